@@ -1,19 +1,21 @@
-"""The one way a kernel is compiled: at its first call, cached, sums stay in order.
+"""Compiles a numerical kernel at its first call, caches the machine code, keeps the order of sums.
 
-`fastmath` stays off, so LLVM may not re-associate floating point: the same inputs give the same
+`fastmath` is off, so that LLVM can not re-associate floating point: the same inputs give the same
 bits on the same platform fingerprint. There are no parallel sections for the same reason.
 
-A kernel's machine code holds that of the kernels that it calls. Numba takes a cached one for fresh
-while the kernel's own file is unchanged, so after a change elsewhere it would go on with the old
-code; and it writes its index before the code, so another process could load what an older program
-left under the same name. Here the files of the cache are named by a digest of the kernel's byte
-code, of the constants that it names and of the kernels that it calls: docs/decisions/0029.
+A kernel's machine code contains that of the kernels that it calls. Numba itself considers cached
+code valid while the kernel's own file is unchanged, so that after a change of a called kernel it
+would run the old code; and it writes its index before the code, so that another process could load
+the code of an older program under the same name. Here the files of the cache are therefore named by
+a digest of the kernel's byte code, of the constants that it names and of the kernels that it calls:
+docs/decisions/0029.
 """
 
 import dis
 import hashlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from functools import cache, lru_cache
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -29,10 +31,10 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def compiled(function: F) -> F:
-    """Compile `function` with Numba: cached on disk, IEEE order of operations.
+    """Compiles `function` with Numba: cached on disk, IEEE order of operations.
 
-    A checker's wrapper (the tests put one around every function) is no code to compile: what it
-    wraps is.
+    Where `function` is a type checker's wrapper (the tests put one around every function), the
+    wrapped function is compiled.
     """
     kernel = inspect.unwrap(function)
     dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel)
@@ -42,9 +44,10 @@ def compiled(function: F) -> F:
 
 
 def _cache_of_its_own(dispatcher: Any) -> Path:
-    """Let a kernel's cached code be that of its program only; the file that locks it.
+    """Names the files of a kernel's cache by its program; returns the file that locks them.
 
-    When it is called first: then all that it names is there. Its line is no part of the name.
+    To be called at the kernel's first call, when all names that it uses are defined. The kernel's
+    line number is left out of the name.
     """
     cache, program = dispatcher._cache, program_of(dispatcher.py_func)
     line = f"-{dispatcher.py_func.__code__.co_firstlineno}."
@@ -53,12 +56,38 @@ def _cache_of_its_own(dispatcher: Any) -> Path:
     return Path(cache._cache_path) / f"{name}.lock"
 
 
+_CALLERS: ContextVar[tuple[Callable[..., object], ...]] = ContextVar("callers", default=())
+"""The kernels whose digests are being computed, each one called by the one before it."""
+
+
+class CircularKernelsError(TypeError):
+    """Kernels call each other in a circle, so that the program of one would contain itself."""
+
+    def __init__(self, circle: Sequence[Callable[..., object]]) -> None:
+        self.circle = tuple(circle)
+        names = " -> ".join(f"{each.__module__}.{each.__qualname__}" for each in circle)
+        super().__init__(f"kernels call each other in a circle: {names}; make them one kernel")
+
+
 @cache
 def program_of(kernel: Callable[..., object]) -> str:
-    """Digest of a kernel's byte code, and of all that its names may mean: kernels and constants.
+    """Digest of a kernel's byte code and of all that its names refer to: kernels and constants.
 
-    What is neither, such as a class, stands for every source that the kernel's module imports.
+    A name of anything else, such as a class, adds all sources that the kernel's module imports. A
+    kernel that calls itself adds no more by that. Raises CircularKernelsError where kernels call
+    each other in a circle.
     """
+    callers = _CALLERS.get()
+    if kernel in callers:
+        raise CircularKernelsError([*callers[callers.index(kernel) :], kernel])
+    within = _CALLERS.set((*callers, kernel))
+    try:
+        return _digest_of(kernel)
+    finally:
+        _CALLERS.reset(within)
+
+
+def _digest_of(kernel: Callable[..., object]) -> str:
     digest = hashlib.blake2b(digest_size=8)
     _add_code(digest, kernel.__code__, kernel.__doc__)
     digest.update(repr((kernel.__defaults__, kernel.__kwdefaults__)).encode())
@@ -75,14 +104,14 @@ def _add_code(digest: hashlib.blake2b, code: CodeType, doc: str | None) -> None:
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             _add_code(digest, constant, None)
-        elif isinstance(constant, frozenset):  # in no order
+        elif isinstance(constant, frozenset):  # its order is not defined
             digest.update(repr(sorted(map(repr, constant))).encode())
         elif constant is not doc:
             digest.update(repr(constant).encode())
 
 
 def _globals(code: CodeType) -> set[tuple[str, ...]]:
-    """The global names that a function loads, each with the attributes that it asks of it."""
+    """The global names that a function loads, each with the chain of attributes that it reads."""
     chains: list[tuple[str, ...]] = []
     at_global = False
     for step in dis.get_instructions(code):
@@ -100,9 +129,9 @@ def _globals(code: CodeType) -> set[tuple[str, ...]]:
 def _add_meant(
     digest: hashlib.blake2b, kernel: Callable[..., object], chain: tuple[str, ...]
 ) -> None:
-    """What a name of a kernel means."""
+    """Adds the value that a name of a kernel refers to."""
     name, *attributes = chain
-    if name not in kernel.__globals__:  # of the language
+    if name not in kernel.__globals__:  # a builtin
         return
     value = kernel.__globals__[name]
     for attribute in attributes:
@@ -110,7 +139,9 @@ def _add_meant(
             value = getattr(value, attribute)
     digest.update(".".join(chain).encode())
     function = getattr(value, "py_func", None)
-    if function is not None:
+    if function is kernel:
+        digest.update(b"itself")
+    elif function is not None:
         digest.update(program_of(function).encode())
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
@@ -135,7 +166,7 @@ _OTHERS = frozenset(("numpy", "math", "builtins", "numba", "typing", "jaxtyping"
 
 @lru_cache
 def _sources(module: str) -> bytes:
-    """Digest of a module and of every module of ours that it imports, near or far."""
+    """Digest of a module and of all modules of ours that it imports, directly or not."""
     digest = hashlib.blake2b(digest_size=8)
     package = (module.partition(".")[0],)
     for name, source in sorted(sources_of(module, package, places=False).items()):

@@ -1,8 +1,8 @@
-"""Processes that need the same kernel for the first time compile it once: the others wait for it.
+"""Compiles a kernel once where several processes need it for the first time: the others wait.
 
-Machine code is kept in files (`team.estimation.compiled`), but who looks there while another
-process is at work on the same kernel finds nothing and does the same work again. On a computer
-with two cores that is all that the second core then does.
+Machine code is cached in files (`team.estimation.compiled`), but a process that looks there while
+another one compiles the same kernel finds nothing and would compile it again, which on a computer
+with two cores takes the time of both.
 """
 
 import sys
@@ -18,16 +18,17 @@ if sys.platform != "win32":
     import fcntl
 
 PATIENCE_S = 60.0
-"""Whoever has waited so long compiles itself: the other may have been stopped."""
+"""After this time [s] a process compiles the kernel itself: the other one may have been stopped."""
 _POLL_S = 0.02
 
 
 def compile_once(dispatcher: Any, lock_of: Callable[[], Path]) -> None:
-    """Let `dispatcher` compile only while no other process compiles the same kernel.
+    """Lets `dispatcher` compile only while no other process compiles the same kernel.
 
-    lock_of: the file to lock, beside its machine code; asked at the first call. Numba looks there
-    again once the lock is held. Kernels call each other without cycles, so processes that hold
-    one and wait for another do not wait in a circle; threads take Numba's own lock first.
+    lock_of: returns the file to lock, beside the machine code; called at the first compilation.
+        Numba looks into the cache again once the lock is held. Kernels do not call each other in
+        cycles, so processes that hold one lock and wait for another can not block each other for
+        good; threads take Numba's own lock first.
     """
     compile_here = dispatcher.compile
     held = False
@@ -51,7 +52,9 @@ def compile_once(dispatcher: Any, lock_of: Callable[[], Path]) -> None:
 
 @contextmanager
 def alone(path: Path, patience_s: float) -> Iterator[bool]:
-    """Hold the lock in the file `path`; False where that took too long or files are not for us."""
+    """Holds the lock in the file `path`; yields False where that took too long or the file can not
+    be opened.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("ab")
@@ -63,7 +66,7 @@ def alone(path: Path, patience_s: float) -> Iterator[bool]:
 
 
 def _locked(descriptor: int, patience_s: float) -> bool:
-    """Whether the lock was free in time; it ends with the descriptor."""
+    """Whether the lock was free in time; it is released when the descriptor is closed."""
     if sys.platform == "win32":
         return False
     until = time.monotonic() + patience_s

@@ -1,4 +1,4 @@
-"""Arrays on the wire: little-endian `bin` fields, and the checks of what they hold."""
+"""Arrays on the wire: little-endian `bin` fields, and the checks of their contents."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ Stamps = bytes
 """int64 nanoseconds, little-endian."""
 
 LARGEST_JOINT = 4096
-"""Rows of the largest covariance that is accepted."""
+"""Number of rows of the largest covariance that is accepted."""
 
 
 def _array(data: bytes, dtype: str, what: str) -> NDArray[Any]:
@@ -134,7 +134,7 @@ def check_blocks(data: Floats, count: int, what: str) -> None:
 
 
 def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
-    """D⁻¹ P D⁻¹ with D = √diag P: units and scale have no influence on its conditioning."""
+    """D⁻¹ P D⁻¹ with D = √diag P, so that units and scale do not influence the conditioning."""
     with np.errstate(over="ignore", invalid="ignore"):  # √ of what is negative is judged below
         sigmas = np.sqrt(np.diag(matrix))
         if not (sigmas > 0.0).all():
@@ -143,7 +143,9 @@ def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64
 
 
 def _check_positive(scaled: NDArray[np.float64], what: str) -> None:
-    """Of a matrix with a unit diagonal: each pivot is more than rounding can leave, n ε."""
+    """Raises ValueError unless each pivot of a matrix with a unit diagonal exceeds its rounding
+    error n ε.
+    """
     try:
         factor = np.linalg.cholesky(scaled)  # reads the lower triangle
     except np.linalg.LinAlgError:

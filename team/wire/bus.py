@@ -1,8 +1,8 @@
 """A bus carries payloads by key. Two implementations: here in memory, and `team.wire.zenoh`.
 
-A `Sample` is what arrives: the relative key, the payload as it was published, and beside it the
-team time, the publisher's wall clock and its counter of this key. A node never sees a bus: its
-shell takes samples from it, decodes them at the door, and publishes what the node returns.
+A received `Sample` contains the relative key, the payload as it was published, the team time, the
+publisher's wall clock and the publisher's counter of this key. A node never uses a bus itself: its
+shell receives the samples, decodes them, and publishes the messages that the node returns.
 """
 
 import logging
@@ -37,7 +37,7 @@ _LOG = logging.getLogger("teamslam")
 
 @dataclass(frozen=True)
 class Sample:
-    """One publication as it arrived."""
+    """One publication as it was received."""
 
     key: str
     payload: bytes
@@ -47,7 +47,9 @@ class Sample:
 
 
 class Outgoing(NamedTuple):
-    """A message on its channel, for one robot or node (empty where the key has no name)."""
+    """A message on its channel, for one robot or node (empty where the channel's key has no
+    name).
+    """
 
     channel: Channel
     name: str
@@ -60,80 +62,98 @@ class Outgoing(NamedTuple):
 
 
 class BusError(RuntimeError):
-    """The bus can not do what it was asked: nobody listens, the port is taken, the link is cut."""
+    """The bus can not do what was requested: no router answers, the port is in use, the link is
+    cut.
+    """
 
 
 _PLACES = re.compile(r"\{(robot|node)\}")
 Answer = Callable[[bytes], Iterable[bytes]]
-"""Answers a query: the request's payload in, the replies' payloads out."""
+"""Answers a query: takes the request's payload, returns the payloads of the replies."""
 
 
 @runtime_checkable
 class Tap(Protocol):
-    """What keeps all that a bus sends and receives, replies to its questions, too: an own log."""
+    """Stores all samples that a bus sends and receives, replies included: a process' own log."""
 
     def __call__(self, samples: list[Sample]) -> None:
-        """Keep these."""
+        """Stores these samples."""
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Measurements of a robot that are known of and not kept, as after a death: incarnation,
-        first number, last number.
+        """Intervals of a robot's measurements that are known to exist and are not stored, as after
+        a crash: incarnation, first number, last number.
         """
 
 
 @runtime_checkable
 class Bus(Protocol):
-    """What a shell needs of a bus."""
+    """The bus as a shell uses it."""
 
     def publish(self, out: Outgoing) -> int:
-        """Publish; the payload's bytes. Blocks, with a bound, when receivers do not keep up."""
+        """Publishes; returns the payload's number of bytes. Blocks, with a bound, while receivers
+        are slower.
+        """
 
     def publish_raw(self, sample: Sample) -> None:
-        """Publish a sample of a log again: its bytes, its stamps and its counter."""
+        """Publishes a logged sample again, with its bytes, its stamps and its counter."""
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """From now on `receive` returns what others publish there, each sample once.
+        """Subscribes: from now on `receive` returns what others publish on the channel, each sample
+        once.
 
-        whole: of a `latest` channel not the newest one, but all that there still is.
+        whole: for a `latest` channel all samples that its publishers still have, not only the
+            newest one.
         """
 
     def receive(self, timeout_s: float) -> list[Sample]:
-        """What has arrived, in order; waits at most `timeout_s` for the first."""
+        """All samples received since the last call, in order; waits at most `timeout_s` for the
+        first one.
+        """
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer the queries of `channel` for one name, or `*`; an asker is told a ValueError."""
+        """Answers the queries of `channel` for one name, or `*`; a ValueError's text is sent to the
+        asker.
+        """
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads, in order; empty when nobody answers, `BusError` on an error."""
+        """The replies' payloads, in order; empty when nobody answers. Raises `BusError` on an
+        error.
+        """
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Ask without waiting: the replies come out of `receive`, as samples of their channels.
+        """Sends a query without waiting: `receive` returns the replies, as samples of their
+        channels.
 
-        While the same is being asked nothing happens. A reply has no counter of its own
-        (`NO_COUNTER`), and the wall clock of its arrival.
+        Does nothing while the same query is open. A reply has no counter of its own (`NO_COUNTER`),
+        and the wall clock of its arrival.
         """
 
     def again(self) -> None:
-        """What was delivered of `all` and whole channels is asked for and delivered once more."""
+        """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """What is known of and has not arrived: by key, intervals of a publisher's numbers."""
+        """Samples that are known to exist and were not received: by key, intervals of a publisher's
+        counters.
+        """
 
     def declare_alive(self, node: str) -> None:
-        """Hold a liveliness token until the bus is closed."""
+        """Holds a liveliness token until the bus is closed."""
 
     def watch_alive(self, node: str = "**") -> None:
-        """Receive `Liveliness` of others' tokens as they appear and go, the present ones first."""
+        """Receives `Liveliness` of others' tokens as they appear and disappear, the present ones
+        first.
+        """
 
     def is_alive(self, node: str) -> bool:
         """Whether anyone holds the node's liveliness token."""
 
     def close(self) -> None:
-        """Leave; the tokens go."""
+        """Leaves the network; the tokens are withdrawn."""
 
 
 def opened(sample: Sample) -> tuple[Channel, str, Message]:
-    """The message of a sample, checked against its key; raises `WireError`.
+    """The channel, the name and the message of a sample, checked against its key; raises
+    `WireError`.
 
     A robot's message on another robot's key is refused, and a node's on another node's.
     """
@@ -154,8 +174,10 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
 
 
 def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
-    """What of samples is sound, each as `opened` has it, for who only looks on: the rest is no
-    message of the team's, whoever has sent it.
+    """The sound ones of some samples, each as `opened` returns it; the others are left out.
+
+    For a reader that only observes: an unsound sample is no message of the team, whoever has sent
+    it.
     """
     for sample in samples:
         try:
@@ -165,7 +187,7 @@ def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
 
 
 def _said_by(channel: Channel, message: Message) -> str | None:
-    """The node that a message names as its own; None where it names none."""
+    """The node that a message gives as its sender; None where it gives none."""
     match message:
         case Configuration() | Progress() | Status() | Liveliness() | Fault():
             return message.node
@@ -182,7 +204,7 @@ def _said_by(channel: Channel, message: Message) -> str | None:
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
     """A reply to a query as a sample of the channel that its message belongs to.
 
-    Raises `WireError` where it is no message that answers this query, or one of another robot.
+    Raises `WireError` where it is no message that answers this query, or belongs to another robot.
     """
     message: Message = decoded(payload)
     of = next((c for c in REPLIES[channel] if isinstance(message, c.kinds)), None)
@@ -195,22 +217,28 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
 
 
 NO_COUNTER = 2**32 - 1
-"""In the place of the counter of what was asked for: it was published at another time, or never."""
+"""Stands for the counter of a sample that was a reply: it was published at another time, or
+never.
+"""
 
 
 LATEST_KEPT = 8_192
-"""Publications of a `latest` key that a publisher keeps: a robot may be 4096 measurements ahead."""
+"""Number of publications of a `latest` key that its publisher stores: a robot may be 4096
+measurements ahead.
+"""
 CLOUDS_KEPT = 1_024
-"""… of particles: kilobytes each."""
+"""The same for particles, of kilobytes each."""
 MAPS_KEPT = 256
-"""… of maps: tens of kilobytes each, a joint covariance more."""
+"""The same for maps, of tens of kilobytes each; a joint covariance is larger."""
 VIEWS_KEPT = 256
-"""… of views: tens of kilobytes each."""
+"""The same for views, of tens of kilobytes each."""
 ALL_KEPT = 1_000_000
 
 
 def kept_of(channel: Channel) -> int:
-    """How many publications of a key its publisher keeps, for who comes late or was cut off."""
+    """Number of publications of a key that its publisher stores for late joiners and after a
+    cut.
+    """
     if channel.delivery == "all":
         return ALL_KEPT
     if channel.message in (FusedMap, MapEstimate, Prior):
@@ -224,7 +252,7 @@ def kept_of(channel: Channel) -> int:
 class MemoryNetwork:
     """The keys of one process: publications are delivered at once, in order, to every other bus.
 
-    It keeps what `latest` and `all` channels promise late joiners.
+    It stores the publications that `latest` and `all` channels promise to late joiners.
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
@@ -233,7 +261,7 @@ class MemoryNetwork:
     alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
 
     def deliver(self, source: "MemoryBus", sample: Sample) -> None:
-        """Hand a sample to every other bus that subscribed, and keep it for late joiners."""
+        """Delivers a sample to every other bus that subscribed, and stores it for late joiners."""
         found = channel_of(sample.key)
         if found is not None and found[0].delivery != "stream":
             kept = self.kept.setdefault(sample.key, deque(maxlen=kept_of(found[0])))
@@ -256,7 +284,7 @@ class MemoryBus:
         network.buses.append(self)
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and deliver at once; the wall clock of a memory bus is always zero."""
+        """Encodes and delivers at once; the wall clock of a memory bus is always zero."""
         counter = self._counters[out.key]
         self._counters[out.key] = counter + 1
         payload = encoded(out.message)
@@ -264,11 +292,11 @@ class MemoryBus:
         return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
-        """Deliver at once, as it is."""
+        """Delivers the sample at once, unchanged."""
         self._network.deliver(self, sample)
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Receive this channel, what is kept for late joiners first."""
+        """Subscribes to this channel; the samples stored for late joiners come first."""
         for key, kept in self._network.kept.items():
             if _is_of(channel, name, key) and not self._subscribed(key):
                 requested = list(kept) if whole or channel.delivery == "all" else [kept[-1]]
@@ -289,21 +317,21 @@ class MemoryBus:
         return known
 
     def offer(self, sample: Sample) -> None:
-        """Take the sample if this bus subscribed to it."""
+        """Queues the sample if this bus subscribed to its key."""
         if self._subscribed(sample.key):
             self._arrived.append(sample)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """Everything that has arrived; a memory bus never waits."""
+        """All samples received since the last call; a memory bus never waits."""
         arrived = self._arrived  # one by one: another thread may be publishing
         return [arrived.popleft() for _ in range(len(arrived))]
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer queries, within `ask`."""
+        """Answers queries, within `ask`."""
         self._network.answers.append((channel, name, answer))
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The answers, at once."""
+        """The replies' payloads, computed at once."""
         for answered, names, answer in self._network.answers:
             if answered is channel and _is_of(channel, names, channel.key(name)):
                 try:
@@ -313,13 +341,13 @@ class MemoryBus:
         return []
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """The answers, with the next samples."""
+        """Sends a query; `receive` returns the replies with its next samples."""
         for payload in self.ask(channel, name, request, 0.0):
             with suppress(WireError):  # what is no reply to this question is dropped
                 self._arrived.append(replied(channel, name, payload, 0))
 
     def again(self) -> None:
-        """What is kept of the channels that were subscribed to as a whole, or are `all`, again."""
+        """Delivers the stored samples of whole subscriptions and of `all` channels once more."""
         for key, kept in self._network.kept.items():
             found = channel_of(key)
             if found is None or not self._subscribed(key):
@@ -328,15 +356,15 @@ class MemoryBus:
                 self._arrived.extend(sample for source, sample in kept if source is not self)
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Nothing is lost in memory."""
+        """Nothing is lost in memory: an empty table."""
         return {}
 
     def declare_alive(self, node: str) -> None:
-        """Hold a token."""
+        """Holds a token."""
         self._token(node, alive=True)
 
     def watch_alive(self, node: str = "**") -> None:
-        """Receive changes of tokens, the present ones first."""
+        """Receives changes of tokens, the present ones first."""
         self._want(ALIVE, node)
         for source, sample in self._network.alive.values():
             if source is not self:
@@ -359,7 +387,7 @@ class MemoryBus:
                 bus.offer(sample)
 
     def close(self) -> None:
-        """Leave the network; the tokens go."""
+        """Leaves the network; the tokens are withdrawn."""
         self._network.buses.remove(self)
         own = [node for node, (source, _) in self._network.alive.items() if source is self]
         for node in own:

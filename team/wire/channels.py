@@ -1,14 +1,14 @@
-"""The table of channels: the only place where a key is spelt.
+"""The table of channels: the only place where a key is written.
 
-Keys are relative to the team; a bus puts `team/<team name>/` before them. Who says something owns
-the key's prefix: a robot's process `robot/{robot}/…`, its driver `source/{robot}/…`, an operator
-`operator/…`, the others those of their name. So a certificate for a prefix is one for a voice. The
-world is the source of every robot, and the truth is its own too.
+Keys are relative to the team; a bus puts `team/<team name>/` before them. The sender of a message
+owns the prefix of its key: a robot's process `robot/{robot}/…`, its driver `source/{robot}/…`, an
+operator `operator/…`, the others that of their name. A certificate for a prefix therefore
+authenticates a sender. The world is the source of every robot; the truth belongs to the world, too.
 
 `{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer`,
 `robot/<name>` or `source/<name>`, `{view}` for a view (`team.wire.views`). In the rates an
-incarnation is one life of a robot's stream (the messages' `incarnation`), a keyframe one
-incarnation of observation.
+incarnation is one life of a robot's stream (the messages' `incarnation`), a keyframe one instant of
+observation.
 """
 
 import re
@@ -19,11 +19,11 @@ from typing import Literal
 from team.wire import messages as m
 
 Delivery = Literal["stream", "latest", "all"]
-"""How a message must arrive. Nothing is ever dropped by congestion; beyond that:
+"""How a message is delivered. No message is dropped because of congestion; beyond that:
 
-stream: what a receiver misses it asks its source for, by the measurement counter.
-latest: a late joiner gets the newest one, a cut link recovers what it missed.
-all:    a late joiner and a cut link get every one.
+stream: a receiver requests a missed message from its source, by the measurement counter.
+latest: a late joiner receives the newest message; after a cut link the missed ones are recovered.
+all: a late joiner, and a receiver after a cut link, receives every message.
 """
 
 
@@ -34,9 +34,9 @@ _PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": ".+"}
 
 @dataclass(frozen=True)
 class Channel:
-    """One row: what travels on a key, how often, how, and what a log does with it.
+    """One row: the message on a key, its rate, its delivery, and how a log treats it.
 
-    alternatives: messages that may travel on the key in the place of `message`, or among them.
+    alternatives: messages that may be sent on the key in the place of `message`, or mixed with it.
     """
 
     name: str
@@ -51,11 +51,11 @@ class Channel:
 
     @property
     def kinds(self) -> tuple[type[m.Message], ...]:
-        """The messages that may travel on the key."""
+        """The types of messages that may be sent on the key."""
         return (self.message, *self.alternatives)
 
     def kind_of(self, tag: str) -> type[m.Message]:
-        """The message that has this tag; the first one where none has it."""
+        """The type of message with this tag; the first one where none has it."""
         return next((kind for kind in self.kinds if m.tag_of(kind) == tag), self.message)
 
     def key(self, name: str = "") -> str:
@@ -70,7 +70,9 @@ class Channel:
         return f"{first}/{name}" if first == "robot" and rest.startswith("{robot}") else first
 
     def owner(self, key: str) -> str | None:
-        """The robot or node that `key` belongs to on this channel; None when it is another's."""
+        """The robot or node that `key` belongs to on this channel; None where the key is of another
+        channel.
+        """
         parts = _PLACE.split(self.template)
         pattern = re.escape(parts[0])
         if len(parts) > 1:
@@ -91,7 +93,7 @@ SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", messa
                     recomputable=False, meaning="teammates seen")  # fmt: skip
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)
 HEAD = Channel(name="head", template="source/{robot}/head", message=m.StreamHead, rate="1 Hz while it measures", delivery="latest", recorded=True, recomputable=False,
-               meaning="how far a robot's driver is, and whether its stream has ended; a world says `end` instead")  # fmt: skip
+               meaning="a driver's number of published measurements, and whether its stream has ended; a world publishes `end` instead")  # fmt: skip
 
 TRUTH = Channel(name="truth", template="truth/{robot}", message=m.Truth, rate="1 Hz, batched", delivery="all", recorded=True, recomputable=False,
                 meaning="true poses; the evaluator's only")  # fmt: skip
@@ -107,7 +109,7 @@ ROBOT_CONFIG = Channel(name="robot_config", template="robot/{robot}/config", mes
 SUBMAP = Channel(name="submap", template="robot/{robot}/submap", message=m.Submap, rate="one per window", delivery="all", recorded=True, recomputable=True,
                  meaning="what the rule `join` consumes")  # fmt: skip
 ASSOCIATION = Channel(name="association", template="robot/{robot}/association", message=m.Association, rate="0-1 per window", delivery="latest",
-                      recorded=True, recomputable=True, meaning="what became of each detection without identity")  # fmt: skip
+                      recorded=True, recomputable=True, meaning="the decision on each detection without identity")  # fmt: skip
 SIGHTING_FACTOR = Channel(name="sighting_factor", template="robot/{robot}/sighting_factor", message=m.SightingFactor,
                           rate="0-1 per teammate and node", delivery="all", recorded=True, recomputable=True,
                           meaning="a teammate seen from a pose node; what the rule `join` consumes")  # fmt: skip
@@ -128,7 +130,7 @@ INNOVATION = Channel(name="innovation", template="robot/{robot}/innovation", mes
 ROBOT_PROGRESS = Channel(name="robot_progress", template="robot/{robot}/progress", message=m.Progress, rate="every 64 measurements",
                          delivery="latest", recorded=True, recomputable=False, meaning="credit for the world")  # fmt: skip
 ROBOT_HEAD = Channel(name="robot_head", template="robot/{robot}/head", message=m.StreamHead, rate="when its driver leaves or ends", delivery="latest",
-                     recorded=True, recomputable=False, meaning="its driver's last word, for a centre that is started again when the driver has gone")  # fmt: skip
+                     recorded=True, recomputable=False, meaning="its driver's last `head`, for a centre that is restarted after the driver has left")  # fmt: skip
 ROBOT_DONE = Channel(name="robot_done", template="robot/{robot}/done", message=m.Done, rate="once per incarnation", delivery="latest", recorded=True,
                      recomputable=True, meaning="all measurements consumed, last submap sent")  # fmt: skip
 
@@ -141,18 +143,18 @@ PRIOR = Channel(name="prior", template="central/prior/{robot}", message=m.Prior,
 ORDER = Channel(name="order", template="operator/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
                 meaning="an operator's order: the team goes on without the robot")  # fmt: skip
 VERDICT = Channel(name="verdict", template="operator/verdict/{robot}", message=m.Verdict, rate="once per verdict", delivery="all", recorded=True,
-                  recomputable=False, meaning="an operator says that two unnamed landmarks are one, or two")  # fmt: skip
+                  recomputable=False, meaning="an operator's decision that two unnamed landmarks are one, or two")  # fmt: skip
 WITHDRAWAL = Channel(name="withdrawal", template="central/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
-                     meaning="the team goes on without the robot; every order that the centre follows")  # fmt: skip
+                     meaning="the team goes on without the robot; one for each order that the centre carries out")  # fmt: skip
 WITHDRAWALS_HEARD = Channel(name="withdrawals_heard", template="robot/{robot}/withdrawals", message=m.WithdrawalHeard,
                             rate="once per order", delivery="all", recorded=True, recomputable=False,
-                            meaning="an order that the robot has heard, for a centre that is started again")  # fmt: skip
+                            meaning="an order that the robot has received, for a centre that is restarted")  # fmt: skip
 GIVEN_UP = Channel(name="given_up", template="operator/given_up/{node}", message=m.GivenUp, rate="once", delivery="all", recorded=True, recomputable=False,
-                   meaning="an order: nobody waits for the node any more")  # fmt: skip
+                   meaning="an operator's order: no process waits for the node any more")  # fmt: skip
 END_ORDER = Channel(name="end_order", template="operator/end", message=m.TeamEnd, rate="once", delivery="all", recorded=True, recomputable=False,
                     meaning="an operator's order: a live team ends now")  # fmt: skip
 TEAM_END = Channel(name="team_end", template="central/end", message=m.TeamEnd, rate="once", delivery="latest", recorded=True, recomputable=False,
-                   meaning="the order to end, repeated by the centre for who comes later")  # fmt: skip
+                   meaning="the order to end, repeated by the centre for late joiners")  # fmt: skip
 FINAL_MAP = Channel(name="final_map", template="central/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True, recomputable=True,
                     meaning="the team's map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel(name="trajectory", template="central/trajectory/{robot}", message=m.Trajectory, rate="once per incarnation",
@@ -169,12 +171,12 @@ KNOWN_MAP = Channel(name="known_map", template="world/known_map", message=m.Know
 END = Channel(name="end", template="world/end", message=m.End, rate="once", delivery="latest", recorded=True, recomputable=False,
               meaning="everything is published; the last counters")  # fmt: skip
 RADIO = Channel(name="radio", template="world/radio", message=m.RadioPlan, rate="once", delivery="latest", recorded=True, recomputable=False,
-                meaning="of a simulated radio: who reaches whom")  # fmt: skip
+                meaning="connections of a simulated radio over time")  # fmt: skip
 RECORDER_PROGRESS = Channel(name="recorder_progress", template="recorder/progress/{robot}", message=m.Progress,
                             rate="every 256 measurements, every submap", delivery="latest", recorded=False, recomputable=False,
                             meaning="credit for the world, and that a robot may leave")  # fmt: skip
 STATUS = Channel(name="status", template="{node}/status", message=m.Status, rate="1 Hz", delivery="latest", recorded=True, recomputable=False,
-                 meaning="what a node is doing, for people")  # fmt: skip
+                 meaning="a node's state, for people")  # fmt: skip
 FAULT = Channel(name="fault", template="{node}/fault", message=m.Fault, rate="when a handling raises", delivery="all", recorded=True, recomputable=False,
                 meaning="a message that a node could not handle and set aside")  # fmt: skip
 ALIVE = Channel(name="alive", template="{node}/alive", message=m.Liveliness, rate="on change", delivery="latest", recorded=True, recomputable=False,
@@ -191,10 +193,10 @@ SENT = Channel(name="sent", template="robot/{robot}/submaps", message=m.SubmapsR
                meaning="a query; the replies are the initial poses, submaps and inter-robot factors that the robot has sent")  # fmt: skip
 
 FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.FinalMapRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-                     meaning="a query; the reply is the final map, when the centre has left, too")  # fmt: skip
+                     meaning="a query; the reply is the final map, even after the centre has left")  # fmt: skip
 
 ORDERS_KEPT = Channel(name="orders_kept", template="router/orders", message=m.OrdersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-                      meaning="a query; the replies are the operator's orders that hold, when who gave them has left, too")  # fmt: skip
+                      meaning="a query; the replies are the operators' valid orders, even after the operators have left")  # fmt: skip
 
 TEAM_CONFIG = Channel(name="team_config", template="robot/{robot}/team/config", message=m.Configuration, rate="once", delivery="latest", recorded=True,
                       recomputable=False, meaning="the configuration of the peer's own fold: a centre's")  # fmt: skip
@@ -207,24 +209,24 @@ TEAM_FINAL = Channel(name="team_final", template="robot/{robot}/team/final", mes
 TEAM_TRAJECTORY = Channel(name="team_trajectory", template="robot/{robot}/team/trajectory", message=m.Trajectory, rate="once per incarnation",
                           delivery="all", recorded=True, recomputable=True, meaning="the peer's smoothed path in its final map")  # fmt: skip
 SET_SUMMARY = Channel(name="set_summary", template="{node}/set", message=m.SetSummary, rate="at most 1 Hz, when it has changed", delivery="latest",
-                      recorded=True, recomputable=False, meaning="what a peer has of the team's set")  # fmt: skip
+                      recorded=True, recomputable=False, meaning="the members of the team's set that a peer has")  # fmt: skip
 CONCLUDED = Channel(name="concluded", template="robot/{robot}/concluded", message=m.Concluded, rate="once", delivery="all", recorded=True, recomputable=False,
                     meaning="a peer has its final map")  # fmt: skip
 CERTIFICATE = Channel(name="certificate", template="robot/{robot}/certificate", message=m.Certificate, rate="once, with keys", delivery="all", recorded=True,
-                      recomputable=False, meaning="by what a robot's signatures are checked")  # fmt: skip
+                      recomputable=False, meaning="the certificate with which a robot's signatures are checked")  # fmt: skip
 SIGNATURE = Channel(name="signature", template="robot/{robot}/signature", message=m.Signature, rate="one per member, with keys", delivery="all", recorded=False,
-                    recomputable=False, meaning="a robot's signature of what it has said, for whoever carries it")  # fmt: skip
+                    recomputable=False, meaning="a robot's signature of one of its members of the set, for peers that relay it")  # fmt: skip
 ORDER_SIGNATURE = Channel(name="order_signature", template="operator/signature/{robot}", message=m.Signature, rate="one per order, with keys", delivery="all", recorded=False,
-                          recomputable=False, meaning="an operator's signature of an order about a robot, for whoever carries it")  # fmt: skip
+                          recomputable=False, meaning="an operator's signature of an order about a robot, for peers that relay it")  # fmt: skip
 FOLD = Channel(name="fold", template="robot/{robot}/fold", message=m.FoldRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                meaning="a query to a peer: it folds the set that it has; the reply is the map")  # fmt: skip
 MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                   meaning="a query to a peer; the replies are members of the set, as `carried`")  # fmt: skip
 CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="as asked for", delivery="stream", recorded=False, recomputable=False,
-                  meaning="members of the set, of whichever robot, from a peer that has them")  # fmt: skip
+                  meaning="members of the set, of any robot, from a peer that has them")  # fmt: skip
 
 VIEW = Channel(name="view", template="view/{view}", message=m.Message, rate="about 1 Hz of team time", delivery="latest", recorded=True, recomputable=False,
-               meaning="what viewers draw, by Foxglove's schemas; see Views")  # fmt: skip
+               meaning="figures for viewers, in Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
 QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT, MEMBERS, FOLD)
@@ -238,7 +240,7 @@ REPLIES = {
 }
 """The channels whose messages answer a query."""
 UNOPENED = (*QUERIES, VIEW)
-"""Rows whose traffic is not opened: queries have no samples, a view is no message of ours."""
+"""Rows whose traffic is not decoded: queries have no samples, and a view is no message of ours."""
 
 
 def robot_node(robot: str) -> str:
@@ -252,7 +254,7 @@ def source_node(robot: str) -> str:
 
 
 def robot_of(node: str) -> str | None:
-    """The robot of a node's name; None if the node is none."""
+    """The robot of a node's name; None if the node is not a robot."""
     kind, _, robot = node.partition("/")
     return robot if kind == "robot" else None
 
@@ -267,7 +269,7 @@ def channel_of(key: str) -> tuple[Channel, str] | None:
 
 
 def row_of(key: str) -> Channel | None:
-    """The row of a relative key, a view's too."""
+    """The row of a relative key, also of a view's."""
     found = channel_of(key)
     if found is not None:
         return found[0]

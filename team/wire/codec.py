@@ -1,4 +1,4 @@
-"""Bytes to messages and back: one door, through which only sound messages come in."""
+"""Encodes messages and decodes them with all checks, so that only sound messages reach a node."""
 
 from typing import TypeVar, cast
 
@@ -10,7 +10,7 @@ from team.wire.messages import BY_TAG, Message
 M = TypeVar("M", bound=Message)
 
 LARGEST_PAYLOAD = 64 * 2**20
-"""Bytes; a joint covariance of 4096 rows takes as much."""
+"""Largest payload in bytes: that of a joint covariance of 4096 rows."""
 _LARGEST_ARRAY = 100_000
 _LARGEST_MAP = 1_000
 _LARGEST_TEXT = 100_000
@@ -19,9 +19,9 @@ _LARGEST_TEXT = 100_000
 class WireError(ValueError):
     """Bytes that are no sound message; `reason` is one of the words below, `detail` a sentence.
 
-    Reasons: "wrong tag", "wrong version", "truncated", "trailing bytes", "wrong length",
-    "not finite", "not symmetric", "not positive definite", "not ascending", "out of bounds",
-    "too large", "too deep", "damaged", "wrong field".
+    Reasons: "wrong tag", "wrong version", "truncated", "trailing bytes", "wrong length", "not
+        finite", "not symmetric", "not positive definite", "not ascending", "out of bounds", "too
+        large", "too deep", "damaged", "wrong field".
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -49,7 +49,7 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
 def unsound(message: Message) -> WireError | None:
     """Why every receiver would refuse this message; None for a sound one.
 
-    What a sender asks of its own output before it speaks: the checks are those of `decoded`.
+    A sender checks its own messages with it before publishing; the checks are those of `decoded`.
     """
     try:
         _converted(msgspec.to_builtins(message, builtin_types=(bytes,)), type(message))
@@ -77,7 +77,7 @@ def _converted(fields: object, kind: type[Message]) -> Message:
 
 
 def tag_in(payload: bytes) -> str:
-    """The tag that a payload begins with, as far as it can be read; empty where there is none."""
+    """The tag at the beginning of a payload, if it can be read; empty where there is none."""
     text = payload[2 : 2 + (payload[1] & 31)] if len(payload) > 1 and payload[1] >> 5 == 5 else b""
     return text.decode("ascii", "replace")
 

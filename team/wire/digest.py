@@ -11,26 +11,26 @@ NO_MAP = bytes(8)
 
 
 class Digest:
-    """A digest that goes on: of all parts that it was given so far."""
+    """A digest that can be continued: of all parts that it was given so far."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=8)
 
     def update(self, *parts: bytes) -> None:
-        """Take more parts."""
+        """Adds more parts."""
         for part in parts:
             self._hash.update(len(part).to_bytes(8, "little"))
             self._hash.update(part)
 
     def copy(self) -> "Digest":
-        """Another one of the same parts."""
+        """A separate digest of the same parts."""
         other = Digest()
         other._hash = self._hash.copy()
         return other
 
     @property
     def value(self) -> bytes:
-        """8 bytes."""
+        """The digest of the parts so far: 8 bytes."""
         return self._hash.digest()
 
 

@@ -1,9 +1,9 @@
-"""Which of two messages of a `latest` channel is the newer one: by what they say, not by arrival.
+"""Decides which of two messages of a `latest` channel is newer: by their contents, not by arrival.
 
-Zenoh orders one publisher's samples on one key. A centre that was started again, a late joiner's
-cache and a repeated answer bring older ones behind newer ones all the same, and a robot that takes
-them steps back. Each order here is total, so that receivers that hear the same messages in any
-order end with the same one.
+Zenoh orders the samples of one publisher on one key. Even so, a restarted centre, a late joiner's
+cache and a repeated reply deliver older messages after newer ones, and a robot that used them would
+go back in time. Each order here is total, so that receivers of the same messages end with the same
+message, in whatever order they arrive.
 """
 
 from collections.abc import Sequence
@@ -14,17 +14,18 @@ SetOrder = tuple[int, int, tuple[tuple[str, int, int], ...]]
 
 
 def set_order(heard: int, members: Sequence[m.VersionEntry]) -> SetOrder:
-    """Of two sets the later one: that of the centre that had heard more, then the larger one.
+    """Sort key of a set: first the number of submaps that the centre had received, then the set's
+    size.
 
-    What a centre has heard only grows, whomever it withdraws or acquits; among equals a set that
-    holds another one is the larger.
+    The number of received submaps only grows, whichever robots are withdrawn or reinstated; of sets
+    with the same number the larger one contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
     return heard, sum(each.sequence + 1 for each in members), vector
 
 
 def is_newer_prior(new: m.Prior, held: m.Prior | None) -> bool:
-    """By the incarnation, by the set, then by how far the robot's own submaps are in it."""
+    """Compares incarnation, then set, then the robot's own number of submaps in the set."""
 
     def order(prior: m.Prior) -> tuple[int, SetOrder, int]:
         return prior.incarnation, set_order(prior.heard, prior.members), prior.sequence
@@ -33,7 +34,9 @@ def is_newer_prior(new: m.Prior, held: m.Prior | None) -> bool:
 
 
 def is_newer_map(new: m.FusedMap, held: m.FusedMap | None) -> bool:
-    """The final one is the last; else by the round, by the set, and a settled one of equal sets."""
+    """Compares: a final map is the newest; then exchange, then set, and a complete map before a
+    provisional one.
+    """
 
     def order(fused: m.FusedMap) -> tuple[bool, int, SetOrder, bool]:
         members = set_order(fused.heard, fused.members)
@@ -43,10 +46,11 @@ def is_newer_map(new: m.FusedMap, held: m.FusedMap | None) -> bool:
 
 
 def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
-    """How far a robot has come by both: it goes over what it has said before, never behind it.
+    """The robot's progress as the larger numbers of both messages; of a newer incarnation, that
+    message.
 
-    Started again it says less than in its earlier life, whose words are true still: the same
-    measurements give the same submaps.
+    A restarted process first reports smaller numbers than in its earlier life. The larger ones
+    remain true: the same measurements give the same submaps.
     """
     if held is None or new.incarnation > held.incarnation:
         return new
@@ -63,7 +67,9 @@ def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
 
 
 def later_end(new: m.End, held: m.End | None) -> m.End:
-    """Each stream's last counter by whichever says more of it; the newer one's notes."""
+    """The end of the streams by the larger counter of each stream in both messages; notes of
+    `new`.
+    """
     if held is None:
         return new
     streams = {each.robot: each for each in held.streams}
@@ -79,7 +85,9 @@ def later_end(new: m.End, held: m.End | None) -> m.End:
 
 
 def later_head(new: m.StreamHead, held: m.StreamHead | None) -> m.StreamHead:
-    """Whichever says more of the stream; of equals the newer word on whether it goes on."""
+    """The message with the larger counter; of equal ones the newer, unless only the other says
+    "ended".
+    """
 
     def order(head: m.StreamHead) -> tuple[int, int, bool]:
         return head.incarnation, head.measurements, head.state == "ended"

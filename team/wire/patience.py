@@ -1,24 +1,24 @@
-"""When to ask for what is missing: not at once, not again and again, anew when the gap changes."""
+"""When to request missing data: after a delay, at growing intervals, anew when the gap changes."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 PATIENCE_S = 0.5
-"""What is on its way needs no question: it has this long to come."""
+"""Delay [s] before the first request: the data may be on its way."""
 LONGEST_S = 8.0
-"""The time between two equal questions doubles up to this."""
+"""Longest interval [s] between two equal requests; intervals double up to it."""
 K = TypeVar("K", bound=Hashable)
 
 
 @dataclass
 class Patience(Generic[K]):
-    """Gaps by name, since when each stands, and when it is to be asked for next."""
+    """Gaps by name, each with the time of its beginning and of its next request."""
 
     _gaps: dict[K, tuple[Hashable, float, float]] = field(default_factory=dict)
 
     def due(self, gaps: Mapping[K, Hashable], now_s: float) -> list[K]:
-        """The names of the gaps to ask for now; one that has changed has new patience."""
+        """The names of the gaps to be requested now; a gap that has changed begins anew."""
         self._gaps = {name: known for name, known in self._gaps.items() if name in gaps}
         found = []
         for name, gap in gaps.items():

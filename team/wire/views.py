@@ -1,8 +1,8 @@
-"""The table of views: what a viewer node publishes below `view/`, by the schemas of other tools.
+"""The table of views: what a viewer node publishes below `view/`, in the schemas of other tools.
 
-A view is no message of the team: nobody opens it, nothing is computed from it, and verification
-skips it. Foxglove, Lichtblick and Rerun know its schema, so that a log opens there with nothing to
-configure. Frames: `map` is the frame of the team's map, `robot/<name>` that of a robot; metres,
+A view is no message of the team: no node decodes it, nothing is computed from it, and verification
+skips it. Foxglove, Lichtblick and Rerun know its schema, so that a log opens there without any
+configuration. Frames: `map` is the frame of the team's map, `robot/<name>` that of a robot; metres,
 radians, counter-clockwise; z = 0.
 """
 
@@ -19,10 +19,11 @@ MAP_FRAME = "map"
 
 
 class TeamFigures(msgspec.Struct, frozen=True):
-    """Figures of the team for plots; what is not known is left out.
+    """Figures of the team for plots; unknown ones are left out.
 
-    Errors are of the map as it lies; landmark_nees_per_dof takes each landmark by itself (2 degrees
-    of freedom, 1 is right). status: the centre's own figures, the consistency monitor's among them.
+    Errors are those of the map without alignment to the truth; landmark_nees_per_dof takes each
+    landmark by itself (2 degrees of freedom; its expectation is 1). status: the centre's own
+    figures, the consistency monitor's among them.
     """
 
     team_time_s: float
@@ -36,8 +37,8 @@ class TeamFigures(msgspec.Struct, frozen=True):
 class RobotFigures(msgspec.Struct, frozen=True):
     """Figures of one robot for plots: its running pose, and its errors with their 3σ bounds.
 
-    What is not known without the truth is left out. nees_per_dof: eᵀ P⁻¹ e / 3; 1 is right on
-    average. status: the robot's own figures.
+    Figures that need an absent truth are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is
+    1. status: the robot's own figures.
     """
 
     team_time_s: float
@@ -68,7 +69,7 @@ class View:
         return self.template.replace("{robot}", robot)
 
     def is_of(self, key: str) -> bool:
-        """Whether a relative key is one of this view."""
+        """Whether a relative key belongs to this view."""
         pattern = re.escape(self.template).replace(r"\{robot\}", "[^/]+")
         return re.fullmatch(pattern, key) is not None
 
@@ -95,7 +96,9 @@ VIEWS: tuple[View, ...] = tuple(v for v in list(globals().values()) if isinstanc
 
 
 def view_of(key: str) -> View | None:
-    """The view that a relative key belongs to; None for a key of a channel, and of no row."""
+    """The view that a relative key belongs to; None for a key of a channel, and for an unknown
+    one.
+    """
     if VIEW.owner(key) is None:
         return None
     return next((view for view in VIEWS if view.is_of(key)), None)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from team.estimation.compiled import _sources, compiled, program_of
+from team.estimation.compiled import CircularKernelsError, _sources, compiled, program_of
 
 INNER = """
 from team.estimation.compiled import compiled
@@ -147,8 +147,8 @@ def test_the_program_of_a_kernel_is_what_it_can_reach(
     assert moved(far=FAR.replace("    b: int", "    c: int")) == {"of_a_class"}
     assert moved(tables="UNUSED = 2\n") == {"of_a_class"}
     assert moved(reaches=REACHES.replace("y * y", "y + y")) == {"alone", "of_a_class"}
-    told_otherwise = "# a line more\n" + REACHES.replace("What it does", "What it is for")
-    assert moved(reaches=told_otherwise) == {"of_a_class"}
+    described_otherwise = "# a line more\n" + REACHES.replace("What it does", "What it is for")
+    assert moved(reaches=described_otherwise) == {"of_a_class"}
 
 
 def test_without_numba_s_compiler_a_kernel_is_the_function_itself() -> None:
@@ -159,3 +159,32 @@ def test_without_numba_s_compiler_a_kernel_is_the_function_itself() -> None:
     )  # fmt: skip
     assert done.stdout.split()[0] == "function"
     assert compiled.__doc__
+
+
+CALLS = """
+from team.estimation.compiled import compiled
+
+@compiled
+def factorial(n: int) -> int:
+    return 1 if n < 2 else n * factorial(n - 1)
+
+@compiled
+def even(n: int) -> bool:
+    return n == 0 or odd(n - 1)
+
+@compiled
+def odd(n: int) -> bool:
+    return n != 0 and even(n - 1)
+"""
+
+
+def test_a_kernel_may_call_itself_and_a_circle_of_kernels_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "calling_kernels.py").write_text(CALLS)
+    module = importlib.import_module("calling_kernels")
+    assert len(program_of(module.factorial.py_func)) == 16
+    assert module.factorial(5) == 120
+    with pytest.raises(CircularKernelsError, match=r"kernels\.even -> .*odd -> .*even; make them"):
+        program_of(module.even.py_func)

@@ -5,10 +5,11 @@ by addition [m]. With P⁻¹ a factor's information and its residual r zero in t
 
 start     r = Log(mean⁻¹ ∘ x),                      ∂r/∂ξ = Jr⁻¹(r)
 odometry  r = Log(mean⁻¹ ∘ h), h = a⁻¹ ∘ b,         ∂r/∂ξ_b = Jr⁻¹(r), ∂r/∂ξ_a = −Jr⁻¹(r) Ad(h⁻¹)
-measurement   r = (predicted − read) of range and bearing, the bearing's on the circle.
+measurement   r = (predicted − measured) of range and bearing, the bearing's on the circle.
 
-Log and Jr⁻¹ are those of SE(2): Solà et al., A micro Lie theory, eq. 158 and 163. Each
-row is what `geometry` and `models` say of one, and every sum runs in the order of the factors.
+Log and Jr⁻¹ are those of SE(2): Solà et al., A micro Lie theory, eq. 158 and 163. Each row equals
+the result of `geometry` and `models` for one factor, and every sum runs in the order of the
+factors.
 """
 
 import math
@@ -46,7 +47,7 @@ SMALL_TURN = 1e-4
 
 
 class Starts(NamedTuple):
-    """Poses that are told: pose [node], mean (x [m], y [m], θ [rad]), information of ξ."""
+    """Given initial poses: pose [node], mean (x [m], y [m], θ [rad]), information of ξ."""
 
     pose: Indices
     mean: Rows
@@ -63,11 +64,12 @@ class Motions(NamedTuple):
 
 
 class Measurements(NamedTuple):
-    """Landmarks seen from poses, and the sensor's variances of each measurement.
+    """Landmarks observed from poses, and the sensor's variances of each measurement.
 
-    landmark: its place among the landmarks. variances: (σ_range² [m²], σ_range_per_m²,
-    σ_bearing² [rad²]), as `models.variances`. own: the noises that they claim themselves
-    (`team.estimation.scans`); the residuals of these are whitened by it, and their variances 1.
+    landmark: index of its landmark.
+    variances: (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]), as `models.variances`.
+    own: the covariances that measurements bring themselves (`team.estimation.scans`); the residuals
+        of these are whitened by them, and their variances are 1.
     """
 
     pose: Indices
@@ -163,7 +165,7 @@ def _adjoints_of_inverse(poses: Rows) -> Blocks:
 
 
 def start_residuals(starts: Starts, poses: Poses) -> tuple[Rows, Blocks]:
-    """R and ∂r/∂ξ of the starts."""
+    """The residuals r and ∂r/∂ξ of the initial poses."""
     residual = logarithms(relative_poses(starts.mean, poses[starts.pose]))
     return residual, inverse_right_jacobians(residual)
 
@@ -177,7 +179,9 @@ def motion_residuals(motions: Motions, poses: Poses) -> Linear:
 
 
 def measurement_residuals(measurements: Measurements, poses: Poses, landmarks: Points) -> Linear:
-    """R of (range, bearing), ∂r/∂ξ of the pose and ∂r/∂ of the landmark, as in `models`."""
+    """The residuals r of (range, bearing), ∂r/∂ξ of the pose and ∂r/∂ of the landmark, as in
+    `models`.
+    """
     z = np.column_stack([measurements.ranges, measurements.bearings])
     found = _linearised(poses[measurements.pose], landmarks[measurements.landmark], z)
     if measurements.own.size:

@@ -1,8 +1,7 @@
 """Dead reckoning: the odometry alone, composed on SE(2).
 
-pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound and no measurement takes any
-of it back. Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A, take it as what SLAM is held
-against.
+pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound, and no measurement reduces
+it. Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A, compare SLAM with it.
 """
 
 from dataclasses import dataclass
@@ -51,5 +50,5 @@ def pose_gaussian(state: DeadReckoning) -> PoseGaussian:
 
 
 def landmark_gaussian(state: DeadReckoning) -> LandmarkGaussian:
-    """It knows no landmark."""
+    """The empty map: dead reckoning estimates no landmark."""
     return NO_LANDMARKS

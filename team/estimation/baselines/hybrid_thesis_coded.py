@@ -29,10 +29,11 @@ FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
 
 @dataclass(frozen=True)
 class CodedState:
-    """What the particles were before they were set to their mean, and what they are now.
+    """The particles before they were set to their mean, and the ones after.
 
-    drawn: the last step's particles, of which pose and map are told. particles: all poses and
-    landmarks are the mean; weights and covariances are each particle's own.
+    drawn: the last step's particles, whose pose and map are reported.
+    particles: all poses and landmarks are the mean; weights and covariances are each particle's
+        own.
     """
 
     drawn: Particles
@@ -95,12 +96,14 @@ def _at_first(
 
 
 def pose_gaussian(state: CodedState) -> PoseGaussian:
-    """Moments of the last step's particles: all the uncertainty of a pose that is kept."""
+    """Moments of the last step's particles: all the uncertainty of a pose that is stored."""
     return pose_moments(state.drawn)
 
 
 def landmark_gaussian(state: CodedState) -> LandmarkGaussian:
-    """Means, and the 2 × 2 blocks of eq. 4.6; landmarks are told as independent of each other."""
+    """Means, and the 2 × 2 blocks of eq. 4.6; landmarks are reported as independent of each
+    other.
+    """
     found = landmark_moments(state.drawn)
     blocks = np.kron(np.eye(len(found.ids)), np.ones((2, 2)))
     return LandmarkGaussian(found.ids, found.means, found.covariance * blocks)

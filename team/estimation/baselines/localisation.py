@@ -107,9 +107,10 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the measurements that `filter_step` would take, where the map is exact.
+    """The innovation of the measurements that `filter_step` would take, where the map is exact.
 
-    A cloud of several modes predicts a broad mixture, so it says little, as its Gaussian does.
+    A cloud of several modes predicts a broad mixture, whose innovation is as uninformative as its
+    Gaussian.
     """
     read = np.isin(state.ids, ids)
     count, known = len(state.cloud.poses), int(read.sum())
@@ -123,7 +124,7 @@ def innovation(
 
 
 def pose_gaussian(state: Localisation) -> PoseGaussian:
-    """Mean and covariance of the cloud; of a cloud with several modes it says little."""
+    """Mean and covariance of the cloud; for a cloud with several modes they are uninformative."""
     return pose_moments(state.cloud)
 
 

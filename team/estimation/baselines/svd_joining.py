@@ -88,9 +88,9 @@ def solved(state: SubmapJoining) -> SubmapJoining:
 
 
 def variance_factor(state: SubmapJoining) -> float:
-    """σ̂², by which the covariance of the solution is scaled.
+    """The variance factor σ̂² by which the covariance of the solution is scaled.
 
-    With the identity the residuals must say how large the errors are: σ̂² = Σ‖r‖²/(residuals −
+    With the identity the residuals must show how large the errors are: σ̂² = Σ‖r‖²/(residuals −
     unknowns), the variance of unit weight (1 while nothing is redundant). Else 1.
     """
     island = state.fold.main
@@ -156,13 +156,14 @@ def exchanged(a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_
     """Two maps as one in the frame of a, from their common landmarks and the robots' positions.
 
     argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): given (R, t), each common
-    xᵢ is the middle of its two, and what is left, ½ Σ ‖aᵢ − R bᵢ − t‖², is minimised in closed form
-    by singular values (`procrustes`). So turning first and joining then is the whole minimum.
+    xᵢ is the middle of its two points, and the remaining ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised in
+    closed form by singular values (`procrustes`). So rotating first and joining then gives the
+    whole minimum.
 
     With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have
     σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and
-    G/2 for the common ones; σ̂² = cost/(2n − 3). What the maps say of their own errors is
-    discarded, as Downs does, so how far each has drifted as a whole is not in the covariance.
+    G/2 for the common ones; σ̂² = cost/(2n − 3). The maps' own covariances are discarded, as Downs
+    does, so the result does not contain how far each map has drifted as a whole.
     Raises TooFewPointsError for n < 2.
     """
     ids = np.union1d(a.ids, b.ids)
@@ -212,11 +213,12 @@ STANDS_STILL = 1e-9
 
 
 def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> Exchange:
-    """Two independent maps as one in the frame of a, each with the covariance that it has.
+    """Two independent maps as one in the frame of a, each with its own covariance.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
-    turn and shift of `exchanged`; the covariance is (JᵀWJ)⁻¹. So Downs' exchange with what the maps
-    say of their errors: how far each has drifted as a whole is in it, as far as the maps know that.
+    rotation and translation of `exchanged`; the covariance is (JᵀWJ)⁻¹. This is Downs' exchange
+    with the maps' own covariances: it contains how far each map has drifted as a whole, as far as
+    the maps know that.
     Raises TooFewPointsError for fewer than two common landmarks, NotACovarianceError for a map
     whose covariance is none.
     """

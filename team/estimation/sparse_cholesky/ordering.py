@@ -1,8 +1,8 @@
-"""A fill-reducing order of elimination for a block-sparse symmetric matrix: minimum degree.
+"""A fill-reducing elimination order for a block-sparse symmetric matrix: minimum degree.
 
 The graph has a vertex per block variable (a pose: 3 unknowns, a landmark: 2) and an edge per
-non-zero block. Eliminating a vertex ties its neighbours to each other; the vertex that is
-eliminated next is the one whose neighbours hold the fewest unknowns, the smallest index among
+non-zero block. Eliminating a vertex makes its neighbours adjacent to each other; the vertex to be
+eliminated next is the one whose neighbours have the fewest unknowns, the smallest index among
 equals (George & Liu 1989, without its approximations). The neighbours at that moment are the
 structure of the vertex's column in the Cholesky factor, so the order comes with the symbolic
 factorisation.
@@ -20,11 +20,11 @@ Bits = UInt64[np.ndarray, "_ _"]
 
 
 class Elimination(NamedTuple):
-    """The order and what it leaves; arrays indexed by step of elimination.
+    """The elimination order and the structure of the factor; arrays indexed by step of elimination.
 
-    order:     block eliminated at each step.
-    parent:    step at which the first of its column's rows is eliminated; −1 at a root.
-    start:     column of step k has the rows `structure[start[k] : start[k + 1]]`.
+    order: block eliminated at each step.
+    parent: step at which the first of its column's rows is eliminated; −1 at a root.
+    start: column of step k has the rows `structure[start[k] : start[k + 1]]`.
     structure: steps at which those rows are eliminated, ascending; without the diagonal.
     """
 
@@ -57,7 +57,7 @@ def _tie(adjacent: Bits, degree: Indices, sizes: Indices, i: int, j: int) -> Non
 
 @compiled
 def _join(adjacent: Bits, degree: Indices, sizes: Indices, i: int, v: int) -> None:
-    """Make i a neighbour of all other neighbours of v, 64 at a time."""
+    """Makes i a neighbour of all other neighbours of v, 64 vertices at a time."""
     for word in range(adjacent.shape[1]):
         new = adjacent[v, word] & ~adjacent[i, word]
         if word == i >> 6:
@@ -73,7 +73,9 @@ def _join(adjacent: Bits, degree: Indices, sizes: Indices, i: int, v: int) -> No
 
 @compiled
 def _neighbours(adjacent: Bits, vertex: int, found: Indices) -> int:
-    """Write the neighbours of a vertex, ascending, to the front of `found`; their number."""
+    """Writes the neighbours of a vertex, ascending, to the front of `found`; returns their
+    number.
+    """
     count = 0
     for word in range(adjacent.shape[1]):
         bits = adjacent[vertex, word]
@@ -89,7 +91,7 @@ def _neighbours(adjacent: Bits, vertex: int, found: Indices) -> int:
 
 @compiled
 def _least(degree: Indices, eliminated: Bool[np.ndarray, " n"]) -> int:
-    """The vertex of least degree that is left, the first among equals."""
+    """The remaining vertex of least degree, the first among equals."""
     least = -1
     for i in range(len(degree)):
         if not eliminated[i] and (least < 0 or degree[i] < degree[least]):

@@ -1,7 +1,7 @@
-"""Dense algebra on big panels, by blocks: nearly all of it is products, which BLAS computes.
+"""Dense algebra on big panels, by blocks: nearly all of it is matrix products, which BLAS computes.
 
 A panel is Lᵀ on a supernode's columns J, a row per column of L (see `sparse_layout`); R are the
-rows below J. Of panels that are not big no sum depends on BLAS (docs/decisions/0028).
+rows below J. For panels that are not big no sum depends on BLAS (docs/decisions/0028).
 """
 
 import math
@@ -14,24 +14,24 @@ from team.estimation.compiled import compiled
 Values = Float[np.ndarray, " _"]
 ROWS = 512
 WIDTH = 16
-"""A panel is big from so many rows and columns on."""
+"""Number of rows, and of columns, from which a panel is big."""
 BLOCK = 48
-"""Columns that are factored, solved or inverted by loops."""
+"""Number of columns that are factorised, solved or inverted by loops."""
 CHUNK = 64
-"""Rows of a product that are there at once."""
+"""Number of rows of a product that are in memory at once."""
 
 
 @compiled
 def is_big(width: int, m: int) -> bool:
-    """Whether products pay in a panel of this shape."""
+    """Whether products by BLAS are faster than loops for a panel of this shape."""
     return m >= ROWS and width >= WIDTH
 
 
 @compiled
 def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, least: Values) -> int:
-    """Dense Cholesky of these columns in place, later ones untouched.
+    """Dense Cholesky factorisation of these columns in place; later columns are not changed.
 
-    The first column whose pivot is ≤ least, else −1.
+    Returns the first column whose pivot is ≤ least, else −1.
     """
     _, m = panel.shape
     for k in range(begin, end):
@@ -50,7 +50,9 @@ def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, lea
 
 @compiled
 def factorise_by_blocks(panel: Float[np.ndarray, "w m"], least: Values) -> int:
-    """`factorise_columns` of all columns: a block by loops, then its product off the later ones."""
+    """`factorise_columns` for all columns: each block by loops, then its product is subtracted from
+    the later ones.
+    """
     width, m = panel.shape
     for begin in range(0, width, BLOCK):
         end = min(begin + BLOCK, width)
@@ -78,9 +80,9 @@ def rows_of_product(
 
 @compiled
 def inverse_by_blocks(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w w"]:
-    """L_JJ⁻ᵀ.
+    """The inverse L_JJ⁻ᵀ of a panel's triangle.
 
-    With L = (A 0; B C): L⁻¹ = (A⁻¹ 0; −C⁻¹ B A⁻¹  C⁻¹), a block of rows after the other.
+    With L = (A 0; B C): L⁻¹ = (A⁻¹ 0; −C⁻¹ B A⁻¹  C⁻¹), one block of rows after the other.
     """
     width = len(panel)
     inverse = np.zeros((width, width))

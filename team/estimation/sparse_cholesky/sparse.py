@@ -1,9 +1,9 @@
 """Sparse symmetric positive definite systems of small blocks: A = L Lᵀ, solutions, inverse entries.
 
-Analysis (order, structure) is apart from the numbers and serves as long as the pattern stays. The
-factor is stored by supernodes: neighbouring columns with (nearly) the same rows share one dense
-panel (Davis 2006, "Direct Methods for Sparse Linear Systems", chapters 4 and 6). All sums run in a
-fixed order.
+The analysis (order, structure) is separate from the numbers and is valid for as long as the pattern
+does not change. The factor is stored by supernodes: neighbouring columns with (nearly) the same
+rows share one dense panel (Davis 2006, "Direct Methods for Sparse Linear Systems", chapters 4 and
+6). All sums run in a fixed order.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ COLUMNS_AT_ONCE = 64
 
 
 class NotPositiveDefiniteError(ValueError):
-    """A pivot of the factorisation is not positive: `variable` (a block) is not determined."""
+    """A pivot of the factorisation is not positive: the block `variable` is undetermined."""
 
     def __init__(self, variable: int) -> None:
         super().__init__(f"the matrix is not positive definite: pivot of variable {variable}")
@@ -54,18 +54,18 @@ class Pattern:
 
     @cached_property
     def value_start(self) -> Indices:
-        """Where each entry's block begins; the last number is their total length."""
+        """Index of each entry's first number; the last one is the total length."""
         areas = self.sizes[self.rows] * self.sizes[self.columns]
         return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(areas)])
 
     @cached_property
     def offset(self) -> Indices:
-        """First unknown of each variable; the last number is the number of unknowns."""
+        """Index of each variable's first unknown; the last one is the number of unknowns."""
         return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(self.sizes)])
 
     @cached_property
     def diagonal(self) -> Indices:
-        """Where the diagonal lies in the numbers of a matrix."""
+        """Indices of the diagonal among the numbers of a matrix."""
         begin = np.repeat(self.value_start[self.column_start[:-1]], self.sizes)
         within = np.arange(self.offset[-1]) - np.repeat(self.offset[:-1], self.sizes)
         diagonal: Indices = begin + within * (np.repeat(self.sizes, self.sizes) + 1)
@@ -92,12 +92,12 @@ class Pattern:
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """Where each number of a pattern lands in the panels of L.
+    """Index in the panels of L of each number of a pattern.
 
-    permutation: place in the elimination of each unknown.
-    structure:   the panels (see `sparse_layout`).
-    target:      place in the panels of each number of the pattern (the mirrored one for the upper
-                 half of a diagonal block).
+    permutation: position of each unknown in the elimination order.
+    structure: the panels (see `sparse_layout`).
+    target: index in the panels of each number of the pattern (the mirrored one for the upper half
+        of a diagonal block).
     """
 
     pattern: Pattern
@@ -131,7 +131,9 @@ def analysed(pattern: Pattern) -> Analysis:
 
 
 def factorised(analysis: Analysis, values: Values) -> Cholesky:
-    """L with L Lᵀ = A. Raises NotPositiveDefiniteError that names the pivot's variable."""
+    """The factor L with L Lᵀ = A. Raises NotPositiveDefiniteError that names the pivot's
+    variable.
+    """
     panels, failed = sparse_kernel.factorise(analysis.structure, analysis.target, values)
     if failed >= 0:
         unknown = int(np.flatnonzero(analysis.permutation == failed)[0])
@@ -141,7 +143,7 @@ def factorised(analysis: Analysis, values: Values) -> Cholesky:
 
 
 def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """X with A X = right."""
+    """Solves A X = right for X."""
     permutation = cholesky.analysis.permutation
     permuted = np.empty_like(right)
     permuted[permutation] = right
@@ -151,7 +153,7 @@ def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndar
 
 
 def inverse_columns(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "n k"]:
-    """The columns of A⁻¹ that belong to `unknowns`: their covariance with everything."""
+    """The columns of A⁻¹ of these `unknowns`: their covariance with all unknowns."""
     total = len(cholesky.analysis.permutation)
     columns = np.empty((total, len(unknowns)))
     for begin in range(0, len(unknowns), COLUMNS_AT_ONCE):

@@ -1,8 +1,8 @@
-"""The kernels of the sparse Cholesky factorisation, its solutions and its selected inverse.
+"""Compiled kernels of the sparse Cholesky factorisation, its solutions and its selected inverse.
 
-They walk the panels of `sparse_layout`. Inner loops add a multiple of one contiguous column to
-another, which a compiler turns into vector instructions without changing the order of any sum. Big
-panels go to `panel_products` instead.
+They traverse the panels of `sparse_layout`. Inner loops add a multiple of one contiguous column to
+another, which a compiler vectorises without changing the order of any sum. Big panels are handled
+by `panel_products` instead.
 """
 
 import numpy as np
@@ -15,7 +15,9 @@ from team.estimation.sparse_cholesky.sparse_layout import Structure
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 PIVOT_TOLERANCE = 1e-14
-"""A pivot below this part of its diagonal entry is rounding noise: the unknown is undetermined."""
+"""Ratio of a pivot to its diagonal entry below which it is rounding noise: the unknown is
+undetermined.
+"""
 
 
 @compiled
@@ -41,7 +43,9 @@ def _places(wanted: Indices, present: Indices, place: Indices) -> None:
 
 @compiled
 def _factorise_panel(panel: Float[np.ndarray, "w m"], least: Values) -> int:
-    """Dense Cholesky of a panel in place; the first column whose pivot is ≤ least, else −1."""
+    """Dense Cholesky factorisation of a panel in place; returns the first column whose pivot is ≤
+    least, else −1.
+    """
     width, m = panel.shape
     if products.is_big(width, m):
         return products.factorise_by_blocks(panel, least)
@@ -50,7 +54,7 @@ def _factorise_panel(panel: Float[np.ndarray, "w m"], least: Values) -> int:
 
 @compiled
 def _subtract_product(structure: Structure, panels: Values, s: int, place: Indices) -> None:
-    """Take L_RJ L_RJᵀ of supernode s from the panels of the rows R below it."""
+    """Subtracts L_RJ L_RJᵀ of supernode s from the panels of the rows R below it."""
     columns_of, row_start, row, panel_start, supernode_of = structure
     rows, panel = _panel(structure, panels, s)
     width, m = panel.shape
@@ -87,10 +91,10 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
 
 @compiled
 def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Values, int]:
-    """Panels of L, and the permuted unknown whose pivot is not positive (−1 if all are).
+    """The panels of L, and the permuted unknown whose pivot is not positive (−1 if all are).
 
-    Right-looking: a supernode's dense factorisation, then its outer product L_RJ L_RJᵀ is taken
-    from the panels of the rows that it reaches.
+    Right-looking: a supernode's dense factorisation, then its outer product L_RJ L_RJᵀ is
+        subtracted from the panels of the rows that it reaches.
     """
     columns_of, row_start, _, panel_start, _ = structure
     panels = np.zeros(panel_start[-1])
@@ -222,7 +226,7 @@ def takahashi(structure: Structure, panels: Values) -> Values:
 
 @compiled
 def has_big_panel(structure: Structure) -> bool:
-    """Whether one of the panels goes to `panel_products`."""
+    """Whether one of the panels is handled by `panel_products`."""
     columns_of, row_start, _, _, _ = structure
     for s in range(len(columns_of) - 1):
         width = columns_of[s + 1] - columns_of[s]
@@ -233,7 +237,9 @@ def has_big_panel(structure: Structure) -> bool:
 
 @compiled
 def _first_columns(structure: Structure) -> Indices:
-    """The first column of each supernode's subtree, which lies in one piece before it."""
+    """The first column of each supernode's subtree, whose columns directly precede the
+    supernode's.
+    """
     columns_of, row_start, row, _, supernode_of = structure
     first = columns_of[:-1].copy()
     for s in range(len(first)):
@@ -250,8 +256,8 @@ def inverse_among(
 ) -> Float[np.ndarray, "k k"]:
     """(L Lᵀ)⁻¹ among ascending unknowns: Wᵀ W with L W = their unit vectors.
 
-    A unit vector fills the supernodes from its own up to the root, so at each supernode those of
-    its subtree are at work, which are neighbours.
+    A unit vector fills the supernodes from its own up to the root, so at each supernode only the
+    unit vectors of its subtree take part, and those are neighbours.
     """
     columns_of, _, _, _, _ = structure
     first = _first_columns(structure)

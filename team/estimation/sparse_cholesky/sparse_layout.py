@@ -1,4 +1,4 @@
-"""Where the numbers of a block-sparse symmetric matrix land in the panels of its Cholesky factor.
+"""The layout of a block-sparse symmetric matrix in the panels of its Cholesky factor.
 
 A supernode is a run of columns with (nearly) the same rows; its panel is the dense m × w matrix of
 those rows and columns, column-major, its own columns being the first w rows.
@@ -14,10 +14,11 @@ from team.estimation.compiled import compiled
 Indices = Int64[np.ndarray, " _"]
 Structure: TypeAlias = tuple[Indices, Indices, Indices, Indices, Indices]
 """(columns_of, row_start, row, panel_start, supernode_of): supernode s has the permuted unknowns
-columns_of[s] … columns_of[s + 1] − 1 as columns, row[row_start[s] : row_start[s + 1]] as rows; its
-panel begins at panel_start[s]; supernode_of[column] is its number."""
+columns_of[s] … columns_of[s + 1] − 1 as columns and row[row_start[s] : row_start[s + 1]] as rows;
+its panel begins at panel_start[s]; supernode_of[column] is its number.
+"""
 PADDING = 0.25
-"""Supernodes grow while explicit zeros are less than this part of the panel."""
+"""Supernodes grow while explicit zeros are less than this share of the panel."""
 
 
 @compiled
@@ -55,9 +56,9 @@ def supernodes(
     start: Indices,
     structure: Indices,
 ) -> tuple[Indices, Structure]:
-    """Neighbouring blocks of the elimination gathered into panels, in numbers of unknowns.
+    """Gathers neighbouring blocks of the elimination into panels, in numbers of unknowns.
 
-    Returns the place in the elimination of each unknown, and the panels' structure.
+    Returns the position of each unknown in the elimination order, and the panels' structure.
     """
     n = len(order)
     first = np.zeros(n + 1, dtype=np.int64)
@@ -104,7 +105,7 @@ def targets(
     permutation: Indices,
     structure: Structure,
 ) -> Indices:
-    """Place in the panels of each number of a pattern."""
+    """Index in the panels of each number of a pattern."""
     columns_of, row_start, row, panel_start, supernode_of = structure
     target = np.empty(value_start[-1], dtype=np.int64)
     for e in range(len(rows)):

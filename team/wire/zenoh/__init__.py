@@ -1,1 +1,1 @@
-"""Everything of Zenoh: sessions, the router, the bus, and what is lacking after a cut."""
+"""Everything of Zenoh: sessions, the router, the bus, and the recovery of lost samples."""

@@ -1,8 +1,8 @@
-"""Access control at the router: each node may say what is its own, and hear its team.
+"""Access control at the router: each node may publish its own keys, and receive those of its team.
 
-Zenoh's rules are by message, direction (as the router sees it) and key; a subject is the common
-name of a certificate. There are no templates, so there is a rule per node. Beside its own keys a
-node needs those of the caches and heartbeats of its advanced publishers, `…/@adv/**`.
+Zenoh's rules select by message, direction (as the router sees it) and key; a subject is the common
+name of a certificate. There are no templates, so each node has a rule. Beside its own keys a node
+needs those of the caches and heartbeats of its advanced publishers, `…/@adv/**`.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
 _LISTENS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 _HEARS = ("put", "reply", "liveliness_token", "declare_subscriber", "query")
 TRUTH = ("truth/**", "truth_landmarks", "truth_labels/**", "truth_positions/**")
-"""What no estimator may hear."""
+"""Keys that no estimator may receive."""
 
 
 def owned(node: str) -> tuple[str, ...]:
-    """The keys, relative to the team, that a node alone may publish, answer and hold tokens on.
+    """The keys, relative to the team, that only this node may publish, answer and hold tokens on.
 
     The world is the driver of every robot's sensors, so it shares those with each `source-…`.
     """
@@ -33,7 +33,7 @@ def owned(node: str) -> tuple[str, ...]:
 
 
 def access_control(roster: Roster) -> dict[str, Any]:
-    """Zenoh's `access_control` for a team: what is not allowed by name is refused."""
+    """Zenoh's `access_control` for a team: whatever no rule allows is refused."""
     prefix = f"team/{roster.team}/"
     every = _keys(prefix, ("**",))
     rules = [
@@ -57,7 +57,9 @@ def access_control(roster: Roster) -> dict[str, Any]:
 
 
 def _keys(prefix: str, keys: Sequence[str]) -> list[str]:
-    """The keys and those of their publishers' caches; `**` takes in nothing that begins with @."""
+    """The keys and those of their publishers' caches; `**` does not match a part that begins with
+    @.
+    """
     return [f"{prefix}{key}{rest}" for key in keys for rest in ("", "/@adv/**")]
 
 

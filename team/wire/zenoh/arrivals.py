@@ -1,29 +1,30 @@
-"""Which publications of a publisher have arrived: each once, and what is missing is asked for.
+"""Tracks which publications of a publisher have arrived: delivers each once, finds the missing
+ones.
 
-A publisher numbers what it publishes on a key from 0 and says again and again, by its heartbeat,
-which number was the last. So a receiver knows of everything that it lacks, at the beginning, in
-between and at the end, as long as the publisher lives: `docs/decisions/0036-delivery.md`.
+A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats.
+A receiver therefore knows of everything that it lacks, at the beginning, in between and at the end,
+for as long as the publisher lives: `docs/decisions/0036-delivery.md`.
 """
 
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 PATIENCE_S = 0.5
-"""A publication that is missing for so long is asked for at its publisher."""
+"""Time [s] for which a publication is missing before it is requested from its publisher."""
 LONGEST_S = 8.0
-"""The time between two questions doubles up to this."""
+"""Longest interval [s] between two requests; intervals double up to it."""
 HELD_S = 2.0
-"""What came after a gap waits for it at the most for so long."""
+"""Longest time [s] for which publications after a gap are delayed."""
 T = TypeVar("T")
 
 
 @dataclass
 class Arrivals(Generic[T]):
-    """The publications of one publisher on one key; those before `first` are not asked for.
+    """The publications of one publisher on one key; those before `first` are not requested.
 
-    in_order: what came after a gap waits for a while, until the gap is closed. newest: the last
-    number that is known of, by arrival or by heartbeat. gone: intervals that the publisher itself
-    does not have any more.
+    in_order: whether publications after a gap are delayed for a while, until the gap is closed.
+    newest: the last number known, from an arrival or a heartbeat.
+    gone: intervals that the publisher itself no longer has.
     """
 
     first: int
@@ -42,7 +43,9 @@ class Arrivals(Generic[T]):
         self._whole = self.first
 
     def take(self, number: int, item: T) -> list[T]:
-        """Note an arrival; what is to be delivered now, nothing where it has come before."""
+        """Records an arrival; returns the items to be delivered now, none if it had arrived
+        before.
+        """
         if number < self.first:  # was not asked for: Zenoh hands it over once
             return [item]
         if number < self._whole or number in self._beyond:
@@ -58,12 +61,12 @@ class Arrivals(Generic[T]):
         return self._released(self._whole)
 
     def know(self, newest: int) -> None:
-        """The publisher has said which number was the last."""
+        """Records the last number that a heartbeat of the publisher contained."""
         self.newest = max(self.newest, newest)
 
     @property
     def missing(self) -> tuple[int, int] | None:
-        """The first and the last number that are missing; some between may be here."""
+        """The first and the last missing number; some numbers in between may have arrived."""
         last = self.newest
         while last >= self._whole and last in self._beyond:
             last -= 1
@@ -71,14 +74,15 @@ class Arrivals(Generic[T]):
 
     @property
     def lacking(self) -> list[tuple[int, int]]:
-        """The intervals that are not here, those that are gone before the others."""
+        """The intervals that are missing, those that the publisher no longer has first."""
         return [*self.gone, *self._open()]
 
     def due(self, now_s: float) -> tuple[int, int | None] | None:
-        """The interval to ask for now, if a gap has stood long enough; None at its end: all since.
+        """The interval to be requested now, if a gap has lasted long enough; end None: everything
+        since.
 
-        A question that is repeated asks for everything since: the newest is always there, so an
-        answer without what is missing says that it is gone.
+        A repeated request is for everything since: the newest is always in the cache, so that a
+        reply without the missing numbers shows that they are gone.
         """
         missing = self.missing
         if missing is None:
@@ -94,16 +98,18 @@ class Arrivals(Generic[T]):
         return missing if self._asked == 1 else (missing[0], None)
 
     def overdue(self, now_s: float) -> list[T]:
-        """What has waited too long for a gap, in order; until that is closed nothing waits."""
+        """The items delayed too long by a gap, in order; until the gap is closed nothing more is
+        delayed.
+        """
         if self._since_s is None or now_s - self._since_s < HELD_S:
             return []
         self._loose = True
         return self._released(self.newest + 1)
 
     def answered(self, first: int, newest: int) -> list[T]:
-        """The publisher has answered with all that it has from `first` to `newest`, and it is in.
+        """Records that the publisher's reply with all it has from `first` to `newest` is complete.
 
-        What is still missing of it is gone; what that held up is to be delivered now.
+        What is still missing in that interval is gone; returns the items that it had delayed.
         """
         for begin, end in self._open():
             lost = (max(begin, first), min(end, newest))

@@ -1,12 +1,12 @@
-"""The bus over Zenoh: what a process of the team publishes, receives, asks and answers.
+"""The bus over Zenoh: how a process of the team publishes, receives, queries and answers.
 
-Beside each payload travels an attachment of 24 bytes, `<qqq`: team time [ns], the publisher's wall
-clock [ns], the publisher's counter of this key. `team.wire.zenoh.delivery` says how a channel's
-delivery is kept; what Zenoh itself does not recover is asked for (`team.wire.zenoh.recovery`).
+Each payload has an attachment of 24 bytes, `<qqq`: team time [ns], the publisher's wall clock [ns],
+the publisher's counter of this key. `team.wire.zenoh.delivery` implements a channel's delivery;
+samples that Zenoh itself does not recover are requested (`team.wire.zenoh.recovery`).
 
-Samples, queries and liveliness go from Zenoh's receiving thread straight into one unbounded queue:
-no thread is ours, the order of arrival is kept across subscriptions, and a slow node never stops
-the link (the team's credit bounds the queue). A bus does not receive what it publishes itself.
+Samples, queries and liveliness go from Zenoh's receiving thread directly into one unbounded queue:
+there is no thread of ours, the order of arrival is preserved across subscriptions, and a slow node
+never blocks the link (the team's credit bounds the queue). A bus does not receive its own samples.
 """
 
 import logging
@@ -38,9 +38,9 @@ if TYPE_CHECKING:  # a node without keys needs none of it
 _ATTACHMENT = struct.Struct("<qqq")
 _ALIVE_TIMEOUT_S = 5.0
 MOST_WAITING = 1_000
-"""Samples that wait for an onlooker before what it can do without is dropped.
+"""Number of samples that wait for an observing node before dispensable ones are dropped.
 
-Each keeps the buffer alive that it came in: some 10 kB.
+Each sample keeps the buffer alive that it arrived in: some 10 kB.
 """
 _LOG = logging.getLogger(__name__)
 
@@ -51,15 +51,15 @@ class _Token:
 
 
 _Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | None
-"""What the receiving thread hands over; None wakes a receiver when the bus closes."""
+"""What the receiving thread queues; None wakes a receiver when the bus closes."""
 
 
 class ZenohBus:
     """A bus over one Zenoh session: a client of the router at `connect`.
 
-    keys: what this node shows the router, over TLS; None: nothing, over TCP. Raises `BusError` when
-    no router answers there within `patience_s`, or one that refuses us or that we refuse. One
-    thread publishes and receives; `close` may come from any.
+    keys: the certificate that this node presents to the router, over TLS; None: none, over TCP.
+        Raises `BusError` when no router answers there within `patience_s`, or one that refuses us
+        or that we refuse. One thread publishes and receives; `close` may be called from any.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ZenohBus:
         self._newest_ns = 0
         self._since_ns = time.time_ns()
         self.tap: Tap | None = None
-        """Is handed what this bus publishes and receives."""
+        """Receives all samples that this bus publishes and receives."""
         self._closed = threading.Event()
         self._keys = keys
         self._session = client(connect, patience_s, keys)
@@ -101,7 +101,7 @@ class ZenohBus:
         self.close()
 
     def close(self) -> None:
-        """Leave: what was published is sent first, the tokens go, a waiting receiver returns."""
+        """Leaves: publishes what is pending, withdraws the tokens, wakes a waiting receiver."""
         if not self._closed.is_set():
             with suppress(BusError):
                 self._tell_tally()
@@ -110,7 +110,9 @@ class ZenohBus:
             self._queue.put(None)
 
     def _tell_tally(self) -> None:
-        """Whoever records is told how much there was of each key: a tail may have been lost."""
+        """Reports to a recorder the number of samples of each key: the last ones may have been
+        lost.
+        """
         if self._tokens:
             node = next(iter(self._tokens))
             counts = dict(sorted(self._published.items()))
@@ -125,9 +127,10 @@ class ZenohBus:
             self.publish(Outgoing(TALLY, node, tally))
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and publish, stamped with this machine's wall clock; the payload's bytes.
+        """Encodes and publishes, stamped with this machine's wall clock; returns the payload's size
+        in bytes.
 
-        Blocks while the link is busy; after ten seconds Zenoh gives the link up and connects anew.
+        Blocks while the link is busy; after ten seconds Zenoh drops the link and connects anew.
         """
         counter = self._counters.get(out.key, 0)
         self._counters[out.key] = counter + 1
@@ -137,7 +140,7 @@ class ZenohBus:
         return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
-        """Publish a sample as it is, with the delivery that the table promises for its key.
+        """Publishes a sample unchanged, with the delivery that the table promises for its key.
 
         A key that is not in the table is a stream.
         """
@@ -165,9 +168,11 @@ class ZenohBus:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """From now on `receive` returns what is published there; asking twice changes nothing.
+        """Subscribes: from now on `receive` returns what is published there; a repeated call
+        changes nothing.
 
-        whole: of a `latest` channel not the newest one, but all that the publishers still have.
+        whole: for a `latest` channel all samples that its publishers still have, not only the
+            newest one.
         """
         self._check_open()
         if {(channel.name, "*"), (channel.name, name)} & self._requested:
@@ -190,17 +195,20 @@ class ZenohBus:
         return row is not None and row.name in self._sheds
 
     def _shed(self, item: _Item) -> None:
-        """Queue what an onlooker can do without, unless it is too far behind already."""
+        """Queues a sample that an observing node can do without, unless the node is too far
+        behind.
+        """
         if self._queue.qsize() < MOST_WAITING:
             self._queue.put(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """All that has arrived, in order; waits at most `timeout_s` for the first.
+        """All samples received since the last call, in order; waits at most `timeout_s` for the
+        first one.
 
-        Queries are answered here, on the caller's thread: a node's state needs no lock. What has
-        been missing for a while is asked for; it comes as it arrives, behind what came after it.
-        What arrives while the rest is taken waits for the next time: a team that speaks faster than
-        this node reads does not keep it here.
+        Queries are answered here, on the caller's thread: a node's state needs no lock. Samples
+        that have been missing for a while are requested; they are returned when they arrive, after
+        later ones. Samples that arrive during the call wait for the next one, so that a team that
+        publishes faster than this node reads can not keep it here.
         """
         self._check_open()
         if self._door is not None:
@@ -256,26 +264,29 @@ class ZenohBus:
             samples += self._recovery.arrived(sample, item.source_info)
 
     def again(self) -> None:
-        """What was delivered of `all` and whole channels is asked for and delivered once more."""
+        """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
         self._recovery.again()
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """What is known of and has not arrived: by key, intervals of a publisher's numbers.
+        """Samples that are known to exist and were not received: by key, intervals of a publisher's
+        counters.
 
-        Of what a publisher does not have any more, too.
+        It includes samples that their publisher no longer has.
         """
         return self._recovery.lacking()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer the queries of `channel`, within `receive`; a ValueError is told to the asker."""
+        """Answers the queries of `channel`, within `receive`; a ValueError's text is sent to the
+        asker.
+        """
         self._check_open()
         self._queries.answer(channel, name, answer)
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads in the order of the answer; empty when nobody answers.
+        """The replies' payloads in their order; empty when nobody answers.
 
-        Raises `BusError` when an answer does not end within `timeout_s`, or is an error. This
-        bus answers nobody meanwhile: two nodes must not ask one another at once.
+        Raises `BusError` when a reply is not complete within `timeout_s`, or is an error. Meanwhile
+        this bus answers no queries: two nodes must not query each other at once.
         """
         self._check_open()
         payloads = self._queries.ask(channel, name, request, timeout_s)
@@ -286,22 +297,25 @@ class ZenohBus:
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Ask without waiting: the replies come out of `receive`, as samples of their channels.
+        """Sends a query without waiting: `receive` returns the replies, as samples of their
+        channels.
 
-        While the same is being asked nothing happens.
+        Does nothing while the same query is open.
         """
         self._check_open()
         self._queries.request(channel, name, request)
 
     def declare_alive(self, node: str) -> None:
-        """Hold a liveliness token until the bus is closed or its process dies."""
+        """Holds a liveliness token until the bus is closed or its process dies."""
         self._check_open()
         if node not in self._tokens:
             key = self._prefix + ALIVE.key(node)
             self._tokens[node] = self._session.liveliness().declare_token(key)
 
     def watch_alive(self, node: str = "**") -> None:
-        """Receive `Liveliness` samples when others' tokens appear and go, present ones first."""
+        """Receives `Liveliness` samples when others' tokens appear and disappear, present ones
+        first.
+        """
         self._check_open()
 
         def notice(sample: zenoh.Sample) -> None:
@@ -330,5 +344,5 @@ class ZenohBus:
 
 
 def _every(channel: Channel, name: str) -> str:
-    """All names: a node's or a view's may have several parts."""
+    """The key for all names: the name of a node or a view may have several parts."""
     return "**" if name == "*" and "{robot}" not in channel.template else name

@@ -1,9 +1,9 @@
-"""A channel's delivery, as the table of channels promises it, by Zenoh's own means.
+"""Implements a channel's delivery, as the table of channels promises it, by Zenoh's own means.
 
-stream: a plain publisher that blocks and never drops; a cut link loses what was sent meanwhile.
-latest: a cache and heartbeats; a late joiner asks for the newest one, after a cut the receiver asks
-        for what the heartbeat says it missed, as far back as the cache goes.
-all:    as `latest` with everything cached, and a late joiner asks for everything.
+stream: a plain publisher that blocks and never drops; samples sent while a link is cut are lost.
+latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut the
+    receiver requests what it missed according to the heartbeat, as far back as the cache reaches.
+all: as `latest` with everything cached, and a late joiner requests everything.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,9 @@ Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
 
 def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
-    """A publisher of the key's row of the table; a key that is not in the table is a stream."""
+    """A publisher with the delivery of the key's row; a key that is not in the table is a
+    stream.
+    """
     row = row_of(key)
     if row is None or row.delivery == "stream":
         return session.declare_publisher(
@@ -56,7 +58,9 @@ def subscribe(
     *,
     whole: bool,
 ) -> None:
-    """Hand on what others publish there, on Zenoh's thread. whole: as `ZenohBus.subscribe`."""
+    """Passes the samples of other publishers to `put`, on Zenoh's thread. whole: as
+    `ZenohBus.subscribe`.
+    """
     callback = Callback(put, indirect=False)
     remote = zenoh.Locality.REMOTE
     if channel.delivery == "stream":

@@ -1,4 +1,4 @@
-"""Keys that are not a team's, as those of ROS 2: what is published there, as it comes."""
+"""Reads keys that are not a team's, as those of ROS 2: the samples as they are published."""
 
 import json
 import time
@@ -12,20 +12,20 @@ from zenoh.handlers import FifoChannel
 from team.wire.bus import BusError
 
 TOKENS_S = 5.0
-"""How long to wait for the tokens that are there."""
+"""Longest time [s] to wait for the tokens that are present."""
 CAPACITY = 65_536
-"""Messages of a subscription that wait for `receive`; only a full channel holds up Zenoh's thread,
-and with it the router, which then drops messages.
+"""Number of messages of a subscription that wait for `receive`. Only a full channel blocks Zenoh's
+thread, and with it the router, which then drops messages.
 """
 AT_ONCE = 10_000
-"""Messages of a subscription that one call of `receive` takes at most."""
+"""Largest number of messages of a subscription that one call of `receive` returns."""
 LOOK_S = 0.005
-"""Between two looks while nothing has come."""
+"""Interval [s] of polling while nothing has arrived."""
 
 
 class ForeignSample(NamedTuple):
-    """One publication, and what was attached to it; of a liveliness token both are empty, and
-    alive says which way.
+    """One publication with its attachment; for a liveliness token both are empty, and `alive` says
+    whether it appeared or disappeared.
     """
 
     key: str
@@ -38,9 +38,9 @@ class ForeignSample(NamedTuple):
 class ForeignKeys:
     """Subscriptions to keys and tokens at a router or peer; raises BusError where none answers.
 
-    What comes waits in a channel for each subscription, which Zenoh's thread fills without Python:
-    a process that is busy decoding does not hold it up. `receive` takes from them; of one key the
-    order is that of its publisher, between keys there is none.
+    Samples wait in one channel per subscription, which Zenoh's thread fills without running Python:
+    a process that is busy decoding does not block it. `receive` reads from these channels; samples
+    of one key are in their publisher's order, those of different keys are in none.
     """
 
     def __init__(
@@ -86,7 +86,9 @@ class ForeignKeys:
         self._session.close()  # type: ignore[no-untyped-call] # zenoh leaves out `-> None`
 
     def receive(self, timeout_s: float) -> list[ForeignSample]:
-        """All that has come, AT_ONCE of a subscription at most; waits for the first so long."""
+        """The samples received, at most AT_ONCE of each subscription; waits at most `timeout_s` for
+        the first.
+        """
         until = time.monotonic() + timeout_s
         while True:
             found = self._taken()
@@ -95,7 +97,7 @@ class ForeignKeys:
             time.sleep(LOOK_S)
 
     def _taken(self) -> list[ForeignSample]:
-        """Tokens first: they tell the types of what follows."""
+        """Tokens first: they announce the types of the samples that follow."""
         found = [_of_token(sample) for sample in self._first]
         self._first.clear()
         for channel in self._tokens:

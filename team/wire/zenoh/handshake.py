@@ -1,7 +1,7 @@
-"""Why a link to a router does not come up: Zenoh says only that the time is over.
+"""Finds out why a link to a router fails: Zenoh reports nothing but a timeout.
 
-One TLS handshake by the standard library, beside Zenoh, tells the cases apart: nobody listens; the
-router refuses our certificate, or we its; one side speaks TLS and the other does not.
+One TLS handshake by the standard library, beside Zenoh, distinguishes the cases: no server listens;
+the router refuses our certificate, or we its; one side speaks TLS and the other does not.
 """
 
 import re
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from team.keys.credentials import Credentials
 
 TIMEOUT_S = 1.0
-"""For each step; a router on a busy machine that takes longer is asked again."""
+"""Timeout [s] of each step; a router on a busy machine that takes longer is tried again."""
 _ENDPOINT = re.compile(r"(?P<protocol>\w+)/(?P<host>\[[^]]+\]|[^:/?#]+):(?P<port>\d+)")
 _ALERTS = {
     "UNKNOWN_CA": "it is of another authority than the router's: copy ca.pem and both files of "
@@ -27,7 +27,9 @@ _ALERTS = {
 
 
 def why_refused(connect: str, keys: "Credentials | None") -> str | None:
-    """In words, with the remedy; None: nobody listens there, or TLS is not what stands between."""
+    """The reason in words, with the remedy; None: no server listens there, or TLS is not the
+    reason.
+    """
     at = _ENDPOINT.match(connect)
     if at is None:
         return None
@@ -41,7 +43,7 @@ def why_refused(connect: str, keys: "Credentials | None") -> str | None:
 
 
 def router_ends(connect: str, keys: "Credentials") -> float | None:
-    """When the router's certificate ends [s since 1970]; None: it can not be learnt now."""
+    """When the router's certificate expires [s since 1970]; None where that can not be read now."""
     at = _ENDPOINT.match(connect)
     if at is None:
         return None

@@ -1,10 +1,11 @@
-"""What a router keeps of a team while it runs: its end, and the orders of operators who have left.
+"""What a router stores of a team while it runs: its final map, and orders of operators who have
+left.
 
-The final map is kept for who was away as it came. Whether a process that begins belongs to the run
-that has ended or to a new one it can not know itself; the router knows who was in that run and has
-never said a last word (`Tally`): a node of that name is a straggler, and is told so once. Orders
-(a robot withdrawn or given up, verdicts on landmarks, the end of a live team) hold until the final
-map is out or nobody of the team is there any more.
+The final map is stored for processes that were absent when it was published. A starting process can
+not know itself whether it belongs to the run that has ended or to a new one; the router knows the
+nodes of that run that never announced their end (`Tally`): a node of that name missed the end, and
+is sent the map once. Orders (a robot withdrawn or given up, verdicts on landmarks, the end of a
+live team) are valid until the final map is published or no process of the team is present any more.
 """
 
 import threading
@@ -13,12 +14,16 @@ from dataclasses import dataclass, field
 from team.wire.messages import FinalMapReply
 
 MOST_ORDERS = 10_000
-"""Orders to a team that are kept: whoever has given more repeats them himself."""
+"""Number of orders to a team that are stored; an operator who gives more has to repeat the
+others.
+"""
 
 
 @dataclass
 class Kept:
-    """Of one team. Every call may come from another thread; times are a monotonic clock's [s]."""
+    """The stored messages of one team. Calls may come from any thread; times are a monotonic
+    clock's [s].
+    """
 
     _there: set[str] = field(default_factory=set, init=False)
     _silent: set[str] = field(default_factory=set, init=False)
@@ -28,7 +33,9 @@ class Kept:
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def token(self, node: str, *, alive: bool) -> bool:
-        """A node's liveliness token appears or goes; whether it went without a last word."""
+        """Records that a node's liveliness token appears or disappears; returns whether the node
+        crashed.
+        """
         with self._lock:
             if alive:
                 self._there.add(node)
@@ -40,31 +47,33 @@ class Kept:
             return node in self._silent
 
     def last_word(self, node: str) -> None:
-        """A process of this node ends as it should, and knows what it needs to."""
+        """Records that a process of this node ends in order, so that it does not need the final
+        map.
+        """
         with self._lock:
             self._silent.discard(node)
             self._owed.discard(node)
 
     def end(self, final: bytes, now_s: float) -> None:
-        """The team's final map is out."""
+        """Stores the team's final map."""
         with self._lock:
             self._final = now_s, final
             self._owed = set(self._silent)
             self._orders.clear()
 
     def order(self, order: bytes) -> None:
-        """An operator orders something; of more than MOST_ORDERS the first ones."""
+        """Stores an operator's order; only the first MOST_ORDERS are stored."""
         with self._lock:
             if len(self._orders) < MOST_ORDERS:
                 self._orders[order] = None
 
     def orders(self) -> list[bytes]:
-        """The orders that hold, the oldest first."""
+        """The valid orders, the oldest first."""
         with self._lock:
             return list(self._orders)
 
     def answer(self, node: str, now_s: float) -> FinalMapReply | None:
-        """The final map for a node that asks for it; None while there is none."""
+        """The reply to a node that requests the final map; None while there is no map."""
         with self._lock:
             if self._final is None:
                 return None

@@ -1,4 +1,4 @@
-"""Questions and answers over a session: what a node answers, and what it asks others."""
+"""Queries over a session: those that a node answers, and those that it sends."""
 
 import logging
 import time
@@ -19,13 +19,13 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, repr=False)
 class Question:
-    """A query that has come, and who answers it."""
+    """A received query, with the function that answers it."""
 
     query: zenoh.Query
     answer: Answer
 
     def reply(self) -> None:
-        """Answer it; where the request is not sound its sender is told."""
+        """Answers the query; where the request is not sound its sender receives the error."""
         request = b"" if self.query.payload is None else self.query.payload.to_bytes()
         with self.query as query:
             try:
@@ -37,7 +37,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply to a request; without a payload: that was all, or why there is none."""
+    """One reply to a request; without a payload it marks the end, or an error with its reason."""
 
     channel: Channel
     name: str
@@ -46,7 +46,9 @@ class Reply:
 
 
 class Queries:
-    """Of one session. Questions and replies go into `put` on Zenoh's thread; all else is one's."""
+    """The queries of one session. Zenoh's thread passes questions and replies to `put`; all other
+    methods are for one thread.
+    """
 
     def __init__(
         self, session: zenoh.Session, prefix: str, put: Callable[[Question | Reply], None]
@@ -57,7 +59,9 @@ class Queries:
         self._requests: set[tuple[str, str]] = set()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """From now on questions of this channel are put, with who answers them."""
+        """Passes the queries of this channel to `put` from now on, with the function that answers
+        them.
+        """
 
         def take(query: zenoh.Query) -> None:
             self._put(Question(query, answer))
@@ -67,7 +71,7 @@ class Queries:
         )
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads in the order of the answer; raises `BusError` as the bus does."""
+        """The replies' payloads in their order; raises `BusError` as the bus does."""
         key = self._prefix + channel.key(name)
         replies = self._session.get(
             key,
@@ -85,7 +89,9 @@ class Queries:
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Ask without waiting: replies are put. While the same is being asked nothing happens."""
+        """Sends a query without waiting: replies are passed to `put`. Does nothing while the same
+        is open.
+        """
         if (channel.name, name) in self._requests:
             return
         self._requests.add((channel.name, name))
@@ -106,7 +112,7 @@ class Queries:
         )
 
     def taken(self, reply: Reply) -> list[Sample]:
-        """A reply as a sample of its channel; nothing where it ends, or is none."""
+        """A reply as a sample of its channel; nothing where it is the end, or no sound reply."""
         key = reply.channel.key(reply.name)
         if reply.payload is None:
             self._requests.discard((reply.channel.name, reply.name))
@@ -121,6 +127,6 @@ class Queries:
 
 
 def _reason(error: zenoh.ReplyError | None) -> str:
-    """Why there is no reply."""
+    """The reason for a missing reply."""
     text = "" if error is None else error.payload.to_bytes().decode("utf-8", "replace")
     return text or "no answer"

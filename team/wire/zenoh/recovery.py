@@ -1,8 +1,8 @@
-"""What has not arrived of what was published is asked for at its publisher's cache.
+"""Requests publications that have not arrived from their publisher's cache.
 
-Zenoh's advanced subscriber does most of this, but not all: of late joiners some get a part of the
-history. So what arrives of each publisher is counted (`team.wire.zenoh.arrivals`), compared with
-its heartbeats, and what has been missing for half a second is asked for.
+Zenoh's advanced subscriber does most of this, but some late joiners receive only a part of the
+history. The arrivals of each publisher are therefore counted (`team.wire.zenoh.arrivals`) and
+compared with its heartbeats, and what has been missing for half a second is requested.
 """
 
 import logging
@@ -18,7 +18,7 @@ from team.wire.channels import row_of
 from team.wire.zenoh.arrivals import Arrivals
 
 ADVANCED = "/@adv/pub/"
-"""In the key of what an advanced publisher says beside its publications."""
+"""Part of the keys on which an advanced publisher sends its heartbeats."""
 _BEAT = struct.Struct("<I")  # a heartbeat's payload: the number of the last publication
 _LOOK_S = 0.1  # between two looks at what is missing
 _ANSWER_S = 10.0
@@ -27,7 +27,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """A publisher's number of the last publication on a key."""
+    """The number of a publisher's last publication on a key."""
 
     key: str
     publisher: str
@@ -36,7 +36,7 @@ class Heartbeat:
 
 @dataclass
 class CacheAnswer:
-    """An answer of a publisher's cache that has come to its end: what was asked, what came."""
+    """A complete reply of a publisher's cache: the requested interval, and the samples."""
 
     key: str
     publisher: str
@@ -47,7 +47,9 @@ class CacheAnswer:
 
 
 class Recovery:
-    """Of one session. Heartbeats and answers go into `put` on Zenoh's thread; all else is one's."""
+    """The recovery of one session. Zenoh's thread passes heartbeats and replies to `put`; all other
+    methods are for one thread.
+    """
 
     def __init__(
         self,
@@ -65,7 +67,9 @@ class Recovery:
         self._look_due = 0.0
 
     def watch(self, key: str) -> None:
-        """Listen to the heartbeats of the publishers of a key, with the session's prefix."""
+        """Subscribes to the heartbeats of the publishers of a key, given with the session's
+        prefix.
+        """
         self._session.declare_subscriber(
             f"{key}{ADVANCED}**",
             Callback(self._beat, indirect=False),
@@ -73,11 +77,11 @@ class Recovery:
         )
 
     def take_whole(self, channel: str) -> None:
-        """Of this `latest` channel all is wanted that its publishers still have."""
+        """Requests all samples that the publishers of this `latest` channel still have."""
         self._whole.add(channel)
 
     def _beat(self, sample: zenoh.Sample) -> None:
-        """On the receiving thread: a heartbeat that says something new."""
+        """Passes on a heartbeat with a new number; called on Zenoh's receiving thread."""
         name, beat = str(sample.key_expr), sample.payload.to_bytes()
         if len(beat) == _BEAT.size and self._beats.get(name) != beat:
             self._beats[name] = beat
@@ -86,19 +90,21 @@ class Recovery:
             self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
 
     def heard(self, beat: Heartbeat) -> None:
-        """A publisher's last number is known."""
+        """Records a publisher's last number."""
         self._arrivals_of(beat.key, beat.publisher, beat.newest).know(beat.newest)
         self._incomplete.add((beat.key, beat.publisher))
 
     def answered(self, answer: CacheAnswer) -> list[Sample]:
-        """A cache has answered in full: what is delivered now, since the rest is gone."""
+        """Records that a cache's reply is complete; returns the samples to be delivered now."""
         if not answer.repeated or answer.failed or answer.newest < 0:
             return []
         arrivals = self._arrivals_of(answer.key, answer.publisher, answer.newest)
         return arrivals.answered(answer.first, answer.newest)
 
     def arrived(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
-        """A publication has come: what is delivered now, each once and in its order."""
+        """Records a received publication; returns the samples to be delivered now, each once and in
+        order.
+        """
         publisher, number = _numbered(source)
         arrivals = self._arrivals_of(sample.key, publisher, number)
         delivered = arrivals.take(number, sample)
@@ -107,7 +113,9 @@ class Recovery:
         return delivered
 
     def _arrivals_of(self, key: str, publisher: str, heard: int) -> Arrivals[Sample]:
-        """Of a `latest` channel nothing is asked for that is older than the first heard of."""
+        """The arrivals of one publisher on one key; on a `latest` channel nothing older than the
+        first known number is requested.
+        """
         found = self._arrivals.get((key, publisher))
         if found is None:
             row = row_of(key)
@@ -117,7 +125,9 @@ class Recovery:
         return found
 
     def overdue(self, now_s: float) -> list[Sample]:
-        """Request what has been missing for a while; returns samples that no longer wait for it."""
+        """Requests what has been missing for a while; returns samples that no longer wait for
+        it.
+        """
         if now_s < self._look_due or not self._incomplete:
             return []
         self._look_due = now_s + _LOOK_S
@@ -154,15 +164,16 @@ class Recovery:
         )
 
     def again(self) -> None:
-        """What was delivered of `all` and whole channels is asked for and delivered once more."""
+        """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
         self._arrivals.clear()
         self._incomplete.clear()
         self._beats.clear()  # so that the next heartbeats are news
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """What is known of and has not arrived: by key, intervals of a publisher's numbers.
+        """Samples that are known to exist and were not received: by key, intervals of a publisher's
+        counters.
 
-        Of what a publisher does not have any more, too.
+        It includes samples that their publisher no longer has.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):
@@ -172,5 +183,5 @@ class Recovery:
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
-    """The publisher, as its heartbeats name it, and its number of the publication."""
+    """The publisher, by the name that its heartbeats have, and its number of the publication."""
     return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn

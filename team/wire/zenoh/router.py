@@ -1,4 +1,4 @@
-"""The router of a team, and what it keeps for who comes later."""
+"""The router of a team, and the messages that it stores for late joiners."""
 
 import json
 import logging
@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # a router without keys needs none of it
     from team.keys.credentials import Credentials
 
 REFUSALS = "error,zenoh_link_tls=warn"
-"""What of Zenoh's log a router with keys shows: whom it refuses, and why."""
+"""The part of Zenoh's log that a router with keys shows: refused connections, with the reasons."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -41,10 +41,11 @@ _LOG = logging.getLogger(__name__)
 def router(
     listen: str = "tcp/127.0.0.1:0", keys: "tuple[Credentials, Roster] | None" = None
 ) -> Iterator[str]:
-    """A router in this process; yields the endpoint that it is bound to.
+    """Runs a router in this process; yields the endpoint that it is bound to.
 
-    keys: the router's own, and whom it lets in: then it speaks TLS alone, and says on stderr or
-    stdout why it refuses whom. Raises `BusError` when it can not listen there.
+    keys: the router's own credentials, and the roster of the nodes that it accepts: then it speaks
+        TLS alone, and reports on stderr or stdout whom it refuses and why. Raises `BusError` when
+        it can not listen there.
     """
     settings: dict[str, object] = {
         "mode": "router",
@@ -75,7 +76,9 @@ def router(
 
 
 class _Keeper:
-    """Keeps each team's final map and orders at the router, and answers for who has left."""
+    """Stores each team's final map and operators' orders at the router, and answers queries for
+    them.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self._teams: defaultdict[str, Kept] = defaultdict(Kept)
@@ -90,7 +93,7 @@ class _Keeper:
             session.declare_queryable(key, Callback(answer, indirect=False))
 
     def _of(self, key: zenoh.KeyExpr) -> tuple[Kept, str]:
-        """What is kept of a key's team, and the key within the team."""
+        """The stored messages of a key's team, and the key within the team."""
         _, team, rest = str(key).split("/", 2)
         return self._teams[team], rest
 
@@ -131,7 +134,7 @@ class _Keeper:
 
 
 def _asker(query: zenoh.Query) -> str:
-    """The node that asks for a final map; nobody's name where it does not say."""
+    """The node that requests a final map; empty where the request does not contain it."""
     with suppress(WireError):
         request = b"" if query.payload is None else query.payload.to_bytes()
         return decoded(request, FinalMapRequest).node

@@ -1,7 +1,8 @@
-"""A process's link to its team's router: how it is opened, and whether it still lets us in.
+"""A process's link to its team's router: how it is opened, and whether the router still accepts it.
 
-Every process is a client of one router, a star without discovery: what is not configured can not
-connect, and the router is the one place where the traffic of a team can be refused or watched.
+Every process is a client of one router, a star without discovery: a process that is not configured
+can not connect, and the router is the single place where the traffic of a team is controlled or
+watched.
 """
 
 import json
@@ -21,17 +22,19 @@ if TYPE_CHECKING:  # a node without keys needs none of it
 _LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
 _BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link is closed
 FIRST_LOOK_S = 3.0
-"""A client that has not come in for so long looks why."""
+"""Time [s] without a connection after which a client finds out why."""
 LINK_S = 1.0
-"""Between two looks whether the router still lets a node with keys in."""
+"""Interval [s] at which a node with keys checks that the router still accepts it."""
 DEAF = 4
-"""Looks in a row at which a router with a link is not heard: then it lets us hear nothing."""
+"""Number of consecutive checks without any sample from a connected router, after which the node
+concludes that the router withholds all samples.
+"""
 DOOR = "router/door"
-"""Where a router with keys holds a token, which every node that it lets in can see."""
+"""Key of the token of a router with keys, which every accepted node can see."""
 
 
 def opened(settings: dict[str, object]) -> zenoh.Session:
-    """A session with these settings and those that every process of a team has."""
+    """A session with these settings and those that all processes of a team share."""
     config = zenoh.Config()
     always: dict[str, object] = {
         "scouting/multicast/enabled": False,
@@ -95,11 +98,11 @@ def _client_tls(keys: "Credentials") -> dict[str, object]:
 
 
 class Door:
-    """Whether a router with keys still lets this node in: Zenoh would try for ever, silently.
+    """Checks whether a router with keys still accepts this node: Zenoh itself would retry silently.
 
-    A router that is gone is waited for. One that does not take us any more, or that we do not take,
-    is asked why by a handshake; one that gives us a link but lets us hear nothing has a roster
-    without our certificate: there is nothing else on the key that it holds a token on.
+    An absent router is waited for. Where the router no longer accepts us, or we no longer accept
+    it, a handshake finds the reason; a router that connects us and then withholds all samples has a
+    roster without our certificate: nothing else uses the key of its token.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials") -> None:
@@ -112,7 +115,7 @@ class Door:
         self._deaf = 0
 
     def look(self, now_s: float) -> None:
-        """Look every LINK_S; raises BusError with the reason."""
+        """Checks every LINK_S seconds; raises BusError with the reason."""
         if now_s < self._due:
             return
         self._due = now_s + LINK_S

@@ -1,7 +1,8 @@
-"""Landmarks that one side has and the other, which looked there, has not: negative evidence.
+"""Negative evidence: landmarks of one side that the other side should have observed, and did not.
 
-What one keyframe saw together spans a polygon inside its view, since a view is convex. A landmark
-of the other side that lies in it and is not matched should have been seen, and was not.
+The landmarks that one keyframe observed together span a polygon inside its field of view, since a
+field of view is convex. A landmark of the other side that lies in this polygon and is not matched
+should have been observed.
 """
 
 from collections.abc import Iterable
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 Views = Int64[np.ndarray, "_ _"]
-"""Of each keyframe, the landmarks that each saw together; rows are filled up with −1."""
+"""For each keyframe the landmarks that it observed together; rows are padded with −1."""
 
 
 def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
@@ -23,7 +24,7 @@ def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
 
 
 def renumbered(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
-    """The views with other numbers for their landmarks; −1 leaves one out."""
+    """The views with renumbered landmarks; −1 leaves a landmark out."""
     if not views.size:
         return views
     now = np.where(views >= 0, to[views], -1)
@@ -34,9 +35,11 @@ def renumbered(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
 def covered(
     points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: Views
 ) -> Bool[np.ndarray, " n"]:
-    """Which points lie in the convex hull of the landmarks of one view, at their places `own`.
+    """Marks the points in the convex hull of the landmarks of any one view, at their positions
+    `own`.
 
-    A point lies in a hull when the hull's points, seen from it, leave no gap of half a turn.
+    A point lies in a hull when the directions from it to the hull's points leave no gap of half a
+    turn.
     """
     inside = np.zeros(len(points), np.bool_)
     if not len(points) or not views.size:

@@ -1,10 +1,10 @@
-"""Whether a patch of landmarks lies at a place of another part of the map: map matching.
+"""Map matching: decides whether a patch of landmarks lies at a place of another part of the map.
 
 Pair voting proposes alignments; each is grown from two of its pairs under the real joint
-covariance. Its evidence is the log-likelihood ratio of its pairs less what is absent: landmarks
-that one side has where the other looked and has none. The best one is taken only if no other
-alignment comes near it and most of what lies there, on the side that has less, is matched; else it
-waits, and the test that failed is named.
+covariance. The evidence for it is the log-likelihood ratio of its pairs less a penalty for absent
+landmarks: those that one side has where the other side observed and has none. The best alignment is
+accepted only if no other one comes close to it and most of the landmarks there, of the side with
+fewer, are matched; else it is deferred, with the name of the test that failed.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,24 +20,28 @@ from team.estimation.map_joining.association.shares import distance, matched_sha
 from team.estimation.map_joining.association.voting import Points, Vote, moved, voted
 
 BEND = 8.0
-"""So many radii of one object may two maps be bent against each other within a patch."""
+"""Largest distortion of two maps against each other within a patch, in radii of one object."""
 WEAK = 2
-"""An alignment with so many times fewer votes than the best one has pairs is no rival of it."""
+"""An alignment with this many times fewer votes than the best one has pairs is no rival of it."""
 LOOKED_AT = 120
-"""So many alignments are looked at, those with the most matched points."""
+"""Number of alignments that are examined: those with the most matched points."""
 TRIED = 8
-"""So many of them are grown: those of which the least is absent for what is matched."""
+"""Number of them that are grown: those with the fewest absent landmarks for their matched ones."""
 WORTH = 3.0
-"""About what a matched point adds to the log-likelihood ratio, for which are grown."""
+"""About what a matched point adds to the log-likelihood ratio; it decides which alignments are
+grown.
+"""
 SEEDS = 3
-"""So many pairs of seeds are tried for each."""
+"""Number of pairs of seeds that are tried for each."""
 
 
 class Side(NamedTuple):
-    """Landmarks of one side: where they are in the joint Gaussian, their places and spreads.
+    """Landmarks of one side: their indices in the joint Gaussian, their positions and spreads.
 
-    names: what they are called, for who asks. within: which of the whole side's they are.
-    views: which of the whole side's were seen together. parts: of the whole side's, neighbours.
+    names: the caller's numbers of them.
+    within: their indices in the whole side.
+    views: which landmarks of the whole side were observed together.
+    parts: groups of neighbours in the whole side.
     """
 
     at: Indices
@@ -49,9 +53,11 @@ class Side(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """A way to lay the patch on the target: its pairs, what of the target it was grown on.
+    """A placement of the patch on the target: its pairs, and the part of the target that it was
+    grown on.
 
-    absent: landmarks that one side has where the other looked and has none. evidence: for it.
+    absent: number of landmarks that one side has where the other side observed and has none.
+    evidence: log-likelihood ratio of the pairs less the penalty for the absent landmarks.
     """
 
     grown: Grown
@@ -62,12 +68,15 @@ class Alignment(NamedTuple):
 
 
 class Closure(NamedTuple):
-    """The best alignment with its figures. why: the test that failed; empty: it is accepted.
+    """The best alignment with its figures.
 
-    llr: of its pairs. absent: what speaks against it. rival_pairs, rival_llr: pairs and evidence of
-    the best other alignment. share: of the landmarks near the matched places, of the side that has
-    fewer. sd: the largest one of the pairs' differences as they were taken [m]. motion: of the
-    patch's centroid, as voted.
+    why: the test that failed; empty: it is accepted.
+    llr: log-likelihood ratio of its pairs.
+    absent: number of absent landmarks.
+    rival_pairs, rival_llr: pairs and evidence of the best other alignment.
+    share: share of the landmarks near the matched places that are matched, of the side with fewer.
+    sd: largest standard deviation [m] of a pair's difference when the pair was accepted.
+    motion: of the patch's centroid, as voted.
     """
 
     pairs: tuple[Pair, ...]
@@ -82,7 +91,9 @@ class Closure(NamedTuple):
 
 
 class Tests(NamedTuple):
-    """What a closure needs: pairs, evidence, and `context` of what both know (islands only)."""
+    """Requirements of a closure: pairs, evidence, and `context` of what both sides know (islands
+    only).
+    """
 
     pairs: int
     llr: float
@@ -98,8 +109,8 @@ def aligned(
 ) -> list[Alignment]:
     """The alignments of a patch with a target, the one with the most evidence first.
 
-    joint_of: the joint Gaussian of both given a proposed alignment, and what of the target is in
-    it.
+    joint_of: returns the joint Gaussian of both for a proposed alignment, and the part of the
+        target that is in it.
     """
     votes = voted(patch.points, target.points, tolerance(profile), reach(profile), patch.parts)[
         :LOOKED_AT
@@ -128,10 +139,10 @@ def closure(
     tests: Tests,
     aliases: Callable[[], Sequence[Alignment]] = tuple,
 ) -> Closure | None:
-    """The best alignment of a patch with a target; None where there is none of two pairs.
+    """The best alignment of a patch with a target; None where no alignment has two pairs.
 
-    aliases: alignments of the patch that are certainly wrong: evidence for them is none of a place.
-    Asked only for what passes all else.
+    aliases: returns alignments of the patch that are certainly wrong: evidence as strong as theirs
+        does not prove a place. Called only for an alignment that passes all other tests.
     """
     found = aligned(patch, target, joint_of, profile)
     if not found:
@@ -175,7 +186,9 @@ def closure(
 
 
 def _against(closure: Closure, others: Sequence[Alignment]) -> Closure:
-    """The closure with the figures of the best rival, if one of these is better."""
+    """The closure with the figures of the best rival, if one of `others` is better than its present
+    one.
+    """
     best = max(others, key=lambda each: each.evidence, default=None)
     if best is None or best.evidence <= closure.rival_llr:
         return closure
@@ -183,7 +196,7 @@ def _against(closure: Closure, others: Sequence[Alignment]) -> Closure:
 
 
 def _promise(vote: Vote, patch: Side, target: Side, profile: AssociationProfile) -> float:
-    """What the evidence for an alignment may be, from where the points lie as it is voted."""
+    """Estimated evidence for an alignment, from where the points lie as it is voted."""
     local = patch.points.mean - patch.points.mean.mean(axis=0)
     sides = (moved(vote.motion, local), vote.first), (target.points.mean, vote.second)
     absent = _missing(*sides, (patch.views, target.views), profile)
@@ -191,7 +204,7 @@ def _promise(vote: Vote, patch: Side, target: Side, profile: AssociationProfile)
 
 
 def _absent(grown: Grown, patch: Side, there: Side, profile: AssociationProfile) -> int:
-    """Landmarks of either side that are not matched where the other looked."""
+    """Number of landmarks of either side that are not matched where the other side observed."""
     mean = grown.joint.mean
     here = np.full(int(max(there.views.max(initial=-1), there.within.max())) + 1, -1)
     here[there.within] = np.arange(len(there.within))
@@ -210,9 +223,10 @@ def _missing(
     views: tuple[Views, Views],
     profile: AssociationProfile,
 ) -> int:
-    """Points of two sides, given with the matched ones' places, where the other's views are.
+    """Number of unmatched points of two sides, given with the matched ones' indices, inside the
+    other side's views.
 
-    What lies at a matched place may be a part of it that was split off, and is not counted.
+    A point close to a matched place may be a split-off part of that landmark, and is not counted.
     """
     count = 0
     for (points, matched), (own, theirs), seen in ((one, two, views[1]), (two, one, views[0])):
@@ -224,13 +238,13 @@ def _missing(
 
 
 def _named(grown: Grown, there: Side) -> list[tuple[int, int]]:
-    """The pairs by their places among the patch and among the whole target."""
+    """The pairs by their indices in the patch and in the whole target."""
     of = dict(zip(there.at.tolist(), there.names.tolist(), strict=True))
     return [(pair.first, of[pair.second]) for pair in grown.pairs]
 
 
 def failed(closure: Closure, profile: AssociationProfile, tests: Tests) -> str:
-    """The first test that a closure does not pass, in words; empty: it passes all."""
+    """The first test that a closure fails, in words; empty if it passes all."""
     pairs = len(closure.pairs)
     evidence = closure.llr - profile.absent * closure.absent
     if pairs < tests.pairs:
@@ -255,22 +269,24 @@ def failed(closure: Closure, profile: AssociationProfile, tests: Tests) -> str:
 
 
 def tolerance(profile: AssociationProfile) -> float:
-    """How far matched points may lie apart in a proposal [m]."""
+    """Largest distance [m] of matched points in a proposal."""
     return 0.4 * profile.same
 
 
 def reach(profile: AssociationProfile) -> float:
-    """How far apart two points may lie that vote together [m]."""
+    """Largest distance [m] of two points that vote together."""
     return 30.0 * profile.same
 
 
 def free_joint(
     patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
 ) -> tuple[Joint, Side]:
-    """Two maps in the target's frame, the patch as voted and free to lie anywhere; who is in it.
+    """Two maps in the target's frame, with the patch as voted and free to lie anywhere; and what is
+    in it.
 
     The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
-    map's extent. Of the target what lies near the patch as voted, which is all that can be paired.
+    map's extent. Of the target only the landmarks near the patch as voted are in it, which are all
+    that can be paired.
     """
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
@@ -312,7 +328,9 @@ def _grown(
     vote: Vote,
     profile: AssociationProfile,
 ) -> Grown | None:
-    """The largest that grows from one of a few pairs of seeds; None where all seeds fail."""
+    """The largest alignment that grows from one of a few pairs of seeds; None where all seeds
+    fail.
+    """
     place = dict(zip(target.within.tolist(), target.at.tolist(), strict=True))
     first = patch.at[vote.first]
     second = np.array([place[k] for k in vote.second.tolist()], np.int64)

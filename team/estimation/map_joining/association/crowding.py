@@ -1,10 +1,11 @@
-"""How densely landmarks stand about landmarks, from those that one keyframe saw together.
+"""The local density of landmarks, from the landmarks that one keyframe observed together.
 
-What one keyframe saw are different landmarks, whatever else is unknown. Their distances give the
-density of others within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13),
-which is far above the mean density of a map where landmarks stand in groups: a pair that is no
-better known than the members of a group stand apart may be either of them. They also bound the
-lengths of a profile: two landmarks farther apart than their neighbours are not one that was split.
+Landmarks observed by one keyframe are different ones, whatever else is unknown. Their distances
+give the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976,
+J. Appl. Prob. 13). Where landmarks stand in groups it is far above the mean density of the map: a
+pair whose difference is no better known than the spacing within a group may be either of its
+members. The distances also bound the lengths of a profile: two landmarks that are farther apart
+than their neighbours are not one landmark that was split.
 """
 
 from collections.abc import Iterable
@@ -18,15 +19,15 @@ from team.association import AssociationProfile
 from team.estimation.submap import LocalMap
 
 CLOSE = 0.1
-"""The spacing that so large a part of the landmarks falls short of is taken for that of groups."""
+"""Quantile of the landmarks' spacing that is taken as the spacing within groups."""
 FEWEST = 10
-"""Of fewer landmarks with a neighbour the smallest spacing is taken."""
+"""With fewer landmarks that have a neighbour the smallest spacing is taken."""
 SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
-"""A profile's lengths are so many of these spacings at the most."""
+"""Upper bounds of a profile's lengths, in multiples of this spacing."""
 
 
 class Crowd:
-    """The spacings of the landmarks without names of some submaps."""
+    """The spacings of the unnamed landmarks of some submaps."""
 
     def __init__(self, submaps: Iterable[LocalMap]) -> None:
         each = [local.spacings for local in submaps]
@@ -43,15 +44,15 @@ class Crowd:
         return np.sort(found[np.isfinite(found)])
 
     def density(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Other landmarks per square metre within each radius [m] of one; what has not been seen is
-        taken for half a pair.
+        """Density [1/m²] of further landmarks within each radius [m] of a landmark; where no pair
+        was observed half a pair is assumed.
         """
         within = np.searchsorted(self._distances, radius) + 1.0
         found: Float[np.ndarray, " k"] = within / (max(self.landmarks, 1) * np.pi * radius**2)
         return found
 
     def bounded(self, profile: AssociationProfile) -> AssociationProfile:
-        """The profile with lengths that tell neighbours apart."""
+        """The profile with lengths that distinguish neighbours."""
         if not len(self.nearest):
             return profile
         share = CLOSE if len(self.nearest) >= FEWEST else 0.0

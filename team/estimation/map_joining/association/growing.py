@@ -1,12 +1,14 @@
-"""The one primitive of data association between submaps: pairs of a joint Gaussian become one.
+"""The basic step of data association between submaps: merges pairs of landmarks of a joint
+Gaussian.
 
-The pair of landmarks with the best log-likelihood ratio of "one landmark" against "two" is taken,
+The pair of landmarks with the best log-likelihood ratio of "one landmark" against "two" is merged,
 mean and covariance are conditioned on it, and so on. With the difference d of a pair, its
-covariance S (joint, plus the slack s₀²) and λ landmarks to be expected per square metre
+covariance S (joint, plus the slack s₀²) and λ expected landmarks per square metre
 
     LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ.
 
-Since each is taken given those before it, their sum is the ratio of all of them together.
+Since each ratio is conditional on the pairs before it, their sum is the ratio of all of them
+together.
 """
 
 from collections.abc import Sequence
@@ -20,18 +22,21 @@ from team.estimation.map_joining.association.crowding import Crowd
 
 Indices = Int64[np.ndarray, " _"]
 PREGATE = 4.0
-"""Pairs whose χ² is beyond so many gates at first are left out for good."""
+"""Multiple of the gate beyond which a pair is excluded for good."""
 SURE_AFTER = 3
-"""An alignment of so many pairs goes on only where it leaves a small standard deviation: else it
-ties neighbours that are one spacing off."""
+"""Number of pairs after which an alignment grows only by pairs of small standard deviation: others
+connect landmarks to neighbours that are one spacing off.
+"""
 
 
 class Joint(NamedTuple):
     """Landmarks with their joint covariance, in one frame.
 
-    mean: [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: which two can not be one, symmetric:
-    they were seen in one scan, have different names, or somebody said so. crowd: how densely they
-    stand about one another; None: as the profile says.
+    mean: positions [m].
+    covariance: of (x₁, y₁, x₂, …) [m²].
+    apart: which two can not be one, symmetric: they were observed in one scan, have different
+        names, or an operator declared them to be two.
+    crowd: their local density; None: the density of the profile.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -42,7 +47,9 @@ class Joint(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two landmarks that are one: the second one stays. rival: the best LLR that excludes it."""
+    """Two landmarks that are one, known by the second; rival: the best LLR of a pair that excludes
+    it.
+    """
 
     first: int
     second: int
@@ -52,9 +59,9 @@ class Pair(NamedTuple):
 
 
 class Grown(NamedTuple):
-    """Pairs in the order in which they were taken, and what they leave of the joint Gaussian.
+    """Pairs in the order in which they were merged, and the joint Gaussian afterwards.
 
-    doubtful: pairs that passed their gate and likelihood, and a rival kept them from being taken.
+    doubtful: pairs that passed their gate and likelihood, and were rejected because of a rival.
     """
 
     pairs: tuple[Pair, ...]
@@ -63,12 +70,14 @@ class Grown(NamedTuple):
 
     @property
     def llr(self) -> float:
-        """Of all pairs together."""
+        """Log-likelihood ratio of all pairs together."""
         return sum(pair.llr for pair in self.pairs)
 
 
 class Likelihoods(NamedTuple):
-    """Of candidates: χ², log-likelihood ratio, largest standard deviation of the difference."""
+    """For each candidate: χ², log-likelihood ratio, largest standard deviation of the
+    difference.
+    """
 
     chi2: Float[np.ndarray, " k"]
     llr: Float[np.ndarray, " k"]
@@ -78,7 +87,7 @@ class Likelihoods(NamedTuple):
 def likelihoods(
     joint: Joint, first: Indices, second: Indices, profile: AssociationProfile
 ) -> Likelihoods:
-    """How likely it is of each candidate pair that it is one landmark."""
+    """The likelihoods that each candidate pair is one landmark."""
     difference = joint.mean[first] - joint.mean[second]
     n = len(joint.mean)
     P = joint.covariance.reshape(n, 2, n, 2)
@@ -102,7 +111,9 @@ def likelihoods(
 
 
 def conditioned(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
-    """The joint Gaussian given that two landmarks are one; the first keeps apart what both did."""
+    """The joint Gaussian given that two landmarks are one, which keeps apart from what either kept
+    apart.
+    """
     n = len(joint.mean)
     P = joint.covariance
     one, two = slice(2 * first, 2 * first + 2), slice(2 * second, 2 * second + 2)
@@ -126,11 +137,13 @@ def grow(
     most_sd: float = np.inf,
     sure_sd: float = np.inf,
 ) -> Grown | None:
-    """Pairs taken one after the other, the likeliest first; None where a seed fails its gate.
+    """Merges pairs one after the other, the likeliest first; None where a seed fails its gate.
 
-    candidates: two lists of landmarks, pair by pair; where one is merged, its other pairs are gone.
-    seeds: pairs to begin with, whatever their rivals. most_sd: pairs with a larger standard
-    deviation wait; sure_sd: the same, once SURE_AFTER pairs are taken.
+    candidates: two lists of landmarks, pair by pair; when a landmark is merged, its other pairs are
+        dropped.
+    seeds: pairs to begin with, whatever their rivals.
+    most_sd: pairs with a larger standard deviation are not merged; sure_sd: the same, once
+        SURE_AFTER pairs are merged.
     """
     taken: list[Pair] = []
     for one, two in seeds:
@@ -173,10 +186,11 @@ def grow(
 def _rivals(
     joint: Joint, first: Indices, second: Indices, at: Likelihoods, profile: AssociationProfile
 ) -> Float[np.ndarray, " k"]:
-    """The best LLR of each candidate's rivals: another partner of the first, or of the second.
+    """The best LLR of each candidate's rivals: another partner of its first or of its second
+    landmark.
 
-    Another partner that may be the same object as this one (split in two, near, never seen with it)
-    is none: fragments of one landmark would block each other.
+    A partner that may be the same object as this one (split in two, close to it, never observed
+    with it) is no rival: fragments of one landmark would block each other.
     """
     rival = np.full(len(first), -np.inf)
     for mine, other in ((first, second), (second, first)):
@@ -189,7 +203,7 @@ def _rivals(
 
 
 def _of_one(landmarks: Indices) -> tuple[Indices, Indices]:
-    """Every two candidates of one landmark, both ways round."""
+    """Every two candidates of one landmark, in both orders."""
     order = np.argsort(landmarks, kind="stable")
     ordered = landmarks[order]
     begin = np.searchsorted(ordered, ordered, side="left")

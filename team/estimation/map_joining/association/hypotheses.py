@@ -1,11 +1,11 @@
-"""Which landmarks are one where each pair by itself has a rival: all joint assignments weighed.
+"""Joint data association where each single pair has a rival: all joint assignments are weighed.
 
-Two landmarks that stand side by side, of which each may be either of two known ones, are told apart
-by one another: their relative places are known far better than where both are. The landmarks to be
-assigned are taken one after the other; each is one of those known, given the pairs before it, or
-none of them. An assignment has the weight exp(Σ LLR) of its pairs (`growing`), and a pair is taken
-when the assignments that have it outweigh all others. Neira and Tardós (2001, IEEE T-RA 17(6)) take
-the assignment with the most pairs; here it has to be the only one that is likely.
+Two neighbouring landmarks, each of which may be either of two known ones, are distinguished by each
+other: their relative position is known far better than their absolute ones. The landmarks are
+assigned one after the other; each is one of the known landmarks, given the pairs before it, or a
+new one. An assignment has the weight exp(Σ LLR) of its pairs (`growing`), and a pair is accepted
+when the assignments that contain it outweigh all others. Neira and Tardós (2001, IEEE T-RA 17(6))
+accept the assignment with the most pairs; here it also has to be the only likely one.
 """
 
 from typing import NamedTuple
@@ -24,15 +24,15 @@ from team.estimation.map_joining.association.growing import (
 )
 
 MOST_ASSIGNED = 10
-"""So many landmarks are assigned together, those whose candidates are known best."""
+"""Number of landmarks that are assigned together: those with the best known candidates."""
 BEAM = 100
-"""So many assignments are kept from landmark to landmark."""
+"""Number of assignments that are continued from landmark to landmark."""
 HOPELESS = 12.0
-"""An assignment whose weight is so many nats below the best one's is left out."""
+"""An assignment is dropped whose log weight is below the best one's by more than this [nat]."""
 
 
 class _Assignment(NamedTuple):
-    """Pairs so far, their log weight, and the joint Gaussian given them."""
+    """The pairs so far, their log weight, and the joint Gaussian given them."""
 
     weight: float
     pairs: tuple[Pair, ...]
@@ -42,10 +42,11 @@ class _Assignment(NamedTuple):
 def jointly(
     joint: Joint, first: Indices, second: Indices, profile: AssociationProfile, most_sd: float
 ) -> Grown:
-    """The pairs of candidates that nearly all of the weight of joint assignments agrees on.
+    """The pairs of candidates on which nearly all of the weight of joint assignments agrees.
 
-    A pair needs log odds of `odds` against every assignment without it, and one that stands alone
-    a standard deviation below `tight`. most_sd: candidates with a larger one are left out.
+    A pair needs log odds of `odds` against all assignments without it, and a single pair a standard
+    deviation below `tight`.
+    most_sd: candidates with a larger standard deviation are left out.
     """
     at = likelihoods(joint, first, second, profile)
     open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
@@ -78,7 +79,7 @@ def jointly(
 
 
 def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
-    """The landmarks to assign: who has the surest candidates first."""
+    """The order of assignment: the landmark with the surest candidates first."""
     surest: dict[int, float] = {}
     for each, own in zip(first.tolist(), sd.tolist(), strict=True):
         surest[each] = min(own, surest.get(each, np.inf))
@@ -86,7 +87,9 @@ def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
 
 
 def _of_each(joint: Joint, first: int, others: list[int], profile: AssociationProfile) -> Indices:
-    """The candidates of a landmark, the likeliest one of those that are likely to be one."""
+    """The candidates of a landmark, of which those that are likely to be one count as their
+    likeliest one.
+    """
     at = likelihoods(joint, np.full(len(others), first), np.array(others), profile)
     kept: list[int] = []
     for k in np.argsort(-at.llr, kind="stable").tolist():
@@ -98,7 +101,9 @@ def _of_each(joint: Joint, first: int, others: list[int], profile: AssociationPr
 def _with(
     one: _Assignment, first: int, others: Indices, profile: AssociationProfile, most_sd: float
 ) -> list[_Assignment]:
-    """An assignment with one landmark more: as none of those known, and as each that fits."""
+    """The continuations of an assignment by one landmark: as a new one, and as each one that
+    fits.
+    """
     found = [one]
     others = others[~one.joint.apart[first, others]]
     if not len(others):
@@ -113,7 +118,7 @@ def _with(
 
 
 def _fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
-    """The landmark and those that are likely to be it: two parts of one are no rivals."""
+    """The landmark and its likely fragments: two parts of one landmark are no rivals."""
     n = len(joint.mean)
     at = likelihoods(joint, np.full(n, landmark), np.arange(n), profile)
     near = np.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
@@ -128,9 +133,9 @@ def _agreed(
     profile: AssociationProfile,
     lost: float,
 ) -> Grown:
-    """The best assignment's pairs that the others have as well, by weight.
+    """The pairs of the best assignment that the others contain as well, by weight.
 
-    lost: the weight of the assignments that there was no room for, in terms of the best one's.
+    lost: the weight of the dropped assignments, relative to the best one's.
     """
     best = assigned[0]
     weights = np.exp([one.weight - best.weight for one in assigned])

@@ -1,9 +1,9 @@
-"""Landmarks as sets of (submap, local landmark), and why each two are one.
+"""The landmarks as sets of (submap, local landmark), with the evidence for each union.
 
-A submap founds each of its unnamed landmarks anew, with a number made of its own name; association
-makes sets one. A set is known by the number of its smallest member, so its identity lasts while
-members come; a set with a named landmark has that name. Everything here depends on the order in
-which submaps are taken alone.
+A submap adds each of its unnamed landmarks as a new one, with a number derived from the submap's
+name; association unites them to sets. A set has the number of its smallest member, so that its
+identity lasts while members are added; a set with a named landmark has that name. Everything here
+depends only on the order in which submaps are added.
 """
 
 import hashlib
@@ -15,9 +15,9 @@ from team.config import UNNAMED
 from team.estimation.contribution import Contribution, Key, Stream, named
 
 OPEN = 2**62
-"""The last submap of a side to which all that come belong."""
+"""The last submap of a side that all later submaps belong to."""
 KEPT = 400
-"""So many of the newest decisions are kept."""
+"""Number of newest decisions that are stored."""
 
 
 class Member(NamedTuple):
@@ -34,9 +34,10 @@ class Member(NamedTuple):
 
 
 class Tie(NamedTuple):
-    """Why a set that had this number went into another: by which step and with which figures.
+    """Why the set with this number was united with another: by which step and with which figures.
 
-    rival: the best log-likelihood ratio of a pair that excludes it. stamp_ns: the tick's last end.
+    rival: the best log-likelihood ratio of a pair that excludes it.
+    stamp_ns: the last end of a submap in the tick.
     """
 
     kind: str
@@ -48,11 +49,13 @@ class Tie(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """A closure, or a merge of robots, that was accepted, undone or waits.
+    """A closure, or a merge of robots, that was accepted, undone or deferred.
 
-    kind: "closure", "merge", "undone", "waits". about: in words, between whom. why: the test that
-    failed; empty where it was accepted. absent: landmarks that one side has where the other looked
-    and has none. rival_llr: the evidence for the best other alignment.
+    kind: "closure", "merge", "undone", "waits".
+    about: in words, between which robots.
+    why: the test that failed; empty where it was accepted.
+    absent: number of landmarks that one side has where the other side observed and has none.
+    rival_llr: the evidence for the best other alignment.
     """
 
     stamp_ns: int
@@ -69,7 +72,7 @@ class Decision(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What an operator says of two local landmarks: that they are one landmark, or two."""
+    """An operator's decision on two local landmarks: that they are one landmark, or two."""
 
     first: Member
     second: Member
@@ -77,7 +80,7 @@ class Verdict(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A closure that was accepted: its pairs by their smallest members, and its newer side.
+    """An accepted closure: its pairs by their smallest members, and its newer side.
 
     newer: the streams of that side, with the first and the last submap of each that belongs to it.
     """
@@ -91,9 +94,12 @@ class Opened(NamedTuple):
 class Landmarks:
     """The sets of unnamed landmarks.
 
-    number: of each member, given when its submap came. sets: the members of each identity,
-    ascending. ties: by the number that is gone. waits: the last failed attempt of each stream.
-    opened: the closures of the last tick. undone: those that are not accepted again.
+    number: of each member, given when its submap was added.
+    sets: the members of each identity, ascending.
+    ties: the unions, by the number that was given up.
+    waits: the last failed attempt of each stream.
+    opened: the closures of the last tick.
+    undone: closures that are not accepted again.
     """
 
     number: Mapping[Member, int] = field(default_factory=dict)
@@ -106,18 +112,20 @@ class Landmarks:
     undone: tuple[Opened, ...] = ()
 
     def identity(self, member: Member) -> int | None:
-        """The number of the landmark that a member is of; None: there is no such member."""
+        """The number of the landmark that a member belongs to; None where there is no such
+        member.
+        """
         number = self.number.get(member)
         while number is not None and number in self.ties:
             number = self.ties[number].into
         return number
 
     def decided(self, *decisions: Decision) -> "Landmarks":
-        """With more decisions, of which the newest are kept."""
+        """The landmarks with further decisions, of which the newest are stored."""
         return replace(self, decisions=(*self.decisions, *decisions)[-KEPT:])
 
     def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
-        """Whether a closure that was undone has a third or more of these pairs of identities."""
+        """Whether a closure was undone that has a third or more of these pairs of identities."""
         wanted = {frozenset(pair) for pair in pairs}
         for each in self.undone:
             old = {frozenset((self.identity(one), self.identity(two))) for one, two in each.pairs}
@@ -130,7 +138,7 @@ NO_LANDMARKS = Landmarks()
 
 
 def members_of(contribution: Contribution) -> list[Member | None]:
-    """The member that each landmark of a submap is; None for one with a name."""
+    """The member for each landmark of a submap; None for a named one."""
     of = contribution
     return [
         Member(of.robot, of.incarnation, of.sequence, id_ - UNNAMED) if id_ >= UNNAMED else None
@@ -141,7 +149,9 @@ def members_of(contribution: Contribution) -> list[Member | None]:
 def founded(
     landmarks: Landmarks, contributions: Iterable[Contribution]
 ) -> tuple[Landmarks, dict[Key, list[int]]]:
-    """Each unnamed landmark of the submaps as a set of its own, and the numbers, per submap."""
+    """Adds each unnamed landmark of the submaps as a set of its own; returns also the numbers, per
+    submap.
+    """
     numbers: dict[Key, list[int]] = {}
     number, sets = None, None
     for contribution in contributions:
@@ -178,10 +188,11 @@ def number_of(member: Member) -> int:
 def united(
     landmarks: Landmarks, ties: Sequence[tuple[int, Tie]]
 ) -> tuple[Landmarks, dict[int, int]]:
-    """The sets after some have gone into others, and the new number of each that has got one.
+    """Unites sets; returns them with the new number of each identity that was renumbered.
 
-    ties: of each identity into `tie.into`. Of each union the name stays, if it has one, else the
-    number of the smallest member: where that is the one that goes, the tie is told the other way.
+    ties: each identity that is united with `tie.into`. A union has the name of a named set, else
+        the number of its smallest member; where that is the identity to be given up, the tie is
+        recorded in the other direction.
     """
     sets, told = dict(landmarks.sets), dict(landmarks.ties)
     becomes: dict[int, int] = {}
@@ -203,5 +214,5 @@ def united(
 
 
 def between(one: Stream, two: Stream) -> str:
-    """Of whom a decision is, in words."""
+    """Names the two sides of a decision, in words."""
     return named(one) if one == two else f"{named(one)} and {named(two)}"

@@ -1,4 +1,4 @@
-"""How much of what lies at a matched place is matched: a share of the landmarks there."""
+"""The share of the landmarks near a matched place that are matched."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,7 +6,7 @@ from jaxtyping import Float
 from team.association import AssociationProfile
 
 WIDE = 3.0
-"""So many spacings around a closure's places does an audit look."""
+"""Radius around a closure's places that an audit considers, in spacings."""
 
 
 def matched_share(
@@ -16,9 +16,10 @@ def matched_share(
     pairs: int,
     profile: AssociationProfile,
 ) -> float:
-    """Pairs / the fewer of the points of the two sides near the matched places.
+    """Number of pairs over the number of points near the matched places, of the side with fewer.
 
-    Near: not farther from one than the median distance between neighbouring places.
+    A point is near if it is no farther from a matched place than the median distance between
+    neighbouring places.
     """
     if len(places) < 2:
         return 0.0
@@ -33,11 +34,12 @@ def overlap_share(
     places: Float[np.ndarray, "k 2"],
     profile: AssociationProfile,
 ) -> float:
-    """Matched places / the fewer of the points of the two sides where both sides know the area.
+    """Matched places over the number of points of the side with fewer, where both sides know the
+    area.
 
-    one, two: all points of either side, the matched ones among them. That is within WIDE spacings
-    of a matched place, with a point of the other side within one: where two robots have been at
-    different places their maps go on differently.
+    one, two: all points of either side, the matched ones among them. The area is within WIDE
+        spacings of a matched place and within one spacing of a point of the other side: where two
+        robots have been at different places their maps differ in extent.
     """
     if len(places) < 2 or not len(one) or not len(two):
         return 0.0
@@ -50,7 +52,7 @@ def overlap_share(
 
 
 def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
-    """Twice the median distance between neighbouring places, and twice `same` at least [m]."""
+    """Twice the median distance [m] between neighbouring places, and at least twice `same`."""
     away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
     np.fill_diagonal(away, np.inf)
     return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
@@ -59,7 +61,7 @@ def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> fl
 def distance(
     points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, " n"]:
-    """From each point to the nearest of others [m]."""
+    """Distance [m] from each point to the nearest one of `others`."""
     away: Float[np.ndarray, " n"] = np.hypot(
         *(points[:, None] - others[None]).transpose(2, 0, 1)
     ).min(axis=1)

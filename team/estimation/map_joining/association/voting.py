@@ -1,8 +1,8 @@
-"""Where one set of points may lie on another, from their shapes alone: pairs of points vote.
+"""Proposes alignments of two sets of points from their shapes alone, by votes of pairs of points.
 
 Two points of one side at the distance of two points of the other propose a rigid motion; motions
-that many pairs propose are refined by the nearest neighbours. No place is left out: an alignment
-that is not looked for is a rival that is not seen.
+that many pairs propose are refined by nearest neighbours. All places are searched: an alignment
+that is not proposed could not be counted as a rival.
 """
 
 from collections.abc import Sequence
@@ -12,25 +12,27 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 MOST_BINS = 60
-"""So many of the motions with the most votes are refined."""
+"""Number of motions, those with the most votes, that are refined."""
 ANGLE_BIN = np.radians(6.0)
 REFINEMENTS = 4
 MOST_HYPOTHESES = 100_000
 OF_A_PART = 16
-"""So many of a part's motions are refined on all points."""
+"""Number of a part's motions that are refined on all points."""
 MOST_DISTANCES = 2_000_000
-"""So many distances between points are held at once."""
+"""Number of distances between points that are in memory at once."""
 
 
 class Points(NamedTuple):
-    """Points of one side [m], and each one's standard deviation beside its neighbours [m]."""
+    """Points of one side [m], and the standard deviation [m] of each relative to its neighbours."""
 
     mean: Float[np.ndarray, "n 2"]
     sd: Float[np.ndarray, " n"]
 
 
 class Vote(NamedTuple):
-    """b_from_a (x, y, θ) about the centroid of the a, and the pairs of points that it makes one."""
+    """The motion b_from_a (x, y, θ) about the centroid of a's points, and the pairs that it
+    matches.
+    """
 
     motion: Float[np.ndarray, "3"]
     first: Int64[np.ndarray, " k"]
@@ -44,12 +46,13 @@ def voted(
     longest: float,
     parts: Sequence[Int64[np.ndarray, " _"]] = (),
 ) -> list[Vote]:
-    """Distinct rigid motions of a onto b by falling number of matched points.
+    """Distinct rigid motions of a onto b, in descending number of matched points.
 
-    tolerance: how far matched points may lie apart [m]. longest: pairs of points that are farther
-    apart do not vote [m], since maps are not rigid over any distance. parts: of a, each of which
-    votes by itself too: where two maps share a small place that lies far from the middle of a, the
-    votes of all its points scatter.
+    tolerance: largest distance of matched points [m].
+    longest: largest distance [m] of two points that vote together, since maps are not rigid over
+        any distance.
+    parts: subsets of a that vote by themselves as well: where two maps share a small place far from
+        the centroid of a, the votes of all points scatter.
     """
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
@@ -72,7 +75,9 @@ def voted(
 
 
 def _distinct(found: list[Vote], points: int) -> list[Vote]:
-    """Those that are no variant of one with more matched points, by falling number of them."""
+    """The votes that are no variant of one with more matched points, in descending number of
+    them.
+    """
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
     paired = np.full((len(found), points), -1)
@@ -121,7 +126,7 @@ def _proposed(
 def _baselines(
     points: Float[np.ndarray, "n 2"], shortest: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of points with these distances, and their distances."""
+    """Pairs of points with a distance in this interval, and their distances."""
     i, j = np.triu_indices(len(points), 1)
     length = np.hypot(*(points[i] - points[j]).T)
     kept = (length >= shortest) & (length <= longest)
@@ -160,9 +165,10 @@ def _refined(
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """The motions that the nearest neighbours agree on, with a tolerance that narrows to its own.
+    """The motions that the nearest neighbours confirm, with a tolerance that narrows to
+    `tolerance`.
 
-    Those that no two points agree on are left out.
+    Motions that no two points confirm are left out.
     """
     most = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
     return [
@@ -179,7 +185,7 @@ def _refined_together(
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """As `_refined`, with all distances held at once."""
+    """As `_refined`, with all distances in memory at once."""
     local = a.mean - centre
     for step in range(REFINEMENTS):
         reach = tolerance * (1.5 if step < 2 else 1.0)
@@ -201,7 +207,9 @@ def _neighbours(
     b: Float[np.ndarray, "m 2"],
     reach: float,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Of each point the nearest one of b, and whether they are each other's and within reach."""
+    """For each point the nearest one of b, and whether the two are mutually nearest and within
+    reach.
+    """
     c, s = np.cos(motions[:, 2:]), np.sin(motions[:, 2:])
     x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
     y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
@@ -217,7 +225,7 @@ def _aligned(
     to: Float[np.ndarray, "B n 2"],
     weights: Float[np.ndarray, "B n"],
 ) -> Float[np.ndarray, "B 3"]:
-    """The argmin over (x, y, θ) of Σ w ‖to − R(θ) a − (x, y)‖² for each of B."""
+    """The (x, y, θ) that minimise Σ w ‖to − R(θ) a − (x, y)‖², for each of B sets of weights."""
     share = weights / weights.sum(axis=1, keepdims=True)
     from_, onto = share @ a, (share[:, :, None] * to).sum(axis=1)
     p, q = a - from_[:, None], to - onto[:, None]
@@ -233,7 +241,7 @@ def _aligned(
 def moved(
     motion: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Points about the centroid, in the other side's frame."""
+    """The points, given about the centroid, in the other side's frame."""
     c, s = np.cos(motion[2]), np.sin(motion[2])
     placed: Float[np.ndarray, "n 2"] = points @ np.array([[c, s], [-s, c]]) + motion[:2]
     return placed
