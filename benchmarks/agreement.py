@@ -7,7 +7,7 @@ other is lost, 10 % comes twice, up to 2 s late, so out of order; partitions by 
 each of which may tear the end of a disk; the second robot joins at half time, the last one only
 ever meets the first. CASE is a scenario, `eight`, or `utias-6`; with `@100` behind it so many steps
 or seconds of it; with `/withdrawn` an operator withdraws the second robot half way, and only the
-first one hears it.
+first one hears it. --json FILE keeps each row as it comes; a row that is in it is not run again.
 """
 
 import argparse
@@ -237,13 +237,17 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     found = []
+    if options.json is not None and options.json.exists():
+        found = json.loads(options.json.read_text())
     for case in options.cases:
-        for each in storms(case, options.ways, options.utias):
+        there = {each["centre"] for each in found if each["case"] == case}
+        ways = [way for way in options.ways if way not in there]
+        for each in storms(case, ways, options.utias) if ways else ():
             found.append(each)
             sys.stdout.write(json.dumps(each) + "\n")
             sys.stdout.flush()
-    if options.json is not None:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+            if options.json is not None:
+                options.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0 if all(each["equal"] and each["submaps_equal"] for each in found) else 1
 
 

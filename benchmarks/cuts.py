@@ -5,9 +5,10 @@
 Needs root and `ip` (Linux). The router, the world, the recorder, the centre and the robots hang on
 one bridge; a cut takes one process's link down for a while, for less or for more than the lease of
 a connection. Each run is a short world; its final map is compared byte by byte with that of the
-same team in memory, and its log's content with the streams' own last counts. Ends with 1 unless
-every process of every run ended with 0, with this map, and without a hole that `teamslam log check`
-does not name.
+same team in memory, and its log's content with the streams' own last counts. --json FILE keeps what
+each run was, as it ends; called again with this file, only runs that are not in it are made. Ends
+with 1 unless every process of every run ended with 0, with this map, and without a hole that
+`teamslam log check` does not name.
 """
 
 import argparse
@@ -197,17 +198,19 @@ def main() -> int:
         expected = expected_of(resolved)
         robots = [robot.id for robot in resolved.robots]
         runs = []
-        for number in range(options.runs):
+        if options.json and options.json.exists():
+            runs = [Run(**row) for row in json.loads(options.json.read_text())]
+        for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
             runs.append(one(number, scenario, robots, expected, options))
             print(row(runs[-1]), flush=True)
+            if options.json:
+                options.json.write_text(json.dumps([asdict(run) for run in runs]))
     good, cuts = sum(run.good for run in runs), sum(len(run.cuts) for run in runs)
     print(
         f"{good} of {len(runs)} runs good, {cuts} links cut; map equal in "
         f"{sum(r.equal for r in runs)}, log whole in {sum(not r.lacks for r in runs)}; "
         f"load {os.getloadavg()[0]:.1f}"
     )
-    if options.json:
-        options.json.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
     return 0 if good == len(runs) else 1
 
 

@@ -4,16 +4,19 @@
     python benchmarks/kills.py --runs 10 --stop 20 --what central,router
     python benchmarks/kills.py --runs 6 --kills 1 --stop inf --end-silent 12
     python benchmarks/kills.py --runs 10 --keys --verify
+    python benchmarks/kills.py --runs 10 --without-centre --what robot,router,world
 
 Each run is a short world; with --keys behind certificates. Who is stopped for ever stays so until
-`launch --end-silent` ends it. The final map is compared, byte by byte, with that of the same team
-in memory, where nobody dies, the log's content with the streams' own last counts; with --verify
-each log is computed again. A row per run, a summary, and with --json everything for machines. Ends
-with 1 unless every run ended with 0, with this map, left no process, and no hole in its log that
-`teamslam log check` does not name.
+`launch --end-silent` ends it. The final map, --without-centre every robot's, is compared, byte by
+byte, with that of the same team in memory, where nobody dies, the log's content with the streams'
+own last counts; with --verify each log is computed again. A row per run, and a summary. --json FILE
+keeps what each run was, as it ends; called again with this file, only runs that are not in it are
+made. Ends with 1 unless every run ended with 0, with this map, left no process, and no hole in its
+log that `teamslam log check` does not name.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import random
@@ -148,6 +151,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         more = ["--keys", str(options.keys_made)] if options.keys else []
+        more += ["--without-centre"] if options.without_centre else []
         if options.end_silent:
             more += ["--end-silent", str(options.end_silent)]
         began = time.monotonic()
@@ -157,7 +161,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
                  "--output", "run", "--json", "result.json", *more],
                 cwd=folder, stdout=said, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
             )  # fmt: skip
-        await_start(folder, launch)
+        await_start(folder, launch, "robot-r1" if options.without_centre else "central")
         awake: list[tuple[float, int]] = []
         due = sorted(
             time.monotonic() + rng.uniform(0.0, options.span) for _ in range(options.kills)
@@ -187,11 +191,15 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             launch.kill()
             launch.wait()
         run.wall_s = time.monotonic() - began
-        final = final_in(folder)
-        run.equal = final == expected
+        result = {}
         with suppress(OSError, ValueError):
             result = json.loads((folder / "result.json").read_text())
             run.restarts, run.failures = result["restarts"], result["failures"]
+        if options.without_centre:
+            finals = {peer["final_map_sha256"] for peer in result.get("peers", {}).values()}
+            run.equal = finals == {hashlib.sha256(expected).hexdigest()}
+        else:
+            run.equal = final_in(folder) == expected
         checked = subprocess.run(
             [*PROGRAM, "log", "check", "run/log.mcap"],
             cwd=folder, capture_output=True, text=True, check=False,
@@ -212,10 +220,10 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
     return run
 
 
-def await_start(folder: Path, launch: subprocess.Popen[bytes]) -> None:
-    """Return when the world publishes."""
+def await_start(folder: Path, launch: subprocess.Popen[bytes], node: str) -> None:
+    """Return when a node has connected: soon the world publishes."""
     end = time.monotonic() + 120.0
-    said = folder / "run" / "central.log"
+    said = folder / "run" / f"{node}.log"
     while time.monotonic() < end and launch.poll() is None:
         if said.exists() and "connected" in said.read_text():
             return
@@ -245,6 +253,20 @@ def hit(
         run.hit.append((round(at_s, 2), "-".join([kind, *robots])))
 
 
+def kept_in(path: Path | None) -> list[Run]:
+    """The runs that an earlier call has kept."""
+    if path is None or not path.exists():
+        return []
+    rows = json.loads(path.read_text())
+    return [Run(**{name: row[name] for name in Run.__dataclass_fields__}) for row in rows]
+
+
+def keep_in(path: Path | None, runs: list[Run]) -> None:
+    """Write all runs until now."""
+    if path is not None:
+        path.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
+
+
 def main() -> int:
     """Read the options, run, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -255,6 +277,7 @@ def main() -> int:
     parser.add_argument("--end-silent", type=float, help="launch ends who is silent so long [s]")
     parser.add_argument("--keys", action="store_true", help="behind certificates")
     parser.add_argument("--verify", action="store_true", help="compute each log again")
+    parser.add_argument("--without-centre", action="store_true", help="every robot is a peer")
     parser.add_argument("--what", default="robot,central,router,record,world,viewer")
     parser.add_argument("--load", type=int, default=0, help="busy loops beside the team")
     parser.add_argument("--steps", type=int, default=60)
@@ -276,12 +299,13 @@ def main() -> int:
             subprocess.Popen([sys.executable, "-c", "while True: pass"])
             for _ in range(options.load)
         ]
-        runs = []
+        runs = kept_in(options.json)
         try:
-            for number in range(options.runs):
+            for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
                 run = one(number, scenario, expected, options)
                 runs.append(run)
                 print(row(run), flush=True)
+                keep_in(options.json, runs)
         finally:
             for process in busy:
                 process.kill()
@@ -297,8 +321,6 @@ def main() -> int:
         f"{sum(bool(r.lacks) and not r.check for r in runs)}, "
         f"verified {sum(r.verified is True for r in runs)}; load {os.getloadavg()[0]:.0f}"
     )
-    if options.json:
-        options.json.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
     return 0 if good == len(runs) else 1
 
 

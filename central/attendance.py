@@ -2,9 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from team.wire import messages as m
 from team.wire.newer import further, later_end, later_head
+
+MOST_HEARD = 1_000
+"""Announced ends of the team, and last words of a robot, that are kept beside those believed."""
 
 Dealt = Callable[[m.Done], bool]
 """True once all messages announced in a robot's `Done` have been dealt with."""
@@ -14,8 +18,9 @@ Dealt = Callable[[m.Done], bool]
 class Attendance:
     """What the centre knows of one robot.
 
-    began: the latest incarnation that has begun; 0: none. head: the newest head of its driver, in a
-    live team. driver: whether its driver is present; None: unknown.
+    done: of the last words the one that is believed; dones: all that were heard. began: the latest
+    incarnation that has begun; 0: none. head: the newest head of its driver, in a live team.
+    driver: whether its driver is present; None: unknown.
     """
 
     alive: bool = False
@@ -23,6 +28,7 @@ class Attendance:
     given_up: bool = False
     progress: m.Progress | None = None
     done: m.Done | None = None
+    dones: list[m.Done] = field(default_factory=list)
     began: int = 0
     head: m.StreamHead | None = None
     driver: bool | None = None
@@ -59,14 +65,14 @@ class TeamAttendance:
 
     now_ns: the newest team time in any message. withdrawn: the robots that the team goes on
     without; nobody waits for one that has left. world_end: the last counters that the world has
-    announced. contradicting_end: an announced end with fewer measurements than robots say they have
-    consumed; it becomes world_end if the robots' `Done` messages confirm it. ordered: an operator
-    has ordered the live team to end.
+    announced. ends: all ends that were announced, those refused included: one that the robots'
+    `Done` messages confirm becomes world_end. ordered: an operator has ordered the live team to
+    end.
     """
 
     robots: dict[str, Attendance]
     world_end: m.End | None = None
-    contradicting_end: m.End | None = None
+    ends: list[m.End] = field(default_factory=list)
     now_ns: int = 0
     withdrawn: frozenset[str] = frozenset()
     ordered: bool = False
@@ -92,11 +98,12 @@ class TeamAttendance:
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Done() if message.robot in self.robots:
                 robot = self.robots[message.robot]
+                _note(message, robot.dones)
                 # A robot's last word is that of its last incarnation, in whichever order they come.
                 if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
-                    self.consider_end(self.contradicting_end)
             case m.End():
+                self.note_end(message)
                 self.world_end = later_end(message, self.world_end)
             case m.TeamEnd():
                 self.ordered = True
@@ -115,19 +122,9 @@ class TeamAttendance:
             case _:
                 pass
 
-    def consider_end(self, end: m.End | None) -> None:
-        """Keep an end that contradicts the robots' progress until all are done at its counts.
-
-        Without keys anybody may publish progress in a robot's name. A robot whose `Done` has the
-        same counts got the same end from its own source, which confirms it.
-        """
-        self.contradicting_end = end
-        if end is None:
-            return
-        dones = {r: a.done for r, a in self.robots.items() if a.done is not None}
-        counts = {(d.robot, d.incarnation, d.measurements) for d in dones.values()}
-        if counts == {(s.robot, s.incarnation, s.measurements) for s in end.streams}:
-            self.world_end, self.contradicting_end = later_end(end, self.world_end), None
+    def note_end(self, end: m.End) -> None:
+        """Keep an announced end, believed or refused: robots' last words may confirm it."""
+        _note(end, self.ends)
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
         robot.began = max(robot.began, message.incarnation)
@@ -237,7 +234,40 @@ class TeamAttendance:
 
     def concluded(self, dealt: Dealt) -> bool:
         """True once the streams have ended and no robot is waited for."""
+        return self._is_concluded(dealt) or (self._agree(dealt) and self._is_concluded(dealt))
+
+    def _is_concluded(self, dealt: Dealt) -> bool:
         return self.end is not None and all(self.settled(r, dealt) for r in self.robots)
+
+    def _agree(self, dealt: Dealt) -> bool:
+        """Believe an announced end and the robots' last words that confirm each other.
+
+        Where there are no keys, a stranger may have announced ends and last words further than
+        there is anything; those of the world and of its robots name the same counters all the same.
+        """
+        for end in self.ends:
+            found = {s.robot: self._confirmed(s, dealt) for s in end.streams}
+            others = self.robots.keys() - found.keys()
+            if not all(self._is_excused(r) for r, done in found.items() if done is None):
+                continue
+            if all(self._is_excused(r) for r in others) and any(found.values()):
+                self.world_end = end
+                for name, done in found.items():
+                    self.robots[name].done = done or self.robots[name].done
+                return True
+        return False
+
+    def _is_excused(self, name: str) -> bool:
+        """Whether the team does not wait for the robot's last word."""
+        robot = self.robots[name]
+        return robot.given_up or (name in self.withdrawn and not robot.alive)
+
+    def _confirmed(self, end: m.StreamEnd, dealt: Dealt) -> m.Done | None:
+        """The last word of a robot that its stream ends so, if everything of it is here."""
+        robot = self.robots[end.robot]
+        counts = end.incarnation, end.measurements
+        same = (d for d in robot.dones if (d.incarnation, d.measurements) == counts)
+        return next(filter(dealt, same), None)
 
     def takes_part(self, name: str) -> bool:
         """Whether the robot may still send a map; a lost one may come back."""
@@ -271,3 +301,13 @@ class TeamAttendance:
         return (
             not robot.began or robot.driver is False or (head is not None and head.state == "left")
         )
+
+
+T = TypeVar("T", m.Done, m.End)
+
+
+def _note(message: T, heard: list[T]) -> None:
+    """Keep a message beside those that were heard, the newest MOST_HEARD."""
+    if message not in heard:
+        heard.append(message)
+        del heard[:-MOST_HEARD]

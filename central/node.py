@@ -75,7 +75,9 @@ class CentralNode:
         if refused is None and isinstance(message, m.End):
             refused = self._attendance.contradicts(message)
             if refused is not None:
-                self._attendance.consider_end(message)
+                self._attendance.note_end(message)
+                # Where the robots' last words confirm it, nothing may come behind it.
+                refused = None if self._attendance.concluded(self._intake.dealt) else refused
         return refused
 
     def _admit(self, message: m.Message) -> None:

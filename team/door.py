@@ -29,7 +29,7 @@ class Door:
 
     def __init__(self, robots: Iterable[str]) -> None:
         self._robots = frozenset(robots)
-        self._began: dict[tuple[str, int], int] = {}
+        self._began: dict[tuple[str, int], int | None] = {}
 
     def admit(self, robot: str) -> None:
         """From now on the robot is in the team."""
@@ -40,10 +40,20 @@ class Door:
         strangers = sorted(set(_robots(message)) - self._robots)
         if strangers:
             return f"of {', '.join(strangers)}, not in this team"
-        refused = absurd(message) or self._another_time(message)
+        refused = absurd(message)
         if refused is None and isinstance(message, m.InitialPose):
-            self._began.setdefault((message.robot, message.incarnation), message.stamp_ns)
-        return refused
+            self._note_beginning(message)
+        return refused or self._another_time(message)
+
+    def _note_beginning(self, start: m.InitialPose) -> None:
+        """Note when a stream begins; one that two messages begin at two times has no bounds.
+
+        One of the two is a stranger's, and its source's own messages must pass.
+        """
+        stream = (start.robot, start.incarnation)
+        known = self._began.setdefault(stream, start.stamp_ns)
+        if known is not None and another_time(start.stamp_ns, known) is not None:
+            self._began[stream] = None
 
     def _another_time(self, message: m.Message) -> str | None:
         if not isinstance(message, OF_ROBOTS):

@@ -303,3 +303,75 @@ def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there
     assert misled.final is not None
     assert honest.final is not None
     assert encoded(misled.final) == encoded(honest.final)
+
+
+def done_of(robot: str, incarnation: int, measurements: int, submaps: int) -> m.Done:
+    return m.Done(
+        stamp_ns=0, robot=robot, incarnation=incarnation, measurements=measurements, steps=0,
+        submaps=submaps, ledger=(),
+    )  # fmt: skip
+
+
+def end_of(robot: str, incarnation: int, measurements: int) -> m.End:
+    other = next(each for each in END.streams if each.robot != robot)
+    mine = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=measurements)
+    return m.End(stamp_ns=0, streams=(mine, other))
+
+
+FAR_START = m.InitialPose(
+    stamp_ns=2**61, robot="r1", incarnation=1, number=0, pose=b"", covariance=b""
+)
+FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
+    "last words of a later incarnation": [(ch.ROBOT_DONE, "r1", done_of("r1", 900, 5, 0))],
+    "last words of submaps that never were": [(ch.ROBOT_DONE, "r1", done_of("r1", 1, 5, 9))],
+    "an end in a later incarnation": [(ch.END, "", end_of("r1", 900, 5))],
+    "an end behind the true one": [(ch.END, "", end_of("r1", 1, 5000))],
+    "progress, ends and last words": [
+        (ch.ROBOT_PROGRESS, "r1", progress("r1", 1000, 50)),
+        *((ch.END, "", end_of("r2", 3, 70 + n)) for n in range(20)),
+        *((ch.ROBOT_DONE, "r2", done_of("r2", 3, 50 + n, 3)) for n in range(20)),
+    ],
+}
+
+
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("what", FORGED)
+def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, behind) -> None:
+    """The end and the last words that confirm each other are believed, whatever else was said."""
+    (*said, end) = run()
+    honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
+    given(Boundary("central"), honest, *said, end)
+    forged = FORGED[what]
+    order = [*said, *forged, end] if behind else [*forged, *said, end]
+    given(Boundary("central"), misled, *order)
+    assert misled.final is not None
+    assert honest.final is not None
+    assert encoded(misled.final) == encoded(honest.final)
+
+
+def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source_out() -> None:
+    """Everything that the robot itself said was then years before its stream began."""
+    node = CentralNode(CentralConfig(), list(STREAMS))
+    boundary = Boundary("central")
+    given(boundary, node, (ch.START, "r1", FAR_START), *run())
+    assert node.final is not None
+    assert boundary.refused == 0
+
+
+def test_a_world_goes_on_when_others_took_what_a_stranger_has_published() -> None:
+    """A robot, and the recorder, counted further than there is: their progress gave no credit."""
+    streams = world_of(*STREAMS.values())
+    announced = configured("world", 0, 0, RobotConfig("r1"))
+    node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
+    here = m.Liveliness(stamp_ns=0, node="recorder", alive=True)
+    given(boundary, node, (ch.ALIVE, "recorder", here))
+    while node.publish(0.0):
+        pass
+    published = len(MEASUREMENTS["r1"]) + len(MEASUREMENTS["r2"])
+    assert node.unrecorded == published
+    for robot in STREAMS:
+        far = msgspec.structs.replace(progress(robot, 5000, 1), node="recorder")
+        given(boundary, node, (ch.RECORDER_PROGRESS, robot, far))
+    assert (boundary.refused, node.unrecorded) == (2, 0)
+    given(boundary, node, (ch.ROBOT_PROGRESS, "r1", progress("r1", 5000, 1)))
+    assert node._sources["r1"].consumed == len(MEASUREMENTS["r1"])

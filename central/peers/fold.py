@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Callable
 from typing import Literal
 
+from central.attendance import MOST_HEARD
 from central.config import CentralConfig
 from central.node import CentralNode
 from team.containment import Boundary
@@ -41,7 +42,7 @@ class PeerFold:
         self._peer = peer
         self.boundary = Boundary(peer.node)
         self._end: m.End | None = None
-        self._doubted: m.End | None = None
+        self._ends: list[m.End] = []
         self._progress: dict[str, m.Progress] = {}
         self._alive: dict[str, bool] = {}
         self._heads: dict[str, m.StreamHead] = {}
@@ -58,7 +59,7 @@ class PeerFold:
             for alive in (True, self._alive.get(robot, False)):
                 node = ch.robot_node(robot)
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
-        ends = (self._end, self._doubted, self._ordered)
+        ends = (self._end, *self._ends, self._ordered)
         known = (*self._heads.values(), *(e for e in ends if e is not None))
         for said in (*known, *self._progress.values()):
             self._give(said)
@@ -68,8 +69,9 @@ class PeerFold:
         refused = self.centre.refusal(message)
         if refused is None and not self._kept(message):
             return []
-        if refused is not None and isinstance(message, m.End):
-            self._doubted = message  # robots' last words may yet say that it is right
+        if isinstance(message, m.End) and message not in self._ends:
+            self._ends.append(message)  # robots' last words may say that it is right
+            del self._ends[:-MOST_HEARD]
         return [*self._give(message), *self.grow()]
 
     def _kept(self, message: m.Message) -> bool:
@@ -158,11 +160,12 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Whether everything that any node has announced is here."""
-        if self._end is None:
-            return False
+        """Whether everything that an announced end speaks of is here."""
+        return any(self._is_here(end) for end in (self._end, *self._ends) if end is not None)
+
+    def _is_here(self, end: m.End) -> bool:
         replica = self._peer.replica
-        for each in self._end.streams:
+        for each in end.streams:
             done = replica.statements.get(each.robot, {}).get(("done", each.incarnation))
             gone = ("given_up", 0) in replica.statements.get(each.robot, {})
             if done is None or not isinstance(done.message, m.Done):

@@ -24,6 +24,7 @@ class Configurations:
     def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
         self._expected = expected
         self._heard: set[str] = set()
+        self._right: set[str] = set()
         self._mismatches: dict[str, str] = {}
 
     def take(self, announced: m.Configuration) -> None:
@@ -46,11 +47,23 @@ class Configurations:
                 f"{node} differs from the world's scenario: {', '.join(found[:SHOWN])}{more}: "
                 + REMEDY
             )
+        else:
+            self._right.add(node)
 
     @property
     def mismatches(self) -> tuple[str, ...]:
         """Who differs in what, and the remedy; by node."""
         return tuple(self._mismatches[node] for node in sorted(self._mismatches))
+
+    @property
+    def forbid(self) -> bool:
+        """Whether a node of the scenario has announced another configuration, and never the right
+        one.
+
+        Where it has, another process, or a stranger, speaks in its name: a warning, as whoever is
+        not in the scenario, but nobody keeps the world from beginning so.
+        """
+        return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 
     def unheard(self, nodes: Collection[str]) -> list[str]:
         """Of these nodes, those whose announcement is due and has not come."""

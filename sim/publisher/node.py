@@ -42,10 +42,10 @@ class WorldNode:
     second of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's
     last measurements can be asked for again; None: all. Who asks for older ones gets a new
     incarnation instead: a start at an unknown pose, and measurements that count from there.
-    configurations: what the others are to announce; the world does not begin while anyone has
+    configurations: what the others are to announce; the world does not begin while one of them has
     announced something else. tells_map: the robots are told the landmarks, since they only localise
-    themselves. batch_s: team time between two looks at what has come in, at the most. peers:
-    robots whose own final maps the world waits for, too, until they are all of one set.
+    themselves. batch_s: team time between two looks at what has come in, at the most. peers: robots
+    whose own final maps the world waits for, too, until they are all of one set.
     """
 
     streams: WorldStreams
@@ -133,6 +133,7 @@ class WorldNode:
                         f"{source.incarnation} is"
                     )
                 if message.measurements > len(source.stream):
+                    self._note_too_far(message, source)
                     return f"consumed {message.measurements} of {len(source.stream)} measurements"
             case m.FusedMap() if message.final and self._published and not self.ended:
                 return "a final map before the end of the streams"
@@ -181,6 +182,18 @@ class WorldNode:
         waits = self.centre and (not said or "central" in self._alive)
         central = self.final is not None or not waits
         self.finished = self.finished or (agreed and central)
+
+    def _note_too_far(self, progress: m.Progress, source: Source) -> None:
+        """Who counts further than there is has all that there is: a stranger published the rest.
+
+        Otherwise the world would wait for ever for the credit of a robot or a recorder that took
+        what a stranger has sent.
+        """
+        if progress.node == "recorder":
+            stream = (progress.robot, progress.incarnation)
+            self._recorded[stream] = max(self._recorded.get(stream, 0), source.counter)
+        else:
+            source.consumed = max(source.consumed, source.published)
 
     def _note_consumed(self, progress: m.Progress) -> None:
         """What robots say before this world has begun is of an earlier life of it."""
@@ -269,7 +282,7 @@ class WorldNode:
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
         if self._began_at is None:
-            if self.configurations.mismatches or not (
+            if self.configurations.forbid or not (
                 self._going_on(clock_s) if self._consumed else not self.waiting_for
             ):
                 return []

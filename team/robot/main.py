@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from team.config import Exchange, RobotConfig
 from team.containment import reply_of
@@ -16,15 +17,15 @@ from team.shell import RECORDER, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Sample, Tap
-from team.wire.codec import WireError, decoded
+from team.wire.codec import WireError, decoded, encoded
 
 SECOND_PATIENCE_S = 6.0
 """Wait [s] for another process' token: that of a cut-off process lasts for its lease of 5 s."""
 SECOND_PERIOD_S = 0.5
 CONFIRMED_S = 1.0
 """Wait [s] between two questions to the source which incarnation its stream is in."""
-MOST_DOUBTED = 8
-"""Ends about which the source is asked at a time."""
+MOST_DOUBTED = 1_000
+"""Ends that wait for the source's word at a time."""
 LOG_LOOK_S, LOG_RARELY_S = 2.0, 60.0
 """Least and greatest wait [s] between two checks for what the robot's own log lacks."""
 _LOG = logging.getLogger("teamslam")
@@ -52,7 +53,8 @@ class RobotShell:
         self.node = RobotNode(config, exchange)
         self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
-        self._doubted: dict[int, Sample] = {}
+        self._doubted: dict[tuple[int, int], Sample] = {}
+        self._doubts_due_s = 0.0
         self._log_due_s = 0.0
         self._log_look_s = LOG_LOOK_S
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
@@ -98,7 +100,7 @@ class RobotShell:
         """Ask the source for missing measurements of the stream."""
         requested = self.node.request()
         self._missing.look(() if requested is None else (requested,))
-        if self._doubted:
+        if self._doubted and time.monotonic() >= self._doubts_due_s:
             self._ask_about_ends()
         if time.monotonic() >= self._log_due_s:
             lost = self._complete_log()
@@ -179,6 +181,14 @@ class RobotShell:
             return False
         try:
             start = reply_of(replies[0], m.InitialPose)
+            last = self._beginning_at_source()
+            if last is not None and last.incarnation < start.incarnation:
+                _LOG.warning(
+                    "the centre has incarnation %d of this robot, of which its source knows "
+                    "nothing: the stream begins again",
+                    start.incarnation,
+                )
+                return False
             self.node.take_over([start, *(reply_of(reply, m.Message) for reply in replies[1:])])
         except Exception as error:
             sample = Sample(ch.SUBMAPS.key(), replies[0], 0, 0, -1)
@@ -209,10 +219,11 @@ class RobotShell:
                 return
 
     def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples without the initial poses of incarnations that the source does not confirm.
+        """The samples without the ends and the initial poses that the source does not confirm.
 
         A robot that begins a new incarnation leaves the one before, so it needs the source's own
-        answer. Where no source answers (a replayed log) the message alone counts.
+        answer, and begins with the initial pose in that answer. Where no source answers (a replayed
+        log) the message alone counts.
         """
         passed = []
         for sample in samples:
@@ -225,13 +236,15 @@ class RobotShell:
                 self._first_of[found] = sample
         if self._first_of and time.monotonic() >= self._confirm_at:
             self._confirm_at = time.monotonic() + CONFIRMED_S
-            last = self._incarnation_at_source()
+            last = self._beginning_at_source()
             first_of, self._first_of = self._first_of, {}
             silent = last is None and self._source_is_there
             for incarnation, sample in sorted(first_of.items()):
                 if silent:  # it has not published yet what would be asked for
                     self._first_of[incarnation] = sample
-                elif last is None or incarnation <= last:
+                elif last is not None and incarnation == last.incarnation:
+                    passed.append(replace(sample, payload=encoded(last), stamp_ns=last.stamp_ns))
+                elif last is None or incarnation < last.incarnation:
                     passed.append(sample)
                 else:
                     why = f"of incarnation {incarnation}, of which its source knows nothing"
@@ -239,52 +252,69 @@ class RobotShell:
         return passed
 
     def _is_doubted(self, sample: Sample) -> bool:
-        """Whether a sample is an end before what has been consumed: it waits for the source's
-        word, since anyone may have published measurements behind it where there are no keys.
+        """Whether a sample is an announced end of the stream: it waits for the source's word.
+
+        Anyone may have announced it where there are no keys, or have published measurements behind
+        the true one.
         """
         if sample.key != ch.END.key():
             return False
         try:
-            last = self.node.contradicted(decoded(sample.payload, m.End))
+            last = self.node.end_in(decoded(sample.payload, m.End))
         except WireError:
             return False
-        if last is None or len(self._doubted) >= MOST_DOUBTED:
+        if last not in self._doubted and len(self._doubted) >= MOST_DOUBTED:
             return False
         self._doubted[last] = sample
         return True
 
     def _ask_about_ends(self) -> None:
-        """Ask the source which of the ends that were doubted is its own."""
+        """Ask the source which of the ends that were announced is its own.
+
+        Where no source answers (a replayed log) the message alone counts.
+        """
+        self._doubts_due_s = time.monotonic() + CONFIRMED_S
         doubted, self._doubted = self._doubted, {}
-        for last, sample in doubted.items():
+        for (incarnation, count), sample in doubted.items():
             wanted = m.MeasurementsRequest(
                 stamp_ns=0,
                 robot=self.node.robot,
-                incarnation=self.node.incarnation,
-                first=max(last - 1, 0),
-                last=last,
+                incarnation=incarnation,
+                first=max(count - 1, 0),
+                last=count,
                 only=True,
             )
             try:
                 replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, wanted, ASK_TIMEOUT_S)
-                if {reply_of(each, m.Measurement).number for each in replies} == {last - 1}:
-                    self.node.confirm_end(last)
+                numbers = {reply_of(each, m.Measurement).number for each in replies}
             except (BusError, WireError) as error:
                 _LOG.warning("%s", error)
+                self._doubted[incarnation, count] = sample
+                continue
+            if count and numbers == {count - 1}:
+                self.node.confirm_end(incarnation, count)
+            elif numbers or (count and self._source_is_there):
+                why = f"an end of {self.node.robot} at {count}, which is not its source's"
+                self.shell.boundary.refuse(sample, why)
+                continue
             self.shell.take([sample])
 
     @property
     def _source_is_there(self) -> bool:
         return any(self.bus.is_alive(n) for n in ("world", ch.source_node(self.node.robot)))
 
-    def _incarnation_at_source(self) -> int | None:
-        """The incarnation that the source says its stream is in; None where nobody answers."""
+    def _beginning_at_source(self) -> m.InitialPose | None:
+        """The initial pose of the incarnation that the stream is in by its source's answer.
+
+        None where nobody answers.
+        """
         request = m.MeasurementsRequest(
             stamp_ns=0, robot=self.node.robot, incarnation=0, first=0, last=0
         )
         try:
             replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, request, ASK_TIMEOUT_S)
-            return max((reply_of(r, m.Measurement).incarnation for r in replies), default=None)
+            starts = [reply_of(reply, m.InitialPose) for reply in replies]
+            return max(starts, key=lambda start: start.incarnation, default=None)
         except (BusError, WireError) as error:
             _LOG.warning("%s", error)
             return None

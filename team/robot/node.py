@@ -209,18 +209,19 @@ class RobotNode:
                 pass
         return None
 
-    def contradicted(self, end: m.End) -> int | None:
-        """The measurements of this stream by an announced end that are fewer than were consumed."""
-        if self._stream_end.refusal(end) is None:
-            return None
-        ends = {s.incarnation: s.measurements for s in end.streams if s.robot == self.robot}
-        return ends.get(self.incarnation)
+    def end_in(self, end: m.End) -> tuple[int, int]:
+        """Incarnation and measurements at which an announced end ends this robot's stream.
 
-    def confirm_end(self, measurements: int) -> None:
-        """Take the source's own answer that this incarnation ends so: what came behind it was not
+        One that does not name the robot says that its stream has none.
+        """
+        ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self.robot]
+        return ends[0] if ends else (self.incarnation, 0)
+
+    def confirm_end(self, incarnation: int, measurements: int) -> None:
+        """Take the source's own answer that an incarnation ends so: what came behind it was not
         the source's.
         """
-        self._stream_end.at_source = self.incarnation, measurements
+        self._stream_end.at_source = incarnation, measurements
 
     def status(self) -> m.Status:
         """The robot's status, for people."""

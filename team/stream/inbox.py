@@ -142,15 +142,29 @@ class Inbox:
     def missing(self, end: StreamEnd | None) -> tuple[int, int, int] | None:
         """Incarnation, first and last measurement to ask the source for: a gap, or everything up
         to the end.
+
+        A gap behind the end, or in an incarnation that is neither the present one nor the last, is
+        nothing that the source has.
         """
         gap = self.gap
-        last = None if end is None else (end.incarnation, end.measurements)
-        if gap is not None and (last is None or gap[:2] < last):
+        if end is None:
             return gap
-        if end is None or self.complete(end) or self.waiting or end.incarnation < self.incarnation:
+        of_stream = gap is not None and gap[0] in (self.incarnation, end.incarnation)
+        if gap is not None and of_stream and gap[:2] < (end.incarnation, end.measurements):
+            return gap
+        if self.complete(end) or end.incarnation < self.incarnation:
             return None
-        first = self.next_measurement if end.incarnation == self.incarnation else 0
-        return end.incarnation, first, end.measurements - 1
+        first = self._here(end.incarnation)
+        return (end.incarnation, first, end.measurements - 1) if first < end.measurements else None
+
+    def _here(self, incarnation: int) -> int:
+        """How many measurements of an incarnation are here without a gap, consumed or not."""
+        if incarnation == self.incarnation:
+            return self.received
+        later, first = self._later.get(incarnation, {}), 0
+        while first in later:
+            first += 1
+        return first
 
     @property
     def waiting(self) -> int:

@@ -14,7 +14,7 @@ from team.wire import messages as m
 from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing, Sample
 from team.wire.codec import decoded, encoded
 from tests.support import odometry
-from tests.teams import config, published, stream
+from tests.teams import config, published, stream, submaps_of
 
 
 def test_a_second_process_of_a_robot_is_refused_and_says_nothing_to_the_team() -> None:
@@ -148,3 +148,58 @@ def test_where_no_source_answers_the_message_itself_is_believed() -> None:
     network.answers.clear()  # a replayed log
     shell = lived(network, MemoryBus(network), lambda: source.begins(3))
     assert (shell.node.incarnation, shell.node.next_measurement) == (3, 1)
+
+
+def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on() -> None:
+    """A stranger's far end made the robot wait for ever; an early one made it leave."""
+
+    class Published(Source):
+        def answer(self, request: bytes) -> list[bytes]:
+            super().answer(request)
+            wanted = decoded(request, m.MeasurementsRequest)
+            there = [self.start, msgspec.structs.replace(odometry(1, "r1"), incarnation=1)]
+            return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
+
+    network = MemoryNetwork()
+    source, viewer = Published(network), MemoryBus(network)
+    source.bus.declare_alive("world")
+    viewer.subscribe(ch.ROBOT_DONE)
+
+    def act() -> None:
+        source.begins(1)
+        measured = msgspec.structs.replace(odometry(1, "r1"), incarnation=1)
+        source.bus.publish(Outgoing(ch.ODOMETRY, "r1", measured))
+        for counts in ((1, 1), (1, 2), (1, 9), (7, 3)):
+            ended = m.StreamEnd(robot="r1", incarnation=counts[0], measurements=counts[1])
+            end = m.End(stamp_ns=0, streams=(ended,))
+            source.bus.publish(Outgoing(ch.END, "", end))
+
+    shell = lived(network, MemoryBus(network), act)
+    assert shell.shell.boundary.refused == 3
+    (said,) = viewer.receive()
+    assert decoded(said.payload, m.Done).measurements == 2
+
+
+def test_a_stream_begins_where_its_source_says() -> None:
+    """A stranger was there first, years away: everything of the source was refused after that."""
+    network = MemoryNetwork()
+    source = Source(network)
+
+    def act() -> None:
+        forged = msgspec.structs.replace(source.start, stamp_ns=2**61)
+        source.bus.publish(Outgoing(ch.START, "r1", forged))
+        measured = msgspec.structs.replace(odometry(1, "r1"), incarnation=1)
+        source.bus.publish(Outgoing(ch.ODOMETRY, "r1", measured))
+
+    shell = lived(network, MemoryBus(network), act)
+    assert (shell.node.next_measurement, shell.shell.boundary.refused) == (2, 0)
+
+
+def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_over() -> None:
+    network = MemoryNetwork()
+    source, centre = Source(network), MemoryBus(network)
+    forged = msgspec.structs.replace(source.start, incarnation=7)
+    submap = msgspec.structs.replace(submaps_of(stream("r1", 12))[0], incarnation=7)
+    centre.answer(ch.SUBMAPS, "", lambda _: [encoded(forged), encoded(submap)])
+    shell = lived(network, MemoryBus(network), lambda: source.begins(1))
+    assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)

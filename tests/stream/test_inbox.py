@@ -118,3 +118,17 @@ def test_received_counts_what_is_here_without_a_gap_consumed_or_not():
     inbox.put(measurement(0, incarnation=1))
     list(inbox.taken())
     assert inbox.received == 1
+
+
+def test_the_tail_is_asked_for_whatever_a_stranger_has_published_behind_it():
+    """His measurements wait for ever: the robot asked for those before them, or for nothing."""
+    inbox = Inbox()
+    for each in (*map(measurement, range(3)), measurement(4, incarnation=7)):
+        inbox.put(each)
+    end = m.StreamEnd(robot="r1", incarnation=0, measurements=9)
+    assert inbox.missing(end) == (0, 3, 8), "what waits for its turn is here"
+    assert names(inbox.taken()) == [(0, 0), (0, 1), (0, 2)]
+    assert inbox.missing(end) == (0, 3, 8)
+    inbox.put(measurement(40))
+    assert inbox.missing(end) == (0, 3, 39)
+    assert inbox.missing(m.StreamEnd(robot="r1", incarnation=9, measurements=5)) == (0, 3, 39)

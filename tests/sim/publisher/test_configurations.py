@@ -77,6 +77,15 @@ def test_a_robot_that_comes_later_with_another_configuration_is_a_warning() -> N
     assert "robot/r1 differs" in node.status().warnings[0]
 
 
+def test_who_speaks_in_the_name_of_a_node_that_was_right_is_named_and_stops_nobody() -> None:
+    node = world()
+    announced(node)
+    announced(node, "central")
+    (warning,) = node.status().warnings
+    assert "central differs" in warning
+    assert node.publish(0.0)
+
+
 def test_a_robot_that_is_not_in_the_scenario_is_named() -> None:
     configurations = Configurations(expected_configurations(SCENARIO))
     configurations.take(
@@ -84,6 +93,7 @@ def test_a_robot_that_is_not_in_the_scenario_is_named() -> None:
             stamp_ns=0, node="robot/r9", incarnation=1, digest=bytes(8), configuration="{}"
         )
     )
+    assert not configurations.forbid, "whoever that is, the team does not wait for it"
     (warning,) = configurations.mismatches
     assert warning.startswith("robot/r9 is not in the world's scenario, which has central, robot/r")
 
