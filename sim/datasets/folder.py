@@ -82,7 +82,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
             )
         read = [_robot_rows(name, folders[name], clocks) for name in clocks]
         surveyed = _table(root, "landmarks", "")
-        said = left_out(root, folders)
+        said = left_out(root, folders, TABLES)
     if world.duration_s is not None:
         end_ns = min(each.start_ns for each in read) + round(world.duration_s * 1e9)
         read = [each.until(end_ns) for each in read]
@@ -185,7 +185,7 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
     saw = len(seen.stamps_ns) or len(met.stamps_ns) or unnamed is not None
     if driven is None and not saw:
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
-    truth_ns, poses, said = rows.truth_of(truth)
+    truth_ns, poses, said = rows.truth_of(truth, driven)
     notes += said if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
     return RobotRows(
         robot=robot,

@@ -2,7 +2,7 @@
 
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -88,10 +88,26 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def left_out(root: File, folders: Mapping[str, File]) -> list[str]:
-    """A word about folders that have tables, but none that makes them a robot's."""
+def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
+    """A word about CSV files that no table is called as, and about folders that have tables, but
+    none that makes them a robot's.
+    """
+    known = {*tables, "detections", "labels"}
+    said = []
+    for place in dict.fromkeys([root, *folders.values()]):
+        strays = sorted(
+            each.name
+            for each in place.iterdir()
+            if each.name.endswith(".csv") and each.name.removesuffix(".csv") not in known
+        )
+        if strays:
+            inside = f"{place.name}: " if place != root else ""
+            said.append(
+                f"{inside}{', '.join(strays)} not read: tables are called "
+                f"{', '.join(f'{each}.csv' for each in tables)}"
+            )
     if root in folders.values():
-        return []
+        return said
     entries: list[File] = sorted(root.iterdir(), key=lambda each: each.name)
     lacking = [
         entry
@@ -100,6 +116,6 @@ def left_out(root: File, folders: Mapping[str, File]) -> list[str]:
         and entry.name not in folders
         and any(each.name.endswith(".csv") for each in entry.iterdir())
     ]
-    return [
+    return said + [
         f"{entry.name}: neither {' nor '.join(STREAM_FILES)} in it: left out" for entry in lacking
     ]

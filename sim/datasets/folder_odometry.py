@@ -12,7 +12,7 @@ from sim.datasets.folder_tables import (
     SPEEDS,
     STEERED,
     Rows,
-    matrices,
+    pose_covariances,
 )
 from sim.datasets.utias_rows import on_circle
 from sim.world.streams import Intervals, moved
@@ -20,6 +20,8 @@ from team.config import Bounds
 
 FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 LONG_GAP_NS = 2_000_000_000
+WHIRLING_RAD_S = 2.0 * np.pi
+"""Who turns faster than this most of the time has hardly told radians."""
 OFF_NS = 1_000_000
 """A duration is not the time since the row before if it differs by more, and by a hundredth."""
 
@@ -74,18 +76,13 @@ def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray
     table = rows.table
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return None
-    if not table.has(*POSE_COVARIANCE):
-        missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
-        raise table.fault(
-            f"a covariance has all of {','.join(POSE_COVARIANCE)}: {missing} missing; give 0 where "
-            "nothing is correlated"
-        )
+    told = pose_covariances(table)
     if form == STEERED:
         raise table.fault(
             f"covariances come with {','.join(SPEEDS)} or {','.join(POSES)} or "
             f"{','.join(INCREMENTS)}; a car's noise stands in the scenario"
         )
-    covariances = matrices(table.numbers(*POSE_COVARIANCE))[used]
+    covariances = told[used]
     for row in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0.0)[:1].tolist():
         raise table.error(row + (used.start or 0), "c_xx", NOT_A_COVARIANCE)
     return covariances
@@ -128,6 +125,12 @@ def _judge_speeds(
         f"beyond {bounds.speed_m_s:g} m/s or {bounds.yaw_rate_rad_s:g} rad/s, which a robot "
         "refuses: metres, radians and seconds are meant",
     )
+    turning = rate[rate > 0.0]
+    if not fast.any() and len(turning) and np.median(turning) > WHIRLING_RAD_S:
+        rows.notes.append(
+            f"it turns by {np.median(turning):.1f} rad/s most of the time: of degrees a map of "
+            "columns makes radians (scale = 0.017453292519943295)"
+        )
 
 
 def _form(table: CsvTable) -> tuple[str, ...]:

@@ -22,7 +22,10 @@ POINTS = ("x_m", "y_m")
 POSE_COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 POINT_COVARIANCE = ("c_xx", "c_xy", "c_yy")
 POLAR_COVARIANCE = ("c_rr", "c_rb", "c_bb")
-NOT_A_COVARIANCE = "its covariance is not positive definite"
+NOT_A_COVARIANCE = (
+    "its covariance is not positive definite; where none is known leave its columns out, and the "
+    "scenario's noise holds"
+)
 EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
 EARLY_NS = 2_000_000_000
@@ -221,16 +224,29 @@ def _own(table: CsvTable, columns: tuple[str, ...]) -> Float[np.ndarray, "R 3"] 
     wrong = [column for column in other if table.has(column)]
     if wrong or any(table.has(c) for c in columns) != table.has(*columns):
         raise table.fault(f"a covariance here has the columns {','.join(columns)}, all three")
-    return table.numbers(*columns) if table.has(*columns) else None
+    return covariances_of(table, columns) if table.has(*columns) else None
+
+
+def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray, "R _"]:
+    """Each row's packed covariance; raises DatasetError, and names a row that has none."""
+    for column in columns:
+        cells = table.columns[column]
+        if "" in cells:
+            raise table.error(
+                cells.index(""), column, "no covariance here; give them in all rows or in none"
+            )
+    return table.numbers(*columns)
 
 
 def truth_of(
-    table: CsvTable | None,
+    table: CsvTable | None, driven: tuple[int, int] | None
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], list[str]]:
-    """True poses in order of time."""
+    """True poses in order of time; driven: when the odometry begins and ends, if there is one."""
     if table is None:
         return np.empty(0, np.int64), np.zeros((0, 3)), []
     rows = Rows(table, "true pose")
+    if driven is not None:
+        _check_clock(rows, driven)
     return rows.stamps_ns, rows.table.numbers(*POSES), rows.notes
 
 
@@ -241,12 +257,23 @@ def start_of(table: CsvTable) -> StartPose | None:
     if len(table) > 1:
         raise table.fault(f"{len(table)} rows: one pose is where a robot starts")
     pose = table.numbers(*POSES)[0]
-    if not table.has(*POSE_COVARIANCE):
+    if not any(table.has(column) for column in POSE_COVARIANCE):
         return StartPose(pose, None)
-    covariance = matrices(table.numbers(*POSE_COVARIANCE))[0]
+    covariance = pose_covariances(table)[0]
     if np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise table.error(0, "c_xx", NOT_A_COVARIANCE)
     return StartPose(pose, covariance)
+
+
+def pose_covariances(table: CsvTable) -> Float[np.ndarray, "N 3 3"]:
+    """Of a table that has one of their columns, which must have all; raises DatasetError."""
+    missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
+    if missing:
+        raise table.fault(
+            f"a covariance has all of {','.join(POSE_COVARIANCE)}: {missing} missing; give 0 where "
+            "nothing is correlated"
+        )
+    return matrices(covariances_of(table, POSE_COVARIANCE))
 
 
 def landmarks_of(

@@ -192,8 +192,15 @@ def test_what_is_hardly_meant_is_noted(tmp_path: Path) -> None:
     (place / "odometry.csv").write_text(SPEEDS.splitlines()[0] + "\n900000,1,0\n900001,0,0\n")
     (tmp_path / "r3").mkdir()
     (tmp_path / "r3" / "odom.csv").write_text(SPEEDS)
+    (tmp_path / "r1" / "sighting.csv").write_text("t_s,teammate,range_m,bearing_rad\n1,r2,1,0\n")
+    (tmp_path / "poles.csv").write_text("landmark,x_m,y_m\n1,2,3\n")
+    degrees = SPEEDS.splitlines()[0] + "\n0,1,11\n1,1,11\n2,0,0\n"
+    whirling = data_set(tmp_path / "w", odometry=degrees)
+    assert "of degrees a map of columns makes radians" in " ".join(only(whirling).notes)
     world = read(tmp_path, "r1", "r2")
     said = "\n".join([*world.notes, *world.streams[0].notes])
+    assert "poles.csv not read: tables are called odometry.csv, observations.csv, sight" in said
+    assert "r1: sighting.csv not read" in said
     assert "1 odometry row beyond 300 m/s or 100 rad/s" in said
     assert "more than 2 s before its first odometry" in said
     assert "r2 begins 10.4 days after r1" in said
@@ -326,6 +333,13 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
             "column duration_s: not above 0",
         ),
         ("start", "x_m,y_m,theta_rad\n0,0,0\n1,1,1\n", "2 rows: one pose is where"),
+        ("start", "x_m,y_m,theta_rad,c_xx,c_xy\n0,0,0,1,0\n", "c_yy, c_xt, c_yt, c_tt missing"),
+        ("truth", "t_s,x_m,y_m,theta_rad\n1e9,0,0,0\n", "are not those of the odometry"),
+        (
+            "observations",
+            "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,1,0,1\n2,1,1,1,1,,\n",
+            "line 3, column c_xy: no covariance here; give them in all rows or in none",
+        ),
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
     ],
 )
