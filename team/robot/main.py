@@ -325,6 +325,7 @@ def _beginning(sample: Sample, robot: str) -> int | None:
     if sample.key != ch.START.key(robot):
         return None
     try:
-        return decoded(sample.payload, m.InitialPose).incarnation
+        start = decoded(sample.payload, m.InitialPose)
+        return start.incarnation if start.number == 0 else None
     except WireError:
         return None  # the door counts it

@@ -51,8 +51,12 @@ class Inbox:
     def refusal(self, measurement: Measurement) -> str | None:
         """Why a measurement can not be of this stream, in words; None if it can.
 
-        Incarnations follow one another, and stamps do not precede the initial pose's.
+        Incarnations follow one another, each begins with its initial pose and has no other, and
+        stamps do not precede that one's.
         """
+        if isinstance(measurement, InitialPose) != (measurement.number == 0):
+            what = type(measurement).__name__
+            return f"{what} as measurement {measurement.number}; the initial pose is measurement 0"
         if self.next_measurement and measurement.incarnation > self.incarnation + NEAR_LIVES:
             return (
                 f"of incarnation {measurement.incarnation}, while {self.incarnation} is in progress"

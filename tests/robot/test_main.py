@@ -203,3 +203,21 @@ def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_o
     centre.answer(ch.SUBMAPS, "", lambda _: [encoded(forged), encoded(submap)])
     shell = lived(network, MemoryBus(network), lambda: source.begins(1))
     assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number: int) -> None:
+    """One odometry as measurement 0 of incarnation 7 made a robot leave its stream for ever."""
+    network = MemoryNetwork()
+    source = Source(network)
+
+    def act() -> None:
+        source.begins(1)
+        forged = msgspec.structs.replace(odometry(0, "r1"), incarnation=7)
+        again = msgspec.structs.replace(source.start, number=1)
+        channel, message = ((ch.ODOMETRY, forged), (ch.START, again))[number]
+        source.bus.publish(Outgoing(channel, "r1", message))
+
+    shell = lived(network, MemoryBus(network), act)
+    assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
+    assert "the initial pose is measurement 0" in shell.shell.boundary.last_refused
