@@ -326,6 +326,6 @@ def _beginning(sample: Sample, robot: str) -> int | None:
         return None
     try:
         start = decoded(sample.payload, m.InitialPose)
-        return start.incarnation if start.number == 0 else None
     except WireError:
         return None  # the door counts it
+    return start.incarnation if start.number == 0 else None
