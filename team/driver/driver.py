@@ -6,6 +6,7 @@ that they have missed; the driver answers from the file.
 """
 
 import logging
+import re
 import threading
 import time
 import warnings
@@ -41,6 +42,8 @@ BRIDGE_S = 5.0
 AWAY_S = 60.0
 """A difference of odometry poses is used up to this interval [s]; beyond it the odometry may have
 been reset."""
+JUMP_S = 86_400.0
+"""Odometry that is stamped so much later [s] than the last comes from another clock."""
 AHEAD_S = 10.0
 """A landmark measurement may be stamped this far [s] ahead of the odometry; beyond it the two are
 taken to have different clocks."""
@@ -60,8 +63,8 @@ class Driver:
     goes on where it was. start: (x [m], y [m], theta [rad]) in the team's frame, None where nobody
     knows; start_covariance: 3 × 3, None where it is exactly known. landmarks: their numbers, if
     they are known beforehand. latency_s: what is seen may come so much later than newer odometry.
-    patience_s: how long to wait for the router; 0: not at all, it may come later. bounds: what is
-    physically sensible.
+    patience_s: how long to wait for the router where the file is new; 0: not at all, it may come
+    later. bounds: what is physically sensible.
 
     Times `t` are seconds of one clock for the whole team, as of Unix time. Raises DriverError where
     it can not begin; each call raises MeasurementError for what can not be a measurement.
@@ -82,6 +85,8 @@ class Driver:
         patience_s: float = 10.0,
         bounds: Bounds | None = None,
     ) -> None:
+        if not re.fullmatch(measured.NAME, robot):
+            raise DriverError(f"{robot!r} is no robot's name: {measured.NAMED}")
         self.robot = robot
         self._bounds = Bounds() if bounds is None else bounds
         self._start = _start_of(robot, start, start_covariance)
@@ -101,7 +106,7 @@ class Driver:
         self._node = SourceNode(self._journal)
         self._link = Link(self._node, team=team, connect=connect, keys=keys, lock=self._lock)
         try:
-            self._link.open(patience_s)
+            self._link.open(0.0 if self._journal.calls else patience_s)
         except (BusError, KeysError) as error:
             self._journal.close()
             raise DriverError(str(error)) from None
@@ -387,9 +392,12 @@ class Driver:
             stamp_ns, kind
         ):
             late_s = 1e-9 * (self._journal.newest_ns - stamp_ns)
+            remedy = f"give a latency_s above {late_s:.2f}"
+            if late_s > AWAY_S:
+                remedy = "all that a robot measures needs one clock"
             raise MeasurementError(
                 f"{self.robot} at {1e-9 * stamp_ns:.3f} s: it comes when there is something "
-                f"{late_s:.3f} s newer, and its turn is over: give a latency_s above {late_s:.2f}"
+                f"{late_s:.3f} s newer, and its turn is over: {remedy}"
             )
         self._journal.append(kind, stamp_ns, payload)
 
@@ -446,12 +454,22 @@ class Driver:
     def _until(
         self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
     ) -> int | None:
-        """Length of the interval that ends now; begins a further incarnation where there is
-        none.
+        """Length of the interval that ends now; None where there is none: a gap is left that
+        `_drive` bridges, or a further incarnation is begun.
         """
         self._resume(stamp_ns)
         end_ns = self._odometer.end_ns
-        if length_ns is None and end_ns is not None and stamp_ns - end_ns > longest_s * 1e9:
+        away_ns = 0 if end_ns is None else stamp_ns - end_ns
+        if end_ns is not None and away_ns > JUMP_S * 1e9:
+            raise MeasurementError(
+                f"{call} of {self.robot} at {1e-9 * stamp_ns:.3f} s: {away_ns * 1e-9:.0f} s after "
+                f"the last odometry, {1e-9 * end_ns:.3f} s: that is another clock. Give all times "
+                "on one, in seconds; for a stream on the other give another file"
+            )
+        if length_ns is None and end_ns is not None and away_ns > longest_s * 1e9:
+            if away_ns <= BRIDGE_S * 1e9:
+                self._odometer.gap_ns = away_ns
+                return None
             self._begin_anew(end_ns, stamp_ns)
         return self._odometer.until(stamp_ns, length_ns, call)
 
@@ -529,5 +547,11 @@ def _start_of(
     """The initial pose as the message has it."""
     if start is None:
         return b"", b""
-    pose = measured.pose_of(start, f"the start of {robot}")
-    return from_floats(pose), measured.square(covariance, f"the start of {robot}")
+    what = f"the start of {robot}"
+    pose = measured.pose_of(start, what)
+    if abs(pose[2]) > 2.0 * np.pi:
+        raise MeasurementError(f"{what}: theta is {pose[2]:g}; it is in radians, in one turn")
+    packed = measured.square(covariance, what)
+    if covariance is not None:
+        measured.definite(np.asarray(covariance, dtype=np.float64)[np.newaxis], what)
+    return from_floats(pose), packed

@@ -16,6 +16,7 @@ from team.wire.codec import unsound
 
 M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
+NAMED = "a small letter, then small letters, digits and _ (32 at most)"
 UNNAMED = 2**31
 """Landmark numbers from here on are reserved for landmarks without identity."""
 
@@ -137,8 +138,8 @@ def sightings(
     for name in names:
         if not re.fullmatch(NAME, name):
             raise MeasurementError(
-                f"{what}: {name!r} is no robot's name: a small letter, then small letters, digits "
-                "and _; a string alone is taken letter by letter"
+                f"{what}: {name!r} is no robot's name: {NAMED}; a string alone is taken letter by "
+                "letter"
             )
     if robot in names:
         raise MeasurementError(f"{what}: {robot} can not see itself; name its teammates")
@@ -176,7 +177,23 @@ def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
         raise MeasurementError(
             f"{what}: covariances have the shape {blocks.shape}; {count} of 2 × 2 are needed"
         )
+    definite(blocks, what)
     return from_floats(blocks[:, [0, 0, 1], [0, 1, 1]].ravel())
+
+
+def definite(covariances: np.ndarray, what: str) -> None:
+    """Raise MeasurementError unless each is finite, symmetric and positive definite."""
+    finite = np.isfinite(covariances).all(axis=(1, 2))
+    checked = np.where(finite[:, np.newaxis, np.newaxis], covariances, 0.0)
+    apart = np.abs(checked - checked.transpose(0, 2, 1)).max(axis=(1, 2))
+    bad = (apart > 1e-6 * np.abs(checked).max(axis=(1, 2))) | (
+        np.linalg.eigvalsh(checked)[:, 0] <= 0.0
+    )
+    for each in covariances[bad][:1].tolist():
+        raise MeasurementError(
+            f"{what}: a covariance is symmetric and positive definite, not {each}; leave "
+            "covariances out where none are known"
+        )
 
 
 def sound(message: M, what: str) -> M:

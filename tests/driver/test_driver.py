@@ -21,6 +21,8 @@ from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests.support import ROOT, wait_until
 
+S = 10**9
+
 
 @pytest.fixture
 def alone(tmp_path):
@@ -87,6 +89,13 @@ REFUSED = [
     (lambda r: r.observe(10.1, [1], [float("inf")], [0.0]), "ranges have inf"),
     (lambda r: r.observe(1.7e9, [1], [1.0], [0.0]), "both need one clock"),
     (lambda r: r.observe(9.5, [1], [1.0], [0.0]), "give a latency_s above 0.50"),
+    (
+        lambda r: r.observe(-99.0, [1], [1.0], [0.0]),
+        "turn is over: all that a robot measures needs",
+    ),
+    (lambda r: r.odometry(1.7e9, 0.1, 0.0), "that is another clock. Give all times on one"),
+    (lambda r: r.observe(10.1, [1], [1.0], [0.0], [[[1.0, 2.0], [2.0, 1.0]]]), "leave covariances"),
+    (lambda r: r.observe_points(10.1, [1], [[1.0, 0.0]], [[[1.0, 0.0], [0.5, 1.0]]]), "symmetric"),
     (lambda r: r.sight(10.1, ["r1"], [1.0], [0.0]), "can not see itself"),
     (lambda r: r.sight(10.1, ["R 2"], [1.0], [0.0]), "is no robot's name"),
     (lambda r: r.odometry_pose(9.5, 0.0, 0.0, 0.0), "time goes back"),
@@ -103,6 +112,24 @@ def test_what_can_not_be_is_refused_at_once_by_name_and_nothing_of_it_is_kept(al
             call(robot)
         assert len(robot._journal.calls) == before
     robot.odometry(10.1, 0.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"start": (0.0, 0.0, 90.0)}, "theta is 90; it is in radians"),
+        ({"start": (0.0, 0.0)}, "a pose is"),
+        ({"start": (0.0, 0.0, 0.0), "start_covariance": -np.eye(3)}, "the start of r1: a covar"),
+    ],
+)
+def test_a_start_that_can_not_be_is_refused(alone, options, words):
+    with pytest.raises(MeasurementError, match=words):
+        alone(**options)
+
+
+def test_a_name_that_no_robot_has_is_refused():
+    with pytest.raises(DriverError, match=r"'R 1' is no robot's name: a small letter, then"):
+        Driver("R 1", team="lab")
 
 
 def test_what_is_hardly_meant_is_warned_of_once(alone):
@@ -147,6 +174,10 @@ def test_a_short_gap_is_bridged_by_a_motion_of_which_little_is_known(alone):
         [0.36, 0.36, 0.09]
     )
     assert (first.incarnation, last.incarnation) == (1, 1)
+    with pytest.warns(DriverWarning, match=r"no odometry from 1\.800 to 4\.800 s: it is taken"):
+        robot.odometry(4.8, 0.5, 0.0)  # longer than one call covers, and still no stream anew
+    *_, again = messages(robot)
+    assert (again.incarnation, again.stamp_ns, again.duration_ns) == (1, 4 * S + 800_000_000, 3 * S)
 
 
 def drive(robot, ticks, *, poses=False):
@@ -322,9 +353,19 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
         robot.bus.close()
 
 
-def test_a_router_that_is_not_there_are_named(tmp_path):
+def test_a_router_that_is_not_there_is_named_and_a_driver_that_goes_on_does_not_wait_for_it(
+    tmp_path,
+):
+    options = {"team": "lab", "connect": "tcp/127.0.0.1:1", "file": tmp_path / "a"}
     with pytest.raises(DriverError, match=r"no router answers at tcp/127\.0\.0\.1:1"):
-        Driver("r1", team="lab", connect="tcp/127.0.0.1:1", file=tmp_path / "a", patience_s=0.5)
+        Driver("r1", **options, patience_s=0.5)
+    first = Driver("r1", **options, patience_s=0.0)
+    first.odometry(1.0, 0.0, 0.0)
+    first.close()
+    again = Driver("r1", **options)  # killed and started again where there is no network
+    again.odometry(1.1, 0.5, 0.0)
+    again.close()
+    assert again.last_time == 1.1
 
 
 PAGE = (ROOT / "docs" / "your_robot.md").read_text()
