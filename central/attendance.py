@@ -184,12 +184,12 @@ class TeamAttendance:
         if silent:
             return f"an end that does not know of {', '.join(silent)}"
         for name, robot in self.robots.items():
-            said = robot.progress
-            last = None if said is None else ends.get((name, said.incarnation))
-            if said is not None and last is not None and last < said.measurements:
+            progress = robot.progress
+            last = None if progress is None else ends.get((name, progress.incarnation))
+            if progress is not None and last is not None and last < progress.measurements:
                 return (
                     f"ends with measurement {last} of {name}, which has consumed "
-                    f"{said.measurements}"
+                    f"{progress.measurements}"
                 )
         return None
 

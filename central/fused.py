@@ -68,9 +68,9 @@ def receivable(fused: m.FusedMap) -> m.FusedMap:
     """
     if unsound(fused) is None:
         return fused
-    said = []
+    refusals = []
     if not 0.0 <= fused.chi2 <= 1e300:
-        said.append(f"the cost of the map is not told: it is {fused.chi2:g}")
+        refusals.append(f"the cost of the map is not told: it is {fused.chi2:g}")
         fused = msgspec.structs.replace(fused, chi2=0.0, dof=0)
     fused, left_out = translate.receivable(fused)
-    return msgspec.structs.replace(fused, reasons=(*fused.reasons, *said, *left_out))
+    return msgspec.structs.replace(fused, reasons=(*fused.reasons, *refusals, *left_out))

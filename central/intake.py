@@ -125,7 +125,7 @@ class Intake(ABC, Generic[I]):
         """Count a message whose handling raised as refused; returns the credit that this gives."""
         return []
 
-    def kept(self, robot: str) -> Sequence[m.Message]:
+    def stored_messages(self, robot: str) -> Sequence[m.Message]:
         """What the robot's next process takes over; nothing: it begins its stream again.
 
         Of each incarnation, the latest first: its initial pose, the submaps without a gap and the

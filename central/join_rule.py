@@ -58,10 +58,10 @@ class JoinRule(FusionRule[SubmapInputs]):
         """The map of a set of submaps: law 2. The final one is solved until it stands still."""
         self._file(inputs)
         if tail == "final":
-            return self._said(inputs, self._ticks.solved(), tail)
+            return self._messages(inputs, self._ticks.solved(), tail)
         self._ticks.take_until(inputs.closed_ns)
         fold = self._ticks.provisional() if inputs.ahead else self._ticks.fold
-        return self._said(inputs, fold, tail)
+        return self._messages(inputs, fold, tail)
 
     def _file(self, inputs: SubmapInputs) -> None:
         """File the new submaps by tick; ticks that were folded already are folded again with
@@ -107,7 +107,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         """
         return (*self.finding.warnings, *self.reasons)
 
-    def _said(self, inputs: SubmapInputs, fold: Fold, tail: Tail) -> list[Outgoing]:
+    def _messages(self, inputs: SubmapInputs, fold: Fold, tail: Tail) -> list[Outgoing]:
         """The messages of a fold: the map, with priors or, at the end, the whole paths."""
         ticks, final = self._ticks, tail == "final"
         digest = ticks.digest(fold, self.config_digest, tail.encode())
@@ -125,7 +125,7 @@ class JoinRule(FusionRule[SubmapInputs]):
             members=ticks.members(fold),
             withdrawn=ticks.withdrawn,
             missing=inputs.missing,
-            heard=inputs.heard,
+            arrived=inputs.arrived,
             cost=(0.0, 0.0) if agreement is None else (agreement.chi2, agreement.dof),
             covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
             biases=biases,

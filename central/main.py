@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from central.config import CentralConfig
-from central.kept import KeptSet
 from central.node import CentralNode
+from central.stored_set import StoredSet
 from team.missing import MissingMeasurements
 from team.shell import WAIT_S, Shell
 from team.wire import channels as ch
@@ -51,7 +51,7 @@ class CentralShell:
         store: Path | None = None,
     ) -> None:
         self._bus = bus
-        self._kept = None if store is None else KeptSet(store)
+        self._stored = None if store is None else StoredSet(store)
         self.node = CentralNode(config, robots, admit=admit)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
@@ -79,8 +79,8 @@ class CentralShell:
         while self._shell.going:
             self._shell.look_for_the_end()
             samples = self._shell.receive()
-            if self._kept is not None:
-                self._kept.note(samples)
+            if self._stored is not None:
+                self._stored.note(samples)
             self._shell.take(self._patient(samples))
             self._shell.take(self._long_lost())
             self._give_up()
@@ -89,8 +89,8 @@ class CentralShell:
             self._hear_orders()
             self._shell.report()
         self._shell.report(last=True)
-        if self._kept is not None:
-            self._kept.close()
+        if self._stored is not None:
+            self._stored.close()
         final = self.node.final
         if final is None:
             _LOG.info("ended without a final map")
@@ -102,13 +102,13 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Take the set that an earlier process has kept, so that nobody has to send it again."""
-        if self._kept is None or not self._shell.going:
+        """Take the set that an earlier process has stored, so that nobody has to send it again."""
+        if self._stored is None or not self._shell.going:
             return
-        kept = self._kept.samples()
-        self._shell.take(kept)
-        if kept:
-            _LOG.info("%d members of the set are kept in %s", len(kept), self._kept.path)
+        stored = self._stored.samples()
+        self._shell.take(stored)
+        if stored:
+            _LOG.info("%d members of the set are stored in %s", len(stored), self._stored.path)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
         """The samples without the tokens of lost robots that may still come back within LOST_S."""
@@ -154,7 +154,7 @@ class CentralShell:
 
     def _awaited(self) -> tuple[str, ...]:
         """The absent robots that the final map waits for, and what to do."""
-        now, said = time.monotonic(), []
+        now, warnings = time.monotonic(), []
         for robot in self.node.awaited:
             since = self._since.get(ch.robot_node(robot))
             if since is None and self.node.ends:
@@ -163,11 +163,11 @@ class CentralShell:
                 state = f"is lost for {now - since:.0f} s"
             else:
                 continue
-            said.append(
+            warnings.append(
                 f"{robot} {state}: start it again, or go on without it by `teamslam withdraw` "
                 f"or `teamslam end --without {robot}`"
             )
-        return tuple(said)
+        return tuple(warnings)
 
     def _hear_orders(self) -> None:
         """Ask the router now and then for the operator's orders.

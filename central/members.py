@@ -16,7 +16,7 @@ from team.wire.digest import Digest
 from team.wire.messages import SightingFactor, Submap
 
 Key = tuple[int, str, int, int]
-KEPT_DIGESTS = 4
+STORED_DIGESTS = 4
 
 
 class Members:
@@ -99,7 +99,7 @@ class Members:
             digest.update(*before)
         digest.update(*self._digests_between(until, closed, gone))
         self._named[before] = closed, digest
-        for oldest in list(self._named)[:-KEPT_DIGESTS]:
+        for oldest in list(self._named)[:-STORED_DIGESTS]:
             del self._named[oldest]
         whole = digest.copy()
         whole.update(*self._digests_between(closed, last, gone))

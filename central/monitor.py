@@ -131,11 +131,13 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
 def _misscaled(scales: Mapping[str, Scale]) -> list[str]:
     """The team, or single robots, whose covariances are far too small or too large, in words."""
     robots = {who: each for who, each in scales.items() if who}
-    said = {who: words for who, each in robots.items() if (words := _misscale(each, ROBOT_WARN))}
+    words_of = {
+        who: words for who, each in robots.items() if (words := _misscale(each, ROBOT_WARN))
+    }
     team = _misscale(scales[""], SCALE_WARN) if "" in scales else ""
-    if team and (not said or 2 * len(said) > len(robots)):
+    if team and (not words_of or 2 * len(words_of) > len(robots)):
         return [f"the team's {team}"]
-    return [f"{robot}: {words}" for robot, words in said.items()]
+    return [f"{robot}: {words}" for robot, words in words_of.items()]
 
 
 def _misscale(scale: Scale, limit: float) -> str:

@@ -196,8 +196,8 @@ class CentralNode:
         """The answer to `SubmapsRequest`: what is here of the robot, its latest incarnation
         first.
         """
-        kept = self._intake.kept(decoded(request, m.SubmapsRequest).robot)
-        return [encoded(message) for message in kept]
+        stored = self._intake.stored_messages(decoded(request, m.SubmapsRequest).robot)
+        return [encoded(message) for message in stored]
 
     def lacking(self) -> list[m.SubmapsRequest]:
         """What robots have sent by their own word and is not here: to be asked of them."""

@@ -35,7 +35,7 @@ class Scheduler:
         self._tick_ns = round(rule.config.tick_s * 1e9)
         self._period_ns = rule.config.broadcast_s * 1e9
         self._patience_ns = PATIENCE * 1e9 * max(rule.config.broadcast_s, rule.config.tick_s)
-        self._said_ns: int | None = None
+        self._fused_ns: int | None = None
         self._quiet_ns: int | None = None
         self._published: Mapping[Stream, int] = {}
         self._announced: dict[str, str] = {}
@@ -65,7 +65,7 @@ class Scheduler:
 
     def conclude(self, now_ns: int) -> list[Outgoing]:
         """The last messages, the final map after all others."""
-        return self._said(self.intake.inputs(math.inf, now_ns), "final")
+        return self._fused(self.intake.inputs(math.inf, now_ns), "final")
 
     def at(self, instant: Instant[Any]) -> list[Outgoing]:
         """Fold what is closed at an instant; returns a map if one is due."""
@@ -78,14 +78,14 @@ class Scheduler:
             if self._quiet_ns is None:
                 self._quiet_ns = now_ns
             if now_ns - self._quiet_ns >= self._patience_ns and self._is_news(math.inf):
-                return [*out, *self._said(inputs, "provisional")]
+                return [*out, *self._fused(inputs, "provisional")]
         return out
 
     def _is_due(self, instant: Instant[Any]) -> bool:
         due = self.intake.due
         if due == "now":
             return True
-        last_ns = instant.since_ns if self._said_ns is None else self._said_ns
+        last_ns = instant.since_ns if self._fused_ns is None else self._fused_ns
         if last_ns is not None and instant.now_ns - last_ns < self._period_ns:
             return False
         return due == "period" or self._is_news(instant.inputs.closed_ns)
@@ -111,21 +111,21 @@ class Scheduler:
         published = {s: n for s, n in self._published.items() if s[0] not in gone}
         if _lacks(whole, published) or _lacks(whole, self._members(inputs.closed_ns)):
             return self._whole(inputs)
-        return self._said(replace(inputs, ahead=False), "closed")
+        return self._fused(replace(inputs, ahead=False), "closed")
 
     def _whole(self, inputs: Inputs) -> list[Outgoing]:
         """The map of everything that is here, closed if nothing of it is ahead of the watermark."""
         ahead = _lacks(self._members(inputs.closed_ns), self._members(math.inf))
-        return self._said(inputs, "provisional" if ahead else "closed")
+        return self._fused(inputs, "provisional" if ahead else "closed")
 
     def _ticks_end_ns(self, closed_ns: float) -> float:
         """The end of the last tick that is over; a tick has the submaps that end in (a, b]."""
         return closed_ns if math.isinf(closed_ns) else closed_ns // self._tick_ns * self._tick_ns
 
-    def _said(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
+    def _fused(self, inputs: Inputs, tail: Tail) -> list[Outgoing]:
         """A map and the messages that go out with it, after the withdrawals that it causes."""
         out = self.rule.fuse(inputs, tail)
-        self._said_ns = self._quiet_ns = inputs.now_ns
+        self._fused_ns = self._quiet_ns = inputs.now_ns
         maps = [each.message for each in out if isinstance(each.message, m.FusedMap)]
         if maps:
             members = maps[-1].members

@@ -27,7 +27,8 @@ class SubmapInputs(Inputs):
 
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
     from a submap. withdrawn: robots withdrawn by an order. verdicts: an operator's on unnamed
-    landmarks. missing: what streams wait for. heard: how much has arrived, to compare maps by.
+    landmarks. missing: what streams wait for. arrived: number of submaps, orders and verdicts that
+    have arrived, to compare maps by.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -36,7 +37,7 @@ class SubmapInputs(Inputs):
     withdrawn: Collection[str] = ()
     verdicts: Collection[Verdict] = ()
     missing: tuple[m.VersionEntry, ...] = ()
-    heard: int = 0
+    arrived: int = 0
 
 
 class SubmapIntake(Intake[SubmapInputs]):
@@ -70,11 +71,11 @@ class SubmapIntake(Intake[SubmapInputs]):
             withdrawn=self.orders,
             verdicts=self._verdicts,
             missing=self._set.missing(),
-            heard=self._heard,
+            arrived=self._arrived,
         )
 
     @property
-    def _heard(self) -> int:
+    def _arrived(self) -> int:
         """Submaps in the map's reach, orders, and verdicts and their withdrawals."""
         verdicts = len(self._verdicts | self._no_more) + len(self._no_more)
         return sum(map(len, self._chains().values())) + len(self.orders) + verdicts
@@ -147,8 +148,8 @@ class SubmapIntake(Intake[SubmapInputs]):
         self.orders.add(robot)
         if robot not in known:
             self.withdrawn = tuple(sorted({*known, robot}))
-            said = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
-            self.warnings.append(said)
+            warning = f"{robot} withdrawn by {withdrawal.by}: {withdrawal.reason}"
+            self.warnings.append(warning)
 
     def _judge_landmarks(self, verdict: m.Verdict) -> None:
         """Take an operator's verdict that two unnamed landmarks are one or two, or its
@@ -220,7 +221,7 @@ class SubmapIntake(Intake[SubmapInputs]):
         """Every submap that the robot has sent is in the map's reach."""
         return self.count((done.robot, done.incarnation)) >= done.submaps
 
-    def kept(self, robot: str) -> list[m.Message]:
+    def stored_messages(self, robot: str) -> list[m.Message]:
         """What the robot's next process takes over, of each incarnation, the latest first.
 
         It is the initial pose, the submaps without a gap and the inter-robot factors from them.
@@ -235,9 +236,11 @@ class SubmapIntake(Intake[SubmapInputs]):
 
     def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
         """What robots say that they have sent, and what is not in the map's reach."""
-        said = (s for robot in attendance.robots.values() for s in (robot.progress, robot.done))
+        announced = (
+            s for robot in attendance.robots.values() for s in (robot.progress, robot.done)
+        )
         sent: dict[Stream, int] = {}
-        for each in said:
+        for each in announced:
             if each is not None:
                 stream = (each.robot, each.incarnation)
                 sent[stream] = max(sent.get(stream, 0), each.submaps)

@@ -434,11 +434,13 @@ class TickFold:
             if (robot, incarnation) in fold.home
         ]
         gone = [f"without {robot}".encode() for robot in self.withdrawn]
-        said = sorted(f"{v.first} {v.second} {v.same}".encode() for v in fold.landmarks.verdicts)
+        verdicts = sorted(
+            f"{v.first} {v.second} {v.same}".encode() for v in fold.landmarks.verdicts
+        )
         keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
         last = max((self._members.tick_of(key[0]) for key in keys), default=-math.inf)
         closed = min(last, self._taken[-1].tick if self._taken else -math.inf)
-        return self._members.digest((*more, *gone, *starts, *said), closed, last, self._gone)
+        return self._members.digest((*more, *gone, *starts, *verdicts), closed, last, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream that was taken or refused."""

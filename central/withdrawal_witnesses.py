@@ -21,27 +21,27 @@ class WithdrawalWitnesses:
 
     def __init__(self, robots: Sequence[str]) -> None:
         self._robots = frozenset(robots)
-        self._said: dict[str, dict[str, m.WithdrawalHeard]] = {}
+        self._reports: dict[str, dict[str, m.WithdrawalHeard]] = {}
 
     def admit(self, robot: str) -> None:
         """Add a robot to the team."""
         self._robots |= {robot}
 
-    def take(self, heard: m.WithdrawalHeard) -> m.Withdrawal | None:
+    def take(self, report: m.WithdrawalHeard) -> m.Withdrawal | None:
         """Take a report; returns the order once it is believed. Reports of strangers are
         ignored.
         """
-        if not {heard.robot, heard.withdrawn} <= self._robots:
+        if not {report.robot, report.withdrawn} <= self._robots:
             return None
-        self._said.setdefault(heard.withdrawn, {})[heard.robot] = heard
-        if not self._believed(heard.withdrawn):
+        self._reports.setdefault(report.withdrawn, {})[report.robot] = report
+        if not self._believed(report.withdrawn):
             return None
         return m.Withdrawal(
-            stamp_ns=heard.stamp_ns, robot=heard.withdrawn, by=heard.by, reason=heard.reason
+            stamp_ns=report.stamp_ns, robot=report.withdrawn, by=report.by, reason=report.reason
         )
 
     def _believed(self, robot: str) -> bool:
-        witnesses = self._said[robot].keys()
+        witnesses = self._reports[robot].keys()
         others = len(self._robots) - 1
         return robot in witnesses or (
             len(witnesses) >= LEAST_WITNESSES and 2 * len(witnesses) > others
@@ -52,8 +52,8 @@ class WithdrawalWitnesses:
         remedy.
         """
         return tuple(
-            f"{', '.join(sorted(said))} heard that {robot} is withdrawn, too few to be believed: "
-            f"if it is, order it again by `teamslam withdraw {robot}`"
-            for robot, said in sorted(self._said.items())
+            f"{', '.join(sorted(reporters))} report that {robot} is withdrawn, too few to be "
+            f"believed: if it is, order it again by `teamslam withdraw {robot}`"
+            for robot, reporters in sorted(self._reports.items())
             if robot not in withdrawn and not self._believed(robot)
         )

@@ -82,8 +82,8 @@ class BatchRule(MeasurementRule):
         else:
             self._batch = self._solved(self._batch, RUNNING_ITERATIONS, RUNNING_DECREMENT)
         landmarks = batch.landmark_gaussian(self._batch)
-        said = (*self._poses(), *(self._paths() if final else ()))
-        return MapContent(landmarks, self._batch.cost, self._batch.dof, said)
+        outgoing = (*self._poses(), *(self._paths() if final else ()))
+        return MapContent(landmarks, self._batch.cost, self._batch.dof, outgoing)
 
     def _grow(self) -> None:
         """Take the turns that wait; without what they saw, or not at all, where none is solved."""
@@ -112,16 +112,16 @@ class BatchRule(MeasurementRule):
 
     def _poses(self) -> list[Outgoing]:
         """The newest pose of each robot that has moved since the last map."""
-        said = [
+        outgoing = [
             self.pose(each, batch.pose_gaussian(self._batch, robot))
             for robot, each in sorted(self._newest.items())
             if self.pose_is_due(each)
         ]
         self._newest = {}
-        return said
+        return outgoing
 
     def _paths(self) -> list[Outgoing]:
-        said = []
+        outgoing = []
         for robot, stamps in sorted(self._stamps.items()):
             poses, covariances = batch.trajectory(self._batch, robot)
             stamps = stamps[: len(poses) - 1]
@@ -140,8 +140,8 @@ class BatchRule(MeasurementRule):
             message = translate.trajectory_message(
                 stamps[-1], robot, incarnation, self.digest, stamps, poses[1:], covariances[1:]
             )
-            said.append(Outgoing(ch.TRAJECTORY, robot, message))
-        return said
+            outgoing.append(Outgoing(ch.TRAJECTORY, robot, message))
+        return outgoing
 
 
 def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:

@@ -90,7 +90,7 @@ class Rounds(Intake[MapInputs]):
             self._next += 1
             yield Instant(attendance.now_ns, inputs)
 
-    def kept(self, robot: str) -> Sequence[m.Message]:
+    def stored_messages(self, robot: str) -> Sequence[m.Message]:
         """The start of the robot's latest incarnation and its submaps without a gap."""
         incarnations = [incarnation for name, incarnation in self._set.streams if name == robot]
         submaps = self._set.chain((robot, max(incarnations))) if incarnations else []

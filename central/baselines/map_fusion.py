@@ -87,18 +87,18 @@ def fused_totally(
     A map beyond the bounds is, and one with which the rule has no result: they are then taken one
     by one in the given order.
     """
-    kept: dict[str, LandmarkGaussian] = {}
+    accepted: dict[str, LandmarkGaussian] = {}
     reasons = []
     for robot, each in maps.items():
         if np.abs(each.means).max(initial=0.0) > coordinate_m:
             reasons.append(f"{robot}: its map is refused, a coordinate beyond {coordinate_m:g} m")
         else:
-            kept[robot] = each
-    fused = _tried(rule, list(kept.values()))
+            accepted[robot] = each
+    fused = _tried(rule, list(accepted.values()))
     if fused is not None:
         return fused, tuple(reasons)
     fused, taken = NO_LANDMARKS, list[LandmarkGaussian]()
-    for robot, each in kept.items():
+    for robot, each in accepted.items():
         more = _tried(rule, [*taken, each])
         if more is None:
             reasons.append(f"{robot}: its map is refused, with it the fusion has no result")

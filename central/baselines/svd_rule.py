@@ -86,9 +86,9 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
             )
         initial = {stream: self._believed(inputs.starts[stream]) for stream in chains}
         joined = {s: self._extended(s, chains[s], initial[s], final) for s in chains}
-        told = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
-        first = min(told or chains, key=lambda s: (initial[s] is None, s))
-        maps = {s: svd_joining.landmark_gaussian(state) for s, state in told.items()}
+        states = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
+        first = min(states or chains, key=lambda s: (initial[s] is None, s))
+        maps = {s: svd_joining.landmark_gaussian(state) for s, state in states.items()}
         with np.errstate(all="ignore"):
             fused, reasons = tied(first, maps, full=self._weighting == "full")
         refused = tuple(x.refused for _, x in sorted(joined.items()) if x.refused)
@@ -104,15 +104,15 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
             reasons=(*reasons, *refused),
         )
 
-    def _believed(self, told: m.InitialPose) -> Pose | None:
+    def _believed(self, message: m.InitialPose) -> Pose | None:
         """The initial pose of a stream, if it is known and within the bounds."""
-        start = translate.start_of(told)
+        start = translate.start_of(message)
         if start is None or start_beyond(start, self.config.bounds) is not None:
             return None
         return start.pose
 
     def _extended(
-        self, stream: Stream, chain: Sequence[m.Submap], told: Pose | None, final: bool
+        self, stream: Stream, chain: Sequence[m.Submap], initial_pose: Pose | None, final: bool
     ) -> _Joined:
         """The map of a stream's chain, from the longest one that was made before.
 
@@ -120,7 +120,7 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
         end, wrong minima looked for.
         """
         begin = svd_joining.initial_state(
-            {stream[0]: np.zeros(3) if told is None else told}, self._weighting
+            {stream[0]: np.zeros(3) if initial_pose is None else initial_pose}, self._weighting
         )
         before = self._joined.get(stream)
         if before is None or before.count > len(chain):

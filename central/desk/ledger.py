@@ -69,17 +69,18 @@ class Ledger:
     def statement(self) -> str:
         """The proof in one sentence."""
         parts = ", ".join(f"{count:,} {name}" for name, count in self.totals().items())
-        said = f"each of {self.measurements:,} measurements has exactly one disposition: {parts}"
+        sentence = (
+            f"each of {self.measurements:,} measurements has exactly one disposition: {parts}"
+        )
         gone = sum(self.totals(robot).get(IN_SUBMAP, 0) for robot in self.withdrawn)
         if not self.withdrawn:
-            return said
-        return (
-            f"{said}; {gone:,} of those in submaps are withdrawn with {', '.join(self.withdrawn)}"
-        )
+            return sentence
+        gone_with = ", ".join(self.withdrawn)
+        return f"{sentence}; {gone:,} of those in submaps are withdrawn with {gone_with}"
 
     def to_json(self) -> dict[str, Any]:
         """Totals, offenders, and of each submap how many measurements and which maps."""
-        held = Counter(
+        counts = Counter(
             (*stream, entry.submap)
             for stream, entries in self.entries.items()
             for entry in entries
@@ -95,7 +96,7 @@ class Ledger:
                     "robot": n[0],
                     "incarnation": n[1],
                     "sequence": n[2],
-                    "measurements": held[n],
+                    "measurements": counts[n],
                     "maps": maps,
                 }
                 for n, maps in sorted(self.maps.items())
@@ -171,14 +172,14 @@ def _entries(
                     f"submaps: {holder[counter]} and {submap.sequence}"
                 )
             holder[counter] = submap.sequence
-    said = dispositions(log, robot, incarnation)
+    disposition_of = dispositions(log, robot, incarnation)
     last = max((s.last_measurement for s in submaps), default=-1)
     consumed = log.reported.get(stream, 0)
     entries = []
     for counter in range(count):
         name = f"measurement {counter} of {robot}, incarnation {incarnation}"
-        held = counter in measurements and holder[counter] is not None
-        disposition = said.get(counter, IN_SUBMAP if held else LOST)
+        in_submap = counter in measurements and holder[counter] is not None
+        disposition = disposition_of.get(counter, IN_SUBMAP if in_submap else LOST)
         if counter not in measurements and holder[counter] is not None:
             wrong.append(f"{name} is in submap {holder[counter]}, but not in the log")
         elif disposition in (IN_SUBMAP, IN_SIGHTING) and holder[counter] is None:
@@ -197,17 +198,17 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
     for done in log.of(ch.ROBOT_DONE):
         if not isinstance(done, m.Done) or (done.robot, done.incarnation) != stream:
             continue
-        told = {d.disposition: d.measurements for d in done.ledger}
-        if sum(told.values()) != done.measurements:
+        announced = {d.disposition: d.measurements for d in done.ledger}
+        if sum(announced.values()) != done.measurements:
             yield (
                 f"{done.robot}, incarnation {done.incarnation}: {done.measurements} "
-                f"measurements, {told} dispositions"
+                f"measurements, {announced} dispositions"
             )
-        resumed = "start pose" not in told
+        resumed = "start pose" not in announced
         found = Counter(entry.disposition for entry in entries[: done.measurements])
-        if not resumed and dict(found) != told:
+        if not resumed and dict(found) != announced:
             yield (
-                f"{done.robot}, incarnation {done.incarnation} says {told}, the log gives "
+                f"{done.robot}, incarnation {done.incarnation} says {announced}, the log gives "
                 f"{dict(found)}"
             )
 

@@ -67,8 +67,8 @@ class PeersAsCentre:
             message = decoded(sample.payload, m.Configuration)
         except WireError:
             return None
-        said = msgspec.structs.replace(message, node="central")
-        return replace(sample, payload=encoded(said))
+        as_centre = msgspec.structs.replace(message, node="central")
+        return replace(sample, payload=encoded(as_centre))
 
     def _status(self, sample: Sample, node: str) -> Sample | None:
         """The status of the peer's fold as a centre's status."""
@@ -100,6 +100,6 @@ def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> It
     """The samples, each followed by its counterpart in a centre's name."""
     for sample in samples:
         yield sample
-        said = centre.of(sample)
-        if said is not None:
-            yield said
+        counterpart = centre.of(sample)
+        if counterpart is not None:
+            yield counterpart

@@ -29,9 +29,9 @@ class PeerCentre(Peer):
         """The first messages: its configuration."""
         return self.fold.centre.begin()
 
-    def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:
+    def _of_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
         """A centre's maps and orders; nobody waits for its credit."""
-        return [each for each in said if each.channel is not ch.CENTRAL_PROGRESS]
+        return [each for each in messages if each.channel is not ch.CENTRAL_PROGRESS]
 
     def status(self) -> m.Status:
         """A centre's status, with how much of the set is here."""

@@ -61,20 +61,20 @@ class PeerFold:
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
         ends = (self._end, *self._ends, self._ordered)
         known = (*self._heads.values(), *(e for e in ends if e is not None))
-        for said in (*known, *self._progress.values()):
-            self._give(said)
+        for message in (*known, *self._progress.values()):
+            self._give(message)
 
     def note(self, message: m.Message) -> list[Outgoing]:
         """Take a message that is no member: progress, liveliness, the end of the streams."""
         refused = self.centre.refusal(message)
-        if refused is None and not self._kept(message):
+        if refused is None and not self._stored(message):
             return []
         if isinstance(message, m.End) and message not in self._ends:
             self._ends.append(message)  # robots' last words may say that it is right
             del self._ends[:-MOST_HEARD]
         return [*self._give(message), *self.grow()]
 
-    def _kept(self, message: m.Message) -> bool:
+    def _stored(self, message: m.Message) -> bool:
         """Keep a message for a fold that begins anew, unless a later one replaces it; returns
         whether it was of use.
         """
@@ -86,8 +86,8 @@ class PeerFold:
             case m.TeamEnd():
                 self._ordered = message
             case m.Progress():
-                held = self._progress.get(message.robot)
-                self._progress[message.robot] = further(message, held)
+                known = self._progress.get(message.robot)
+                self._progress[message.robot] = further(message, known)
             case m.Liveliness():
                 robot = ch.robot_of(message.node)
                 if robot not in self._robots:
@@ -109,8 +109,8 @@ class PeerFold:
             return []
         streams = []
         for robot in stated:
-            said = (each.message for each in stated[robot].values())
-            last = [(d.incarnation, d.measurements) for d in said if isinstance(d, m.Done)]
+            statements = (each.message for each in stated[robot].values())
+            last = [(d.incarnation, d.measurements) for d in statements if isinstance(d, m.Done)]
             if last:
                 incarnation, count = max(last)
                 end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)

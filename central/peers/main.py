@@ -98,17 +98,17 @@ class PeerShell(RobotShell):
 
     def _resume(self) -> bool:
         """Take over what is on disk; whether the stream goes on behind it."""
-        kept = self._keeper.kept
-        if not kept:
+        stored = self._keeper.kept
+        if not stored:
             return False
-        goes_on = self._peer.restore(kept)
+        goes_on = self._peer.restore(stored)
         self._peer.peer.unsaved.clear()
         self.node = self._peer.node
         maps = m.InitialPose | m.Submap | m.SightingFactor
-        self._log([each for each in kept if isinstance(each.message, maps)])
+        self._log([each for each in stored if isinstance(each.message, maps)])
         _LOG.info(
             "%d members of the set are kept, of this robot %d submaps",
-            len(kept),
+            len(stored),
             self.node.submaps,
         )
         return goes_on

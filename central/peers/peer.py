@@ -72,9 +72,9 @@ class Peer:
         if self.final is None:
             return False
         lost = {*self.final.lost, *self.final.withdrawn}
-        said = self.peer.replica.concluded
+        concluded = self.peer.replica.concluded
         return all(
-            robot in lost or (robot in said and said[robot].digest == self.final.digest)
+            robot in lost or (robot in concluded and concluded[robot].digest == self.final.digest)
             for robot in self.peer.replica.robots
         )
 
@@ -98,8 +98,8 @@ class Peer:
         channel, name = (None, "") if found is None else found
         if channel in TALK and channel.publisher(name) != self.name:
             self.downlink += len(sample.payload)
-        heard = self._hear(message, sample)
-        return self._take(message, sample, channel, name) if heard is None else heard
+        answered = self._hear(message, sample)
+        return self._take(message, sample, channel, name) if answered is None else answered
 
     def _hear(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
         """Take what others say of themselves; None: it is something else."""
@@ -167,9 +167,9 @@ class Peer:
         """Fold what the set has more; what the fold says."""
         return self._of_fold(self.fold.grow())
 
-    def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:
+    def _of_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
         """What the fold says, as this node says it."""
-        return list(said)
+        return list(messages)
 
     def refresh(self) -> list[Outgoing]:
         """What there is to say of what has come since the last map; for when there is time."""

@@ -28,7 +28,7 @@ _OF_THE_FOLD = {
     ch.TRAJECTORY: ch.TEAM_TRAJECTORY,
 }
 """What the centre would say under its own name the robot says under its own."""
-_NOT_HEARD = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
+_OF_A_CENTRE = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
 """What a robot hears from a centre and a peer from its own fold."""
 
 
@@ -58,7 +58,7 @@ class PeerRobot(Peer):
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
         """The channels of its own stream, and of the world, to subscribe to under its name."""
-        return tuple(channel for channel in RobotNode.listens if channel not in _NOT_HEARD)
+        return tuple(channel for channel in RobotNode.listens if channel not in _OF_A_CENTRE)
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
@@ -77,13 +77,13 @@ class PeerRobot(Peer):
         proofs = self.peer.proofs
         if proofs is None:
             return []
-        said = Outgoing(ch.CERTIFICATE, self.robot, proofs.certificate())
-        self.peer.take(member_in(said), self.name)
-        return [said]
+        certificate = Outgoing(ch.CERTIFICATE, self.robot, proofs.certificate())
+        self.peer.take(member_in(certificate), self.name)
+        return [certificate]
 
-    def _vouched(self, said: Outgoing) -> list[Outgoing]:
+    def _vouched(self, outgoing: Outgoing) -> list[Outgoing]:
         """Take a member of its own into the set; with keys its signature goes out behind it."""
-        member = member_in(said)
+        member = member_in(outgoing)
         self.peer.take(member, self.name)
         proofs = self.peer.proofs
         if proofs is None:
@@ -93,17 +93,17 @@ class PeerRobot(Peer):
     def restore(self, members: Iterable[Member]) -> bool:
         """Take what an earlier life has kept, before `begin`; whether its stream goes on there."""
         self.keep(members)
-        kept = self._kept()
-        if not kept:
+        stored = self._own_stored()
+        if not stored:
             return False
         try:
-            self.node.take_over(kept)
+            self.node.take_over(stored)
         except Exception:  # the same submaps once more, from the stream
             self.node = RobotNode(self.config, self._exchange)
             return False
         return True
 
-    def _kept(self) -> list[m.Message]:
+    def _own_stored(self) -> list[m.Message]:
         """Of each incarnation of its own stream, the latest first: what `take_over` takes."""
         found: list[m.Message] = []
         own = (s for s in self.peer.replica.streams if s[0] == self.robot)
@@ -148,20 +148,20 @@ class PeerRobot(Peer):
     def _tell_robot(self, message: m.Message, sample: Sample) -> list[Outgoing]:
         return self._of_robot(self.counted(self.boundary.hand(self.node, message, sample)))
 
-    def _of_robot(self, said: Sequence[Outgoing]) -> list[Outgoing]:
+    def _of_robot(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
         """What the estimator says goes out; what of it is for fusion goes into the set, too."""
-        out = list(said)
-        for each in said:
+        out = list(messages)
+        for each in messages:
             if each.channel in CHANNELS:
                 out += self._vouched(each)
             elif isinstance(each.message, m.Progress):
                 out += self._of_fold(self.fold.note(each.message))
         return out + self.grown()
 
-    def _of_fold(self, said: Sequence[Outgoing]) -> list[Outgoing]:
+    def _of_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
         """What the fold says, under this robot's name; the prior goes to the estimator first."""
         out: list[Outgoing] = []
-        for each in said:
+        for each in messages:
             channel = _OF_THE_FOLD.get(each.channel)
             if each.channel is ch.FAULT:
                 out.append(each)
@@ -179,8 +179,8 @@ class PeerRobot(Peer):
             self._finals = self.fold.finals
             concluded = self.fold.conclusion(self.robot)
             assert concluded is not None
-            said_so = Outgoing(ch.CONCLUDED, self.robot, concluded)
-            out += [said_so, *self._vouched(said_so)]
+            statement = Outgoing(ch.CONCLUDED, self.robot, concluded)
+            out += [statement, *self._vouched(statement)]
         return out
 
     def status(self) -> m.Status:

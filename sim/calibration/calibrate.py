@@ -1,15 +1,17 @@
-"""What measurements say about odometry and sensor: with the truth, or by the team's own map.
+"""Learns the figures of the odometry's and the sensor's models from measurements.
 
-With truth of poses and landmarks every figure is learnt by maximum likelihood against it; constants
-of the sensor for each robot by itself where robots differ beyond doubt (`own`).
+Where the data have the true poses and landmarks, every figure is a maximum-likelihood estimate
+against them. Constants of the sensor are learnt for each robot separately where robots differ
+significantly (`own`).
 
-Without truth the reference is the joined map and the paths in it, with an odometry that is trusted
-less, so that scale comes from the ranges (expectation and maximisation in turn). Only what the
-ranges and bearings determine is learnt then: the odometry's scales, drag and veer. The sensor's own
-figures stay: a team can not see the scale of its own measure.
+Without truth the reference is the joined map and the paths in it, alternating between joining and
+learning (expectation and maximisation). The joining trusts the odometry less, so that the scale
+comes from the ranges. Then only what ranges and bearings determine is learnt: the odometry's
+scales, drag and veer. The sensor's own figures stay, since a team can not observe the scale of its
+own range measurements.
 
-How sure the submaps are (`covariance_factor`, and the monitor's `normal_scale` under it) is learnt
-without the truth in both cases, from the maps of single robots (`consistency`).
+How consistent the submaps' covariances are (`covariance_factor`, and the monitor's `normal_scale`
+with it) is learnt without the truth in both cases, from the maps of single robots (`consistency`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,15 +38,19 @@ from team.estimation.map_joining.joining import Fold
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
 MISTRUST = 4.0
-"""Without truth the odometry's densities of noise are taken times this."""
+"""Factor on the odometry's noise densities where there is no truth."""
 ROUNDS = 2
 SYSTEMATIC = 0.02
-"""Standard deviation of the forward scale, relative, that is due to a scale from the joined map."""
+"""Standard deviation of the forward scale, relative, that a scale learnt from the joined
+map has.
+"""
 TYPICAL_M = 3.0
 BETTER = 0.8
-"""Of the ranges' σ at TYPICAL_M: a model of theirs that leaves less than this share is told."""
+"""A depth model of the ranges that leaves less than this share of their σ at TYPICAL_M is
+reported.
+"""
 ALARM = 0.015
-"""A scale that differs by more from the scenario's does not fit the data."""
+"""A scale that differs by more than this from the scenario's does not fit the data."""
 
 NOTHING: Mapping[str, Sequence[Figure]] = MappingProxyType({})
 
@@ -53,9 +59,10 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Calibration:
-    """The figures by their part of a robot's configuration, and what a user should know.
+    """The learnt figures by the part of a robot's configuration that they belong to, and notes for
+    the user.
 
-    robots: of single robots' sensors, where they differ.
+    robots: figures of single robots' sensors, where robots differ.
     """
 
     motion: tuple[Figure, ...]
@@ -69,9 +76,10 @@ class Calibration:
 def calibrated(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
-    """Learn from all worlds together, beginning with the scenario's models (one for all robots).
+    """Learn from all worlds together, starting from the scenario's models (one for all robots).
 
-    Raises CalibrationError where the measurements do not suffice.
+    worlds: of each its label and its streams. Raises CalibrationError where the measurements do not
+    suffice.
     """
     if all(world.landmarks is not None and true_paths(world.streams) for _, world in worlds):
         return _by_truth(worlds, scenario, progress)
@@ -112,12 +120,14 @@ def _by_truth(
     marker = marker_spread(data, depth=depth)
     strays = own.strays if marker is None else (*own.strays, marker)
     of_central = _central_figures(folds, learnt, strays, progress)
-    said = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
-    return Calibration(of_motion, of_sensor, True, said, of_central, own.robots)
+    findings = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
+    return Calibration(of_motion, of_sensor, True, findings, of_central, own.robots)
 
 
 def _other_model(data: Sequence[Reference], depth: bool) -> tuple[str, ...]:
-    """A word where ranges are explained better as what the scenario does not take them for."""
+    """A note where the other range model (depth or distance) explains the ranges better than the
+    scenario's.
+    """
     taken, other = (
         hypot(found["range_sigma"], TYPICAL_M * found["range_sigma_per_m"])
         for found in (sensor.fit_sensor(data, depth=each) for each in (depth, not depth))
@@ -157,19 +167,21 @@ def _by_the_map(
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
     if any(each.seen.covariances is not None for each in data):
         note += "; so do the factors of covariances that come with measurements, and the mount"
-    said = (note, *notes, *_alarms(figures, scenario))
-    return Calibration(figures, (), False, said, of_central)
+    findings = (note, *notes, *_alarms(figures, scenario))
+    return Calibration(figures, (), False, findings, of_central)
 
 
 def _central_figures(
     folds: Sequence[Fold], scenario: Scenario, strays: Sequence[Figure], progress: Progress
 ) -> tuple[Figure, ...]:
-    """The errors of each robot's own, the factor that they leave, and the monitor's scale then."""
+    """The standard deviations of robots' own biases, the covariance factor that remains with them,
+    and the monitor's normal scale.
+    """
     progress("maps of single robots against the rest of their team")
     fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
     for table in ("bias_sigma", "common_bias_sigma"):
-        told = msgspec.to_builtins(getattr(scenario.central, table))
-        fields[table] = told | msgspec.to_builtins(fields[table])
+        fields_of_table = msgspec.to_builtins(getattr(scenario.central, table))
+        fields[table] = fields_of_table | msgspec.to_builtins(fields[table])
     central = msgspec.convert(fields, CentralConfig)
     factor = covariance_factor(folds, central)
     if factor is None:
@@ -188,7 +200,7 @@ def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:
 def _left_out(
     label: str, world: WorldStreams, paths: Mapping[str, Path], pathless: str
 ) -> list[str]:
-    """The robots of which nothing can be learnt, each with its reason."""
+    """The robots of which nothing can be learnt, each with the reason."""
     return [
         f"{label} {stream.robot}: {reason}: nothing is learnt from it"
         for stream in world.streams
@@ -239,7 +251,7 @@ def _alarms(figures: Sequence[Figure], scenario: Scenario) -> tuple[str, ...]:
 
 
 def _mistrusting(scenario: Scenario) -> Scenario:
-    """The scenario whose odometry says MISTRUST times its noise."""
+    """The scenario with the densities of odometry noise multiplied by MISTRUST."""
 
     def wider(noise: MotionNoise) -> MotionNoise:
         fields = msgspec.structs.asdict(noise)
@@ -258,7 +270,9 @@ def with_figures(
     of_sensor: Sequence[Figure],
     of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
 ) -> Scenario:
-    """The scenario with the learnt figures in every robot's models, a robot's own above all's."""
+    """The scenario with the learnt figures in every robot's models; a robot's own figures take
+    precedence.
+    """
     robots = tuple(
         msgspec.structs.replace(
             robot,
@@ -282,10 +296,10 @@ def with_figures(
 def nested(
     below: Mapping[str, object], figures: Sequence[Figure], declared: type[msgspec.Struct]
 ) -> dict[str, object]:
-    """Fields of a model with figures laid over them: `forward.per_m` is a field of `forward`.
+    """The fields of a model overlaid with figures: `forward.per_m` is a field of `forward`.
 
-    A density that was learnt replaces all three of its noise. What is no field of the model (a
-    share of outliers) is left out.
+    A learnt density replaces all three densities of its noise. A figure that is no field of the
+    model (a share of outliers) is left out.
     """
     names = {field.name for field in msgspec.structs.fields(declared)}
     fields = dict(below)

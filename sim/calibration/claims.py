@@ -1,10 +1,10 @@
-"""What measurements claim of themselves, and where a sensor is mounted, held against the truth.
+"""Compares the covariances that measurements carry, and the sensor's mount, with the truth.
 
-Covariances that come with odometry or with landmarks are right up to a factor: the median of the
-squared errors in their metric, over the median of chi-square. Errors of odometry are taken over
-spans, since those of a moment are the reference's own. A mount's heading is what a bearing reads
-too much, so it can not be told from `bearing_offset`; its place can, unless landmarks are seen in
-one direction only.
+Covariances of odometry or of landmark measurements are taken to be right up to a factor: the median
+of the squared Mahalanobis errors over the median of chi-square. Errors of odometry are taken over
+spans of time, since those of single intervals are dominated by the reference's own. A mount's
+heading and `bearing_offset` have the same effect on bearings, so only their sum is known; the
+mount's position can be estimated unless landmarks are seen in one direction only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,30 +22,32 @@ from team.estimation.models import Increment, corrected
 
 SPAN_NS = 10_000_000_000
 LEAST = 30
-"""Spans or measurements from which a factor is learnt."""
+"""Least number of spans or measurements from which a factor is learnt."""
 CERTAIN_M = 0.02
-"""A mount that is not known as well as this [m], at three standard deviations, is not told."""
+"""A mount is not reported where three standard deviations of its position exceed this [m]."""
 DISTANT = 3.0
-"""Standard deviations from which a mount is not the scenario's."""
+"""Number of standard deviations from which a mount differs from the scenario's."""
 
 UNITS = {"covariance_factor": ""}
 
 
 def odometry_factor(data: Sequence[Reference]) -> Mapping[str, float]:
-    """`motion.covariance_factor` of increments that come with covariances; nothing of too few."""
+    """`motion.covariance_factor` of increments that come with covariances; empty where there are
+    too few.
+    """
     squared = [value for each in data for value in _spans(each)]
     return _factor(np.array(squared), 3)
 
 
 def _spans(data: Reference) -> list[float]:
-    told = data.intervals
-    if told.increments is None or told.covariances is None or not len(told.end_ns):
+    intervals = data.intervals
+    if intervals.increments is None or intervals.covariances is None or not len(intervals.end_ns):
         return []
-    edges = np.append(told.end_ns[0] - told.duration_ns[0], told.end_ns)
+    edges = np.append(intervals.end_ns[0] - intervals.duration_ns[0], intervals.end_ns)
     poses, known = poses_at(data.path, edges, data.gap_ns)
     found, start, sum_ = [], 0, Increment.identity()
-    for k in range(len(told.end_ns)):
-        sum_ = sum_.then(Increment(told.increments[k], told.covariances[k]))
+    for k in range(len(intervals.end_ns)):
+        sum_ = sum_.then(Increment(intervals.increments[k], intervals.covariances[k]))
         if edges[k + 1] - edges[start] < SPAN_NS:
             continue
         if known[start] and known[k + 1]:
@@ -56,7 +58,9 @@ def _spans(data: Reference) -> list[float]:
 
 
 def landmark_factor(data: Sequence[Reference], sensor: Sensor) -> Mapping[str, float]:
-    """`sensor.covariance_factor` of landmarks that come with covariances; nothing of too few."""
+    """`sensor.covariance_factor` of landmark measurements that come with covariances; empty where
+    there are too few.
+    """
     parts = [np.empty(0)]
     for each in data:
         claims = each.seen.covariances
@@ -79,7 +83,7 @@ def _factor(squared: Float[np.ndarray, " n"], dof: int) -> Mapping[str, float]:
 
 
 class _Rows(NamedTuple):
-    """Landmarks that are known, as they were seen and as they were, relative to the sensor."""
+    """Measurements of known landmarks and their true values, relative to the sensor."""
 
     taken: np.ndarray
     ranges: Float[np.ndarray, " n"]
@@ -106,7 +110,9 @@ def _rows(data: Reference, sensor: Sensor) -> _Rows:
 
 
 def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
-    """What the truth says of the sensor's place on the base, where it is not the scenario's."""
+    """The sensor's mount estimated by the truth, as a note, where it differs from the
+    scenario's.
+    """
     rows = [_rows(each, sensor) for each in data]
     points = np.concatenate([np.empty((0, 2)), *(each.points for each in rows)])
     true = np.concatenate([np.empty((0, 2)), *(each.true_points for each in rows)])

@@ -1,15 +1,15 @@
-"""How sure submaps are: maps of single robots against the rest of their team, without the truth.
+"""Learns how consistent submaps are from the maps of single robots, without the truth.
 
-A robot's own map a and the map b of the others share no measurement. Where the covariances are
-right,
+A robot's own map a and the map b of the others share no measurement. If the covariances are right,
 
     D = min over rigid motions of (a − b)ᵀ (P_a + P_b − P_ab − P_ba)⁻¹ (a − b)
 
-has the mean 2n − 3 for the n landmarks of both. `covariance_factor` is what makes Σ D that of all
-robots of all worlds: it stands for errors that last longer than a window, and for a robust loss,
-which weighs down what fits, too. What is wrong alike for all robots is not seen. a and b have the
-states of what the team shares in common (`central.common_bias_sigma`), hence P_ab: a marker that
-reads too far does so for both, from where each sees it.
+has the mean 2n − 3 for the n landmarks of both. `covariance_factor` is the factor under which ΣD
+over all robots of all worlds has its expected value. It accounts for errors that last longer than a
+window, and for a robust loss, which down-weights inliers, too. Errors that all robots have alike do
+not show in D. a and b share the states of the biases that the team has in common
+(`central.common_bias_sigma`), hence P_ab: a marker that reads too far does so for both, from where
+each sees it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,33 +32,34 @@ from team.estimation.map_joining.merging import ages
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
 
 LEAST_LANDMARKS = 3
-"""Two have one number between them: their distance."""
+"""Two landmarks have one invariant only, their distance."""
 LEAST_ROBOTS = 3
-"""In all worlds together: fewer say little."""
+"""Least number of robots in all worlds together from which a factor is learnt."""
 SETTLED = 0.02
-"""A factor that moves by a smaller share than this is found."""
+"""The iteration ends when the factor changes by a smaller share than this."""
 MOST_ROUNDS = 8
 APART = 2**40
-"""No landmark has a number from here on."""
+"""The landmarks of the single robot are numbered from here on; no landmark has such a number."""
 
 
 class Disagreement(NamedTuple):
-    """D of one robot, and the numbers that it is a sum over."""
+    """D of one robot, and its degrees of freedom."""
 
     chi2: float
     dof: int
 
 
 def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """The factor under which single robots' maps differ from the rest as they should, at least 1.
+    """The factor, at least 1, under which ΣD of the single robots' maps has its expected value.
 
-    ± from the scatter over the robots. None where there are not three robots with a map to compare.
+    Its standard deviation is from the scatter over the robots. None where fewer than LEAST_ROBOTS
+    robots have a map to compare.
     """
     settings = join_settings(central)
     factor = settings.covariance_factor
     for _ in range(MOST_ROUNDS):
-        told = replace(settings, covariance_factor=factor)
-        found = [each for fold in teams for each in disagreements(fold, told) if each.dof]
+        scaled = replace(settings, covariance_factor=factor)
+        found = [each for fold in teams for each in disagreements(fold, scaled) if each.dof]
         if len(found) < LEAST_ROBOTS:
             return None
         chi2, dof = np.array(found).T
@@ -71,10 +72,11 @@ def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure |
 
 
 def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """The monitor's covariance scale under these settings: what it says where all is right.
+    """The covariance scale that the monitor computes under these settings where everything is
+    consistent.
 
-    The geometric mean over the worlds, ± from their scatter (of one world: as the monitor knows
-    it). None where there are too few submaps to say.
+    The geometric mean over the worlds, with the standard deviation from their scatter (of one
+    world: the monitor's own). None where there are too few submaps.
     """
     settings = join_settings(central)
     scales, sigmas = [], []
@@ -98,7 +100,9 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
-    """Of each robot of the main island that shares three landmarks and more with the others."""
+    """D of each robot of the main island that has at least three landmarks in common with the
+    others.
+    """
     island = fold.main
     robots = sorted({robot for robot, _ in island.graph.streams})
     found = []
@@ -114,10 +118,10 @@ def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
 def _apart(
     island: Island, robot: str, starts: Mapping[Stream, InitialPoseFactor], settings: JoinSettings
 ) -> tuple[Graph, Island]:
-    """One robot's map beside that of the others, each from its own submaps, solved from where the
-    whole team has it; the robot's landmarks have numbers from APART on.
+    """The graph of one robot's map beside that of the others, each from its own submaps, solved
+    from the joined map's state; the robot's landmarks are numbered from APART on.
 
-    What both have in common are the errors that the whole team shares.
+    The two maps share the states of the biases that the whole team has in common.
     """
     submaps = island.graph.submaps
     numbers = {
@@ -144,7 +148,7 @@ def _apart(
 
 
 def _between(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> Disagreement:
-    """D of two maps of n landmarks, the one behind the other, and their joint covariance."""
+    """D of two maps of n landmarks, from their stacked means and their joint covariance."""
     a, b = mean.reshape(2, -1, 2)
     a_from_b = rigid_alignment(a, b)
     if a_from_b is None:

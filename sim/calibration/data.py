@@ -1,6 +1,4 @@
-"""What a calibration is learnt from: a robot's measurements beside poses that they are held
-against.
-"""
+"""The data of a calibration: a robot's measurements with the reference poses and landmarks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,18 +21,17 @@ from team.estimation.scans import Scan, point_scan, polar_scan
 
 LARGEST_TURN_RAD = 0.35
 FASTEST_TURN_RAD_S = 3.0
-"""Between two poses of a path; more than both is a fault of resampled headings beside ±π."""
+"""A faster turn between two poses of a path is an interpolation fault near a heading of ±π."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
     """One robot's odometry and landmark measurements, and the poses and landmarks of reference.
 
-    name: the world's label, then the robot's id.
-    gap_ns: between poses of `path` that are at most this far apart it is interpolated.
-    landmarks: position of each id in the path's frame; `teammates`: the paths of the others.
-    mount: the sensor's pose on the robot's base.
-    turns_first: between two poses the robot turns, then drives straight on (else: an arc).
+    name: the world's label, then the robot's id. gap_ns: `path` is interpolated between poses that
+    are at most this far apart. landmarks: position of each id in the path's frame. teammates: the
+    paths of the others. mount: the sensor's pose on the robot's base. turns_first: between two
+    poses the robot turns, then drives straight on (else: an arc).
     """
 
     name: str
@@ -55,7 +52,7 @@ class Reference:
         return self.name.rpartition(" ")[2]
 
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
-        """The same with the odometry and the measurements of [begin_ns, end_ns) only."""
+        """The same with only the odometry and the measurements of [begin_ns, end_ns)."""
         chosen = (self.intervals.end_ns >= begin_ns) & (self.intervals.end_ns < end_ns)
         seen, sighted = (_between(each, begin_ns, end_ns) for each in (self.seen, self.sighted))
         return replace(self, intervals=self.intervals.where(chosen), seen=seen, sighted=sighted)
@@ -69,7 +66,7 @@ def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
 def sensor_poses(
     data: Reference, stamps_ns: Int64[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Where the sensor was at these times, and which of them are known."""
+    """The poses of the sensor at these times, and which of them are known."""
     poses, known = poses_at(data.path, stamps_ns, data.gap_ns, turns_first=data.turns_first)
     if not any(data.mount):
         return poses, known
@@ -79,48 +76,48 @@ def sensor_poses(
     return poses + moved_on, known
 
 
-def as_speeds(told: Intervals, motion: MotionModel) -> Intervals:
-    """Odometry of any form with the mean speeds that it means; those of a motion are its arc's."""
-    if told.increments is not None:
-        twists = np.array([moved(each, None).twist for each in told.increments]).reshape(-1, 3)
-        rates = twists / (told.duration_ns * 1e-9)[:, np.newaxis]
-        return replace(told, forward=rates[:, 0], yaw_rate=rates[:, 2])
-    if not told.steered:
-        return told
-    pairs = zip(told.forward.tolist(), told.yaw_rate.tolist(), strict=True)
+def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
+    """Odometry of any form as mean speeds; increments give the speeds of their arc."""
+    if intervals.increments is not None:
+        twists = np.array([moved(each, None).twist for each in intervals.increments]).reshape(-1, 3)
+        rates = twists / (intervals.duration_ns * 1e-9)[:, np.newaxis]
+        return replace(intervals, forward=rates[:, 0], yaw_rate=rates[:, 2])
+    if not intervals.steered:
+        return intervals
+    pairs = zip(intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
     speeds = np.array([steered(motion, *pair) for pair in pairs]).reshape(-1, 2)
-    return replace(told, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)
+    return replace(intervals, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)
 
 
 def scan_of(seen: ObservationMeasurement) -> Scan:
-    """What a robot's door makes of this scan."""
+    """The scan as a robot's front end receives it."""
     if seen.points is not None:
         return point_scan(seen.ids, seen.points, seen.covariances)
     return polar_scan(seen.ids, seen.ranges, seen.bearings, seen.covariances)
 
 
-def interval_of(told: OdometryMeasurement, motion: MotionModel) -> Interval:
-    """What a robot's door makes of this interval of odometry."""
-    if told.increment is not None:
-        motions = moved(told.increment, told.covariance)
-        rates = motions.twist / (told.duration_ns * 1e-9)
+def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> Interval:
+    """The interval of odometry as a robot's front end receives it."""
+    if measurement.increment is not None:
+        motions = moved(measurement.increment, measurement.covariance)
+        rates = motions.twist / (measurement.duration_ns * 1e-9)
         speeds = float(rates[0]), float(rates[2])
-        return Interval(told.stamp_ns, told.duration_ns, *speeds, motions)
-    speeds = told.forward, told.yaw_rate
-    if told.steered:
+        return Interval(measurement.stamp_ns, measurement.duration_ns, *speeds, motions)
+    speeds = measurement.forward, measurement.yaw_rate
+    if measurement.steered:
         speeds = steered(motion, *speeds)
-    return Interval(told.stamp_ns, told.duration_ns, *speeds)
+    return Interval(measurement.stamp_ns, measurement.duration_ns, *speeds)
 
 
 def poses_at(
     path: Path, stamps_ns: Int64[np.ndarray, " n"], gap_ns: int, *, turns_first: bool = False
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """The path at these times, and which of them are known.
+    """The poses of a path at these times, and which of them are known.
 
-    Between two poses it is the arc that joins them: s of the way from (p, θ), that is
-    (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ). With turns_first it is the chord,
-    with the heading of its end. Not known: outside the path, in a gap longer than gap_ns, beside a
-    jump of the heading.
+    Between two poses the path is the arc that joins them: at a share s of it from (p, θ), the pose
+    is (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ). With turns_first it is the
+    chord, with the heading of its end. Unknown are poses outside the path, in a gap longer than
+    gap_ns, and beside a jump of the heading.
     """
     if len(path.stamps_ns) < 2:
         return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)
@@ -158,7 +155,11 @@ def references(
     turning_first: frozenset[str] = frozenset(),
     models: RobotConfig | None = None,
 ) -> list[Reference]:
-    """The references of the robots that have a path and odometry; models: what reads the latter."""
+    """The references of the robots that have a path and odometry.
+
+    turning_first: the robots that turn before they drive straight on. models: the robots' models,
+    which convert odometry to motion.
+    """
     robot = models or RobotConfig("any")
     return [
         Reference(

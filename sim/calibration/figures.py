@@ -1,4 +1,4 @@
-"""Figures that were learnt, with their uncertainty by leaving out."""
+"""Learnt figures with their uncertainty by the jackknife."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,21 +11,25 @@ from scipy.optimize import least_squares
 from sim.calibration.data import Reference
 
 GROUPS = 5
-"""At least so many parts are left out in turn; fewer robots are cut into equal stretches."""
+"""Least number of parts that are left out in turn; fewer robots are cut into equal stretches of
+time.
+"""
 
 HUBER = 2.0
-"""Residuals beyond so many standard deviations pull no harder."""
+"""The loss is linear beyond this number of standard deviations."""
 
 Fit = Callable[[Sequence[Reference]], Mapping[str, float]]
 
 
 class CalibrationError(ValueError):
-    """The data do not determine what was asked for: what is missing."""
+    """The data do not determine a figure; the text says what is missing."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One learnt number: its place in a scenario, its value, one standard deviation and unit."""
+    """One learnt number: its place in a scenario, its value, its standard deviation and its
+    unit.
+    """
 
     name: str
     value: float
@@ -48,7 +52,9 @@ def huber(
 
 
 def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
-    """Parts that are as independent as may be: robots of sets, or stretches of time of each."""
+    """Groups that are as independent as possible: the robots of each data set, or stretches of time
+    of each.
+    """
     pieces = -(-GROUPS // len(data))
     if pieces == 1:
         return [[each] for each in data]
@@ -61,10 +67,11 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
 
 
 def jackknifed(fit: Fit, data: Sequence[Reference], units: Mapping[str, str]) -> tuple[Figure, ...]:
-    """The fit of all, σ² = (G − 1)/G Σ (fit without group − their mean)²; Efron and Stein 1981.
+    """The fit of all data, with σ² = (G − 1)/G Σ (fit without a group − their mean)²; Efron and
+    Stein 1981.
 
-    Errors within a group may be correlated as they will; between groups they are independent. What
-    hangs on one group, so that the rest does not tell it, is not a figure.
+    Errors may be correlated within a group; between groups they are independent. A figure that the
+    data without one group do not determine is left out.
     """
     groups = groups_of(data)
     values = fit([part for group in groups for part in group])

@@ -35,12 +35,12 @@ from team.estimation.map_joining.joining import (
 )
 
 LONGEST_NS = 250_000_000
-"""Intervals of an arc are merged up to this: a window ends with one."""
+"""Intervals of an arc are merged up to this length: a window closes at the end of an interval."""
 
 
 @dataclass(frozen=True)
 class _Track:
-    """One closed window: its submap, and the mean path of its particles in its own frame."""
+    """One closed window: its submap, and the mean path of its particles in the submap's frame."""
 
     closed: ClosedWindow
     stamps_ns: Int64[np.ndarray, " K"]
@@ -49,7 +49,7 @@ class _Track:
 
 @dataclass(frozen=True)
 class JoinedTeam:
-    """Landmarks by id and each robot's path, in the frame of the joined map; the fold of it."""
+    """The landmarks by id and each robot's path in the frame of the joined map, and the fold."""
 
     landmarks: Mapping[int, Float[np.ndarray, "2"]]
     paths: Mapping[str, Path]
@@ -59,10 +59,11 @@ class JoinedTeam:
 def joined_team(
     world: WorldStreams, scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> JoinedTeam:
-    """Every robot's windows with the scenario's models, joined; the main island's robots only.
+    """The joined map of every robot's windows under the scenario's models; robots of the main
+    island only.
 
-    Between two ends of windows a path is the particles' mean, bent to end where the join ends it.
-    progress: is told the name of each robot whose windows are done.
+    Between two window ends a path is the particles' mean, moved so that it ends at the joined pose.
+    progress: called with the name of each robot whose windows are done.
     """
     tracks = {}
     for each in world.streams:
@@ -100,7 +101,9 @@ def joined_team(
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:
-    """The robot's configuration; one that the scenario does not know has the first one's models."""
+    """The robot's configuration; a robot that the scenario does not have gets the first robot's
+    models.
+    """
     configs = {each.id: each for each in scenario.robots}
     return configs.get(robot) or msgspec.structs.replace(scenario.robots[0], id=robot)
 
@@ -130,33 +133,35 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
 def _merged(
     stream: RobotStream, longest_ns: int
 ) -> Iterator[ObservationMeasurement | OdometryMeasurement]:
-    """The stream's scans and odometry; intervals of one command between two scans are made one.
+    """The stream's scans and odometry, with intervals of one command between two scans merged.
 
-    None is made longer than longest_ns. A command that is logged ten times is one arc, and noise of
-    motion is a density: the estimate is the same, up to the correlation of the noises within an
-    interval and to where a window ends.
+    No interval becomes longer than longest_ns. A command that is logged ten times is one arc, and
+    motion noise is a density: the estimate stays the same, up to the correlation of the noises
+    within an interval and to where a window closes.
     """
-    held: OdometryMeasurement | None = None
+    pending: OdometryMeasurement | None = None
     for counter in range(1, len(stream)):
         kind = stream.kinds[counter]
         if kind == ODOMETRY:
             interval = stream.odometry(counter)
-            if held is not None and _goes_on(held, interval, longest_ns):
-                interval = interval._replace(duration_ns=held.duration_ns + interval.duration_ns)
-            elif held is not None:
-                yield held
-            held = interval
+            if pending is not None and _goes_on(pending, interval, longest_ns):
+                interval = interval._replace(duration_ns=pending.duration_ns + interval.duration_ns)
+            elif pending is not None:
+                yield pending
+            pending = interval
         elif kind == OBSERVATIONS:
-            if held is not None:
-                yield held
-            held = None
+            if pending is not None:
+                yield pending
+            pending = None
             yield stream.observations(counter)
-    if held is not None:
-        yield held
+    if pending is not None:
+        yield pending
 
 
 def _goes_on(one: OdometryMeasurement, then: OdometryMeasurement, longest_ns: int) -> bool:
-    """Whether the other follows without a gap, by the same command, and both are short."""
+    """Whether the second interval follows without a gap and by the same command, and both are
+    short.
+    """
     return (
         then.stamp_ns - then.duration_ns == one.stamp_ns
         and one.increment is None

@@ -12,18 +12,20 @@ from sim.calibration.data import Reference, poses_at, sinc
 from sim.calibration.figures import CalibrationError, huber
 
 SPAN_S = 10.0
-"""Errors are taken over so long: those of one command are correlated for seconds."""
+"""Length [s] of the spans over which errors are taken: errors of one command are correlated for
+seconds.
+"""
 STEPS = 40
-"""Steps of a span, each an arc (or turn and chord) of the true path."""
+"""Number of steps of a span, each an arc (or a rotation and a chord) of the true path."""
 STEP_S = SPAN_S / STEPS
 LEAST_SPANS = 30
 LEAST_WAY_M = 0.05
-"""A span in which less is logged is not one of motion."""
+"""A span with a shorter logged path [m] has no motion."""
 ROUNDS = 4
 STANDING_M_S = 1e-3
-"""A slower speed is none."""
+"""Speeds below this [m/s] count as standing."""
 FLOOR_VARIANCE = 1e-6
-"""Of a span without motion: a millimetre, a milliradian of the reference itself."""
+"""Variance of a span without motion: a millimetre, a milliradian of the reference itself."""
 
 UNITS = {
     "forward_scale": "",
@@ -39,7 +41,7 @@ UNITS = {
 }
 
 LEAST_SLOW_S = 20.0
-"""So long must the robots creep for the scale of slow speeds to be learnt."""
+"""Least time [s] at low speed from which the scale of low speeds is learnt."""
 
 Numbers = Float[np.ndarray, " p"]
 Pair = Float[np.ndarray, "2"]
@@ -49,7 +51,9 @@ Values = Float[np.ndarray, " spans"]
 
 @dataclass(frozen=True)
 class _Spans:
-    """Of each span's steps: logged mean speed and yaw rate, true forward, lateral way and turn."""
+    """The steps of each span: logged mean speed and yaw rate, and true forward and lateral
+    translation and rotation.
+    """
 
     speed: Grid
     yaw_rate: Grid
@@ -59,17 +63,17 @@ class _Spans:
 
     @property
     def way(self) -> Values:
-        """How far the robot truly drove [m]."""
+        """The length of the true path [m]."""
         return np.asarray(np.abs(self.forward).sum(axis=1))
 
     @property
     def driven(self) -> Values:
-        """The true way forward [m]."""
+        """The true forward translation [m]."""
         return np.asarray(self.forward.sum(axis=1))
 
     @property
     def turned(self) -> Values:
-        """The true turn [rad]."""
+        """The true rotation [rad]."""
         return np.asarray(self.turn.sum(axis=1))
 
     def rates(self, yaw_scale: float, limit: float) -> Grid:
@@ -77,19 +81,21 @@ class _Spans:
         return np.asarray(np.clip(yaw_scale * self.yaw_rate, -limit, limit))
 
     def slow(self, below: float) -> Grid:
-        """1 where the robot creeps, at a logged speed below this [m/s] and not standing; else 0."""
+        """1 where the robot drives at a logged speed below this [m/s] and does not stand;
+        else 0.
+        """
         speed = np.abs(self.speed)
         return np.asarray(((speed < below) & (speed > STANDING_M_S)).astype(np.float64))
 
     def forward_of(self, p: Numbers, yaw_scale: float, limit: float, below: float) -> Values:
-        """The model's way for p = (forward_scale, turn_drag, slow_scale or nothing) [m]."""
+        """The model's translation for p = (forward_scale, turn_drag, slow_scale or nothing) [m]."""
         lost = p[1] * np.abs(self.rates(yaw_scale, limit))
         scale = p[0] + (p[2] - p[0]) * self.slow(below) if len(p) > 2 else p[0]
         speed = np.maximum(scale * np.abs(self.speed) - lost, 0.0)
         return np.asarray((np.sign(self.speed) * speed).sum(axis=1) * STEP_S)
 
     def turn_of(self, p: Pair, limit: float) -> Values:
-        """The model's turn for p = (yaw_scale, veer) on the true way [rad]."""
+        """The model's rotation for p = (yaw_scale, veer) on the true path [rad]."""
         return np.asarray(self.rates(p[0], limit).sum(axis=1) * STEP_S + p[1] * self.driven)
 
 
@@ -128,7 +134,7 @@ def _steps_of(data: Reference) -> Float[np.ndarray, "spans steps 5"]:
 
 
 def creep(data: Sequence[Reference], slow_below: float) -> bool:
-    """Whether the robots crept for long enough to learn the scale of slow speeds."""
+    """Whether the robots drove at low speed for long enough to learn its scale."""
     return bool(_spans(data).slow(slow_below).sum() * STEP_S >= LEAST_SLOW_S)
 
 
@@ -137,9 +143,9 @@ def fit_motion(
 ) -> Mapping[str, float]:
     """The model of `increment_of` whose errors over SPAN_S are most likely.
 
-    With slow_below [m/s] the scale below that speed is learnt, too; ask `creep` first.
-    Scales by weighted least squares under Huber's loss, densities σ² = per_m² |d| + per_rad² |φ| of
-    what is left, in turn (each maximises the likelihood given the other).
+    With slow_below [m/s] the scale below that speed is learnt, too; ask `creep` first. Alternates
+    weighted least squares of the scales under Huber's loss with the likelihood of the densities σ²
+    = per_m² |d| + per_rad² |φ| of the residuals (each maximises the likelihood given the other).
     Raises CalibrationError where there is too little motion.
     """
     spans = _spans(data)

@@ -1,15 +1,15 @@
-"""What each robot's sensor has of its own, and how far that strays from one world to the next.
+"""Learns which constants single robots' sensors have, and how they vary from world to world.
 
 A constant of robot r in world w is v = m + a_r + e_rw. Each robot's value is its mean over the
-worlds, drawn towards the mean of all robots by what the spread s of e leaves uncertain:
+worlds, shrunk towards the mean of all robots by the uncertainty that the spread s of e leaves:
 
     m + (v̄_r − m) τ²/(τ² + s²/n_r),    τ² = var(v̄_r) − mean(s²/n_r).
 
-Where no constant's τ² is beyond doubt (F test) all robots are alike. s is a robust estimate: one
-camera that was touched between two worlds is not the rule.
+Where τ² is not significant for any constant (F test) all robots have the same. s is a robust
+estimate, so that one camera that was moved between two worlds does not count.
 
-Landmarks have something of their own, too: a marker that hangs higher or is larger than the others
-reads too far by a share of the range, for whoever sees it (`marker_spread`).
+Landmarks have an error of their own, too: a marker that hangs higher or is larger than the others
+reads too far by a share of the range, for every robot (`marker_spread`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,22 +24,24 @@ from sim.calibration.figures import CalibrationError, Figure, groups_of
 from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
 
 LEAST_ROBOTS = 3
-"""Of fewer it is not known how far robots differ."""
+"""Least number of robots from which their variation is learnt."""
 LEAST_LANDMARKS = 4
-"""Of fewer it is not known how far they differ."""
+"""Least number of landmarks from which their variation is learnt."""
 BEYOND_DOUBT = 0.99
 COMMON_DOF = 2
-"""What robots have in common counts as seen in so many worlds more, as large as one's own."""
+"""The prior of the common range scale counts as this number of further worlds, with a robot's own
+spread.
+"""
 BIAS_OF = {
     "bearing_offset": "bearing",
     "range_offset": "range_offset",
     "range_scale": "range_scale",
 }
-"""The error that the centre estimates of each constant that has one."""
+"""The bias that the centre estimates for each constant, where there is one."""
 
 
 class Own(NamedTuple):
-    """robots: figures of each robot's sensor, empty where all are alike; strays: s of each bias,
+    """robots: figures of each robot's sensor, empty where all are alike. strays: s of each bias,
     and σ of the range scale that all have in common.
     """
 
@@ -51,7 +53,9 @@ NOTHING_OF_ITS_OWN = Own({}, ())
 
 
 def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
-    """Each robot's own constants by the worlds (or by stretches of time where there are few)."""
+    """Each robot's own constants over the worlds (or over stretches of time where there are few
+    worlds).
+    """
     found: dict[str, list[Mapping[str, float]]] = {}
     worlds: dict[str, list[str]] = {}
     for group in groups_of(data):
@@ -99,7 +103,8 @@ def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
 def _in_common(
     parts: Sequence[Float[np.ndarray, " n"]], worlds: Sequence[Sequence[str]], stray: float
 ) -> Figure:
-    """How far the range scale of all robots strays together from one world to the next.
+    """The standard deviation, from world to world, of the range scale that all robots have in
+    common.
 
     parts: each robot's values, in the worlds of these names.
     """
@@ -117,11 +122,12 @@ def _in_common(
 
 
 def marker_spread(data: Sequence[Reference], *, depth: bool) -> Figure | None:
-    """How far one landmark's ranges differ from another's, relative, for all robots of a world.
+    """The standard deviation of single landmarks' range scales, relative, for all robots of a
+    world.
 
     The share e_rl by which robot r sees landmark l too far, given r's own constants, is m_l + ε_rl:
     var(m) = var(ē_l) − var(ε) mean(1/n_l) of the n_l robots that see it. None where that is not
-    beyond doubt (F test): where no two robots of a world see one landmark, or few landmarks.
+    significant (F test): where no two robots of a world see one landmark, or few landmarks.
     """
     by_world: dict[str, dict[int, list[float]]] = {}
     for each in data:

@@ -13,7 +13,9 @@ from team.config import MotionModel, Sensor
 
 
 def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
-    """A document with `base`: the scenario's name if it is built in, else that of its data set."""
+    """A TOML document whose `base` is the scenario's name if it is built in, else its data
+    set's.
+    """
     world = scenario.world
     otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
     base = scenario.name if scenario.name in builtin_names() else otherwise
@@ -36,8 +38,8 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
         if figures:
             lines += ["", f"[{name}]", *_table(figures, declared)]
     differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
-    told_apart = calibration.robots or (calibration.by_truth and differ)
-    for robot in scenario.robots if told_apart or isinstance(world, LiveWorld) else ():
+    by_robot = calibration.robots or (calibration.by_truth and differ)
+    for robot in scenario.robots if by_robot or isinstance(world, LiveWorld) else ():
         fields = nested({}, calibration.robots.get(robot.id, ()), Sensor)
         own = [f"sensor = {_inline(fields)}"] if fields else []
         lines += ["", "[[robots]]", f'id = "{robot.id}"', *own]

@@ -1,8 +1,10 @@
-"""Maximum likelihood of the range-bearing sensor's model: affine range, noise, its persistence.
+"""Maximum likelihood of the range-bearing sensor's model: affine range, noise and its correlation
+time.
 
 Where the range is a depth along the optical axis, range = scale · distance · cos(b − axis) + offset
-with the raw bearing b. Each robot's constants (scale, offset, axis, bearing offset) are its own in
-the fit of the noise, which all share; the constants of all together stand for an unknown robot.
+with the raw bearing b. The noise is fitted with each robot's own constants (scale, offset, axis,
+bearing offset) and is the same for all; the constants of all together serve a robot that is not in
+the data.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,12 +24,14 @@ from team.estimation.models import corrected
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4
 OUTLIER = 4.0
-"""Standard deviations beyond which a measurement is no part of a spread or a correlation."""
+"""Measurements beyond this number of standard deviations are left out of spreads and
+correlations.
+"""
 MAD_TO_SIGMA = 1.4826
 LAGS_S = np.geomspace(0.1, 30.0, 9)
-"""Edges of the lags at which the errors of one landmark are correlated."""
+"""Edges of the lags [s] at which the errors of one landmark are correlated."""
 NEIGHBOURS = 64
-"""Pairs of measurements of one landmark are taken up to so many measurements apart."""
+"""Pairs of measurements of one landmark are formed up to this number of measurements apart."""
 
 UNITS = {
     "range_offset": "m",
@@ -51,7 +55,7 @@ UNITS = {
 
 @dataclass(frozen=True)
 class _Rows:
-    """Measurements with what they should have been: distances [m] and bearings [rad].
+    """Measurements with their true values: distances [m] and bearings [rad].
 
     series: equal for measurements of one landmark by one robot; the rows ascend by (series, time).
     """
@@ -92,10 +96,11 @@ def _rows(data: Sequence[Reference]) -> _Rows:
 
 
 class Constants(NamedTuple):
-    """What one camera reads: range = scale · d · cos(b − axis) + offset [m], bearing + offset.
+    """The constants of one camera: range = scale · d · cos(b − axis) + offset [m], bearing +
+    offset.
 
-    axis: None where the range is the distance itself. lens: coefficients of b, b² and b³ that
-    bearings read too much in addition, of a camera.
+    axis: None where the range is the distance itself. lens: the coefficients of b, b² and b³ by
+    which a camera's bearings are too large in addition.
     """
 
     range_scale: float
@@ -106,7 +111,7 @@ class Constants(NamedTuple):
 
     @property
     def figures(self) -> dict[str, float]:
-        """By the names of the fields of `Sensor`."""
+        """The constants by the names of the fields of `Sensor`."""
         named = {
             "range_offset": self.range_offset,
             "range_scale": self.range_scale,
@@ -121,7 +126,7 @@ class Constants(NamedTuple):
     def distances(
         self, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
-        """The distances [m] that raw ranges and bearings say; NaN beside the axis."""
+        """The distances [m] of raw ranges at these bearings; NaN far from the axis."""
         sensor = Sensor(
             range_offset=self.range_offset,
             range_scale=self.range_scale,
@@ -134,8 +139,8 @@ class Constants(NamedTuple):
 def constants(data: Sequence[Reference], *, depth: bool) -> Constants:
     """The constants of all measurements together, as of one camera.
 
-    Ranges under Huber's loss in units of their noise, bearings by their median, since outliers come
-    in bursts. Raises CalibrationError where there are too few measurements.
+    Ranges are fitted under Huber's loss in units of their noise, bearings by their median, since
+    outliers come in bursts. Raises CalibrationError where there are too few measurements.
     """
     return _constants(_enough(_rows(data)), depth)
 
@@ -185,10 +190,10 @@ def _lens(rows: _Rows, offset: float) -> list[float]:
 def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str, float]:
     """The model of `Sensor` under which the measurements are most likely.
 
-    The constants are those of all robots together, the noise is what each robot's own constants
-    leave: σ² = σ₀² + (σ₁ d)² by likelihood, of bearings the median absolute deviation. Shares:
-    ρ(τ) = (1 − white) exp(−τ/T) fitted to the correlation of one landmark's errors. Raises
-    CalibrationError where there are too few measurements.
+    The constants are those of all robots together. The noise is that of the residuals under each
+    robot's own constants: σ² = σ₀² + (σ₁ d)² by likelihood, of bearings the median absolute
+    deviation. The shares are those of ρ(τ) = (1 − white) exp(−τ/T), fitted to the correlation of
+    one landmark's errors. Raises CalibrationError where there are too few measurements.
     """
     common = constants(data, depth=depth)
     parts = []
@@ -226,9 +231,11 @@ def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str
 
 
 def shares_by_landmark(data: Reference, *, depth: bool) -> dict[int, float]:
-    """By what share of its range each landmark is seen too far, given the robot's own constants.
+    """The share of its range by which each landmark is seen too far, given the robot's own
+    constants.
 
-    Medians less their mean, of landmarks with LEAST_MEASUREMENTS and more; none of too few.
+    Medians less their mean, of landmarks with at least LEAST_MEASUREMENTS; empty where there are
+    too few.
     """
     rows = _rows([data])
     if len(rows.series) < LEAST_MEASUREMENTS:
@@ -273,7 +280,9 @@ def _persistence(
     seconds: Float[np.ndarray, " n"],
     relative: Float[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """(white share, correlation time [s]) of errors in units of σ; (1, 0) if there is none."""
+    """(white share, correlation time [s]) of errors in units of σ; (1, 0) where there is no
+    correlation.
+    """
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
     counts, sums, times = (np.zeros(len(LAGS_S) - 1) for _ in range(3))
@@ -282,10 +291,10 @@ def _persistence(
         lag = (seconds[apart:] - seconds[:-apart])[pair]
         product = (relative[apart:] * relative[:-apart])[pair]
         at = np.searchsorted(LAGS_S, lag) - 1
-        kept = (at >= 0) & (at < len(counts))
-        counts += np.bincount(at[kept], minlength=len(counts))
-        sums += np.bincount(at[kept], product[kept], minlength=len(counts))
-        times += np.bincount(at[kept], lag[kept], minlength=len(counts))
+        counted = (at >= 0) & (at < len(counts))
+        counts += np.bincount(at[counted], minlength=len(counts))
+        sums += np.bincount(at[counted], product[counted], minlength=len(counts))
+        times += np.bincount(at[counted], lag[counted], minlength=len(counts))
     filled = counts >= LEAST_MEASUREMENTS
     if np.count_nonzero(filled) < 3:
         return 1.0, 0.0
@@ -301,7 +310,9 @@ def _persistence(
 
 
 def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[str, float]:
-    """How much too far teammates are seen, the median of the nearer half; none where few are."""
+    """The distance [m] by which teammates are seen too far, the median of the nearer half; empty
+    where there are few.
+    """
     errors, distances = [np.zeros(0)], [np.zeros(0)]
     for each in data:
         seen, own = each.sighted, owns.get(each.robot)

@@ -1,4 +1,4 @@
-"""The measurements to calibrate by: a data set's, or those of a log."""
+"""Reads the measurements of a calibration: a data set's, or those of a log."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from sim.world.streams import WorldStreams
 def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
     """The measurements of a log (`.mcap`) with its scenario, or of a data set with its own.
 
-    Of a log the first incarnation of each robot is taken; of a set, all robots that it has files
-    of. Raises DatasetError, LogError or ScenarioError.
+    Of a log the first incarnation of each robot is used; of a data set all robots that have files
+    in it. Raises DatasetError, LogError or ScenarioError.
     """
     if path.suffix != ".mcap":
         scenario = _with_its_robots(path)
@@ -26,7 +26,7 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
 
 
 def _with_its_robots(path: Path) -> Scenario:
-    """The data set's own scenario with the robots that it has files of, however many."""
+    """The data set's own scenario with the robots that have files in it, however many."""
     if kind_of(path) == "folder":
         return with_options(load(scenario_beside(path)), dataset=path)
     with opened_set(str(path), UTIAS_MARKER) as files:

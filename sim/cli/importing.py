@@ -70,7 +70,7 @@ def import_(
     )
     report = imported(request, output)
     elapsed_s = time.monotonic() - began
-    for note in dict.fromkeys([*report.said, *_as_read(output)]):  # each once
+    for note in dict.fromkeys([*report.notes, *_as_read(output)]):  # each once
         typer.echo(note)
     if report.messages:
         rate = report.messages / elapsed_s
@@ -89,7 +89,7 @@ def imported_into(path: Path, folder: Path) -> Path:
 
     if folder.exists() and any(folder.iterdir()):
         fail(f"{folder} is not empty: give another --output", WRONG_USE)
-    for note in imported(Request(sources=[path]), folder).said:
+    for note in imported(Request(sources=[path]), folder).notes:
         typer.echo(note, err=True)
     typer.echo(f"imported {path} into {folder}", err=True)
     return folder
@@ -109,7 +109,7 @@ def readable(path: Path) -> Iterator[Path]:
 
     with TemporaryDirectory() as place:
         folder = Path(place) / path.stem
-        for note in imported(Request(sources=[path]), folder).said:
+        for note in imported(Request(sources=[path]), folder).notes:
             typer.echo(note, err=True)
         yield folder
 
@@ -130,12 +130,12 @@ def _as_read(folder: Path) -> list[str]:
     streams = streams_of(with_options(load(scenario_beside(folder)), dataset=folder))
     lines = list(streams.notes)
     for stream in streams.streams:
-        seen, met = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)
+        seen, teammates = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)
         driven = counted(len(stream.intervals.end_ns), "odometry interval")
-        told = "known" if stream.start is not None else "not known"
+        pose = "known" if stream.start is not None else "not known"
         lines.append(
-            f"{stream.robot}: {driven}, {counted(seen, 'measurement')}, {counted(met, 'sighting')}"
-            f", initial pose {told}"
+            f"{stream.robot}: {driven}, {counted(seen, 'measurement')}, "
+            f"{counted(teammates, 'sighting')}, initial pose {pose}"
         )
         lines += [f"{stream.robot}: {note}" for note in stream.notes]
     return lines

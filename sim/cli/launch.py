@@ -195,8 +195,8 @@ def _launched(plan: "Plan") -> "Outcome":
         except LaunchError as error:
             fail(str(error), FAILED)
         except KeyboardInterrupt:
-            kept = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
-            fail(f"interrupted: every process of the team was ended{kept}", FAILED)
+            recorded_note = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
+            fail(f"interrupted: every process of the team was ended{recorded_note}", FAILED)
 
 
 def _keep_showing(url: str, log: Path) -> None:

@@ -64,15 +64,15 @@ def main() -> None:
     try:
         command()()
     except Exception as error:
-        told = _told(error)
-        if told is None:
+        advice = _advice(error)
+        if advice is None:
             raise
-        status, text = told
+        status, text = advice
         typer.secho(f"error: {text}", fg="red", err=True)
         sys.exit(status)
 
 
-def _told(error: Exception) -> tuple[int, str] | None:
+def _advice(error: Exception) -> tuple[int, str] | None:
     """The exit status and the text for an expected error; None for any other.
 
     Modules of exceptions are imported only where they were raised: a router needs no SciPy.

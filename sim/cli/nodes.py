@@ -139,7 +139,7 @@ def robot(
         ),
     ] = None,
     peers: Peers = False,
-    kept: Annotated[
+    store: Annotated[
         Path | None,
         typer.Option(
             "--set", help="With --peers: the file that keeps the team's set.", metavar="FILE"
@@ -187,7 +187,7 @@ def robot(
         bus.tap = tap
         _connected(resolved, connect)
         if resolved.peers:
-            _peer_shell(bus, resolved, config, stop, kept, fold, keys).run()
+            _peer_shell(bus, resolved, config, stop, store, fold, keys).run()
         else:
             RobotShell(bus, config, stop, exchange=resolved.exchange).run()
 
@@ -197,7 +197,7 @@ def _peer_shell(
     scenario: Scenario,
     config: "RobotConfig",
     stop: "threading.Event",
-    kept: Path | None,
+    store: Path | None,
     fold: str,
     keys: Path | None,
 ) -> "PeerShell":
@@ -217,7 +217,7 @@ def _peer_shell(
             stop,
             central=scenario.central,
             robots=[each.id for each in scenario.robots],
-            store=kept,
+            store=store,
             exchange=scenario.exchange,
             when=cast(FoldWhen, fold),
             signer=signer,
@@ -244,7 +244,7 @@ def central(
     estimator: EstimatorOption = None,
     fusion: FusionOption = None,
     peers: Peers = False,
-    kept: Annotated[
+    store: Annotated[
         Path | None,
         typer.Option(
             "--set",
@@ -272,7 +272,7 @@ def central(
     with process("central") as stop, connected(resolved.team, connect, keys, "central") as bus:
         _connected(resolved, connect)
         try:
-            _central_shell(bus, resolved, stop, kept, patience, keys).run()
+            _central_shell(bus, resolved, stop, store, patience, keys).run()
         except StoreError as error:
             fail(str(error), WRONG_USE)
 
@@ -281,7 +281,7 @@ def _central_shell(
     bus: "Bus",
     scenario: Scenario,
     stop: "threading.Event",
-    kept: Path | None,
+    store: Path | None,
     patience: float | None,
     keys: Path | None,
 ) -> "CentralShell | CentreShell":
@@ -297,10 +297,10 @@ def _central_shell(
             stop,
             patience,
             admit=scenario.admits,
-            store=kept,
+            store=store,
         )
     signer = _signer(keys, "central", scenario.team)
-    return CentreShell(bus, scenario.central, names, stop, store=kept, signer=signer)
+    return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer)
 
 
 def _signer(keys: Path | None, node: str, team: str) -> "Signer | None":
@@ -348,11 +348,11 @@ def record(
     expected = [robot_node(r.id) for r in resolved.robots]
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
-    told = []
+    configurations = []
     if resolved.is_live:  # what a recorder of other teams does not need: it takes 105 MB
         from team.wire.digest import configured
 
-        told = [configured("world", 0, 0, resolved)]
+        configurations = [configured("world", 0, 0, resolved)]
     with (
         process("recorder", endless=True) as stop,
         connected(resolved.team, connect, keys, "recorder") as bus,
@@ -369,7 +369,7 @@ def record(
                 inventory,
                 lambda: next_part(output, resolved.team, metadata),
                 stop=stop,
-                scenario=told,
+                scenario=configurations,
             )
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:
@@ -499,9 +499,9 @@ def verdict(
         fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
     with connected(team, connect, keys, "operator") as bus:
         try:
-            said = Judgement(first=one, second=two, same=word == "same")
+            judgement = Judgement(first=one, second=two, same=word == "same")
             signer = _signer(keys, "operator", team)
-            fused = judge(bus, said, reason, patience, signer, withdrawn=withdraw)
+            fused = judge(bus, judgement, reason, patience, signer, withdrawn=withdraw)
         except WithdrawError as error:
             fail(str(error), FAILED)
     landmarks = len(ids(fused.ids, "ids"))
@@ -542,5 +542,5 @@ def end(
                 give_up(bus, without, reason, patience, _signer(keys, "operator", team))
         except WithdrawError as error:
             fail(str(error), FAILED)
-    said = f"nobody waits for {without} any more" if without else "the team ends"
-    typer.echo(said)
+    effect = f"nobody waits for {without} any more" if without else "the team ends"
+    typer.echo(effect)

@@ -41,11 +41,11 @@ def status(
         table.add_row(*(_cell(row[name]) for name in row if name != "warnings"))
     console = Console()
     console.print(table)
-    said = presence.advice()
-    for line in said:
+    advice = presence.advice()
+    for line in advice:
         console.print(f"- {line}", markup=False, highlight=False, soft_wrap=True)
     if json_file is not None:
-        json_file.write_text(json.dumps({"nodes": rows, "advice": said}, indent=2) + "\n")
+        json_file.write_text(json.dumps({"nodes": rows, "advice": advice}, indent=2) + "\n")
 
 
 def _rows(presence: Any) -> list[dict[str, Any]]:

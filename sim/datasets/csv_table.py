@@ -56,9 +56,9 @@ class CsvTable:
 
     def rows(self, chosen: Iterable[bool]) -> "CsvTable":
         """The chosen rows."""
-        kept = [i for i, each in enumerate(chosen) if each]
-        columns = {name: [cells[i] for i in kept] for name, cells in self.columns.items()}
-        return CsvTable(self.name, columns, [self.lines[i] for i in kept])
+        rows = [i for i, each in enumerate(chosen) if each]
+        columns = {name: [cells[i] for i in rows] for name, cells in self.columns.items()}
+        return CsvTable(self.name, columns, [self.lines[i] for i in rows])
 
     def filled(self, needed: Sequence[str]) -> "CsvTable":
         """Without columns that have nothing in any row; those that are needed stay.
@@ -68,8 +68,8 @@ class CsvTable:
         empty = {name for name, cells in self.columns.items() if not any(cells)}
         if not set(self.columns) - empty - {*needed[:1]}:
             return self
-        kept = {n: cells for n, cells in self.columns.items() if n in needed or n not in empty}
-        return CsvTable(self.name, kept, self.lines)
+        columns = {n: cells for n, cells in self.columns.items() if n in needed or n not in empty}
+        return CsvTable(self.name, columns, self.lines)
 
     def error(self, row: int, column: str, problem: str) -> DatasetError:
         """What is wrong in one cell."""

@@ -56,8 +56,8 @@ def together(named: Detections, unnamed: Detections | None) -> Detections:
     """Both kinds of scans by time."""
     if unnamed is None:
         return named
-    told = replace(named, hidden=np.zeros(len(named.stamps_ns), np.bool_))
-    return in_order([told, unnamed]) if len(named.stamps_ns) else unnamed
+    labelled = replace(named, hidden=np.zeros(len(named.stamps_ns), np.bool_))
+    return in_order([labelled, unnamed]) if len(named.stamps_ns) else unnamed
 
 
 def rows_of(

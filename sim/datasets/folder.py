@@ -82,7 +82,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
             )
         read = [_robot_rows(name, folders[name], clocks) for name in clocks]
         surveyed = _table(root, "landmarks", "")
-        said = left_out(root, folders, TABLES)
+        unused = left_out(root, folders, TABLES)
     if world.duration_s is not None:
         end_ns = min(each.start_ns for each in read) + round(world.duration_s * 1e9)
         read = [each.until(end_ns) for each in read]
@@ -97,7 +97,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
             f"{', '.join(steered)}: wheel speed and steering can not be used: give "
             'kind = "ackermann" and wheel_base in [defaults.motion] of scenario.toml'
         )
-    notes += [*said, *_apart(read)]
+    notes += [*unused, *_apart(read)]
     return WorldStreams(
         streams=tuple(_stream(each, world, clocks) for each in read),
         landmark_ids=ids,
@@ -121,8 +121,8 @@ class RobotRows:
     start: StartPose | None
     intervals: Intervals
     seen: rows.Scans
-    looked: Int64[np.ndarray, " E"]
-    met: rows.Scans
+    empty_ns: Int64[np.ndarray, " E"]
+    teammates: rows.Scans
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]
@@ -135,8 +135,8 @@ class RobotRows:
         first = (
             intervals.end_ns[:1] - intervals.duration_ns[:1],
             self.seen.stamps_ns[:1],
-            self.looked[:1],
-            self.met.stamps_ns[:1],
+            self.empty_ns[:1],
+            self.teammates.stamps_ns[:1],
             np.empty(0, np.int64) if self.unnamed is None else self.unnamed.stamps_ns[:1],
         )
         return int(np.concatenate(first).min())
@@ -150,8 +150,8 @@ class RobotRows:
             self,
             intervals=intervals,
             seen=self.seen.where(self.seen.stamps_ns <= last_ns),
-            looked=self.looked[self.looked <= last_ns],
-            met=self.met.where(self.met.stamps_ns <= last_ns),
+            empty_ns=self.empty_ns[self.empty_ns <= last_ns],
+            teammates=self.teammates.where(self.teammates.stamps_ns <= last_ns),
             unnamed=_within(self.unnamed, (0, last_ns)),
             truth_ns=self.truth_ns[:samples],
             truth=self.truth[:samples],
@@ -175,25 +175,25 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
             )
     else:
         notes.append("no odometry: only what it saw is given")
-    seen, looked, said = rows.measurements_of(observed, "measurement", None, driven)
-    notes += said
+    seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
+    notes += more
     unnamed = _within(detections_of(place, robot), driven)
     if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")
-    met, _, said = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
-    notes += said
-    saw = len(seen.stamps_ns) or len(met.stamps_ns) or unnamed is not None
+    teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
+    notes += more
+    saw = len(seen.stamps_ns) or len(teammates.stamps_ns) or unnamed is not None
     if driven is None and not saw:
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
-    truth_ns, poses, said = rows.truth_of(truth, driven)
-    notes += said if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
+    truth_ns, poses, more = rows.truth_of(truth, driven)
+    notes += more if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
     return RobotRows(
         robot=robot,
         start=None if start is None else rows.start_of(start),
         intervals=intervals,
         seen=seen,
-        looked=looked,
-        met=met,
+        empty_ns=empty_ns,
+        teammates=teammates,
         truth_ns=truth_ns,
         truth=poses,
         notes=tuple(notes),
@@ -239,8 +239,8 @@ def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> R
         start_ns=read.start_ns,
         start=None if starts_unknown(world, read.robot) else read.start,
         intervals=read.intervals,
-        observations=together(_with_empty(read.seen.grouped(), read.looked), read.unnamed),
-        sightings=read.met.grouped(),
+        observations=together(_with_empty(read.seen.grouped(), read.empty_ns), read.unnamed),
+        sightings=read.teammates.grouped(),
         teammates=tuple(clocks),
         truth_ns=read.truth_ns if known else None,
         truth=read.truth if known else None,
@@ -249,11 +249,11 @@ def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> R
     )
 
 
-def _with_empty(seen: Detections, looked: Int64[np.ndarray, " E"]) -> Detections:
+def _with_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:
     """The messages with further ones that are empty."""
-    looked = np.setdiff1d(looked, seen.stamps_ns)
-    stamps = np.concatenate([seen.stamps_ns, looked])
-    counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(looked), np.int64)])
+    empty_ns = np.setdiff1d(empty_ns, seen.stamps_ns)
+    stamps = np.concatenate([seen.stamps_ns, empty_ns])
+    counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(empty_ns), np.int64)])
     order = np.argsort(stamps, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(counts[order])]).astype(np.int64)
     return replace(seen, stamps_ns=stamps[order], offsets=offsets)

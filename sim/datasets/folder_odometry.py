@@ -92,10 +92,10 @@ def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
     """Raises DatasetError for what is no duration; a note where it is not the time between rows."""
     if not rows.table.has("duration_s"):
         return
-    told = rows.table.stamps("duration_s")
-    for row in np.flatnonzero(told <= 0)[:1].tolist():
+    stated = rows.table.stamps("duration_s")
+    for row in np.flatnonzero(stated <= 0)[:1].tolist():
         raise rows.table.error(row, "duration_s", "not above 0")
-    off = np.abs(told - duration) > np.maximum(OFF_NS, duration // 100)
+    off = np.abs(stated - duration) > np.maximum(OFF_NS, duration // 100)
     rows.note(
         off, "whose duration_s is not the time since the row before: it is taken to last as long"
     )
@@ -118,10 +118,10 @@ def _judge_speeds(
     bounds = Bounds()
     fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)
     first = 1 if form == POSES else 0
-    told = np.zeros(len(rows.table), np.bool_)
-    told[first : first + len(fast)] = fast
+    too_fast = np.zeros(len(rows.table), np.bool_)
+    too_fast[first : first + len(fast)] = fast
     rows.note(
-        told,
+        too_fast,
         f"beyond {bounds.speed_m_s:g} m/s or {bounds.yaw_rate_rad_s:g} rad/s, which a robot "
         "refuses: metres, radians and seconds are meant",
     )

@@ -138,7 +138,7 @@ def measurements_of(
     rows = Rows(table, thing)
     if driven is not None:
         _check_clock(rows, driven)
-    looked = rows.take_out(
+    empty_ns = rows.take_out(
         ~np.array([any(cells[1:]) for cells in _cells(rows.table)], dtype=np.bool_)
     )
     column = "landmark" if team is None else "teammate"
@@ -152,9 +152,9 @@ def measurements_of(
         ids = rows.table.names(column)
     found = _scans(rows, ids, claims=team is None)
 
-    def keep(kept: Bool[np.ndarray, " rows"], otherwise: str) -> Scans:
-        rows.drop(~kept, otherwise)
-        return found.where(kept)
+    def keep(chosen: Bool[np.ndarray, " rows"], otherwise: str) -> Scans:
+        rows.drop(~chosen, otherwise)
+        return found.where(chosen)
 
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
@@ -166,8 +166,8 @@ def measurements_of(
         begin_ns, end_ns = driven
         found = keep(found.stamps_ns <= end_ns, LATE)
         found = keep(found.stamps_ns >= begin_ns - EARLY_NS, EARLY)
-        looked = looked[(looked <= end_ns) & (looked >= begin_ns - EARLY_NS)]
-    return found, looked, rows.notes
+        empty_ns = empty_ns[(empty_ns <= end_ns) & (empty_ns >= begin_ns - EARLY_NS)]
+    return found, empty_ns, rows.notes
 
 
 def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:

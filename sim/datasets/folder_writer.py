@@ -40,16 +40,18 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
     place.mkdir(exist_ok=True)
     if len(stream.intervals.end_ns):
         write_table(place / "odometry.csv", *_odometry(stream))
-    (seen, unnamed), met = split(stream.landmark_detections), stream.teammate_detections
+    (seen, unnamed), teammates = split(stream.landmark_detections), stream.teammate_detections
     if unnamed is None or len(seen.stamps_ns):
         write_table(place / "observations.csv", *_measured(seen, "landmark", seen.ids.tolist()))
     if unnamed is not None:
-        columns, told, labels = rows_of(unnamed)
-        write_table(place / "detections.csv", columns, ((seconds(t), *row) for t, row in told))
+        columns, table_rows, labels = rows_of(unnamed)
+        write_table(
+            place / "detections.csv", columns, ((seconds(t), *row) for t, row in table_rows)
+        )
         write_table(place / "labels.csv", ("landmark",), ((label,) for label in labels))
-    if len(met.ids):
-        names = [stream.teammates[i] for i in met.ids]
-        write_table(place / "sightings.csv", *_measured(met, "teammate", names))
+    if len(teammates.ids):
+        names = [stream.teammates[i] for i in teammates.ids]
+        write_table(place / "sightings.csv", *_measured(teammates, "teammate", names))
     if stream.start is not None:
         covariance = stream.start.covariance
         columns, row = [*POSES], stream.start.pose.tolist()
@@ -77,8 +79,8 @@ def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
             packed = intervals.covariances[:, [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
             numbers = np.hstack((numbers, packed))
         times = zip(ends_ns.tolist(), intervals.duration_ns.tolist(), strict=True)
-        told = zip(times, numbers.tolist(), strict=True)
-        return columns, [(seconds(end), seconds(length), *row) for (end, length), row in told]
+        measured = zip(times, numbers.tolist(), strict=True)
+        return columns, [(seconds(end), seconds(length), *row) for (end, length), row in measured]
     begins = (ends_ns - intervals.duration_ns).tolist()
     pairs = zip(begins, intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
     rows: list[Row] = [(seconds(begin_ns), v, w) for begin_ns, v, w in pairs]

@@ -218,19 +218,19 @@ def _labels(root: Path, rows: int) -> UInt32[np.ndarray, " R"]:
 def _named(seen: Detections) -> Detections:
     """The labels as identities, for a run to compare with; what has none is left out."""
     message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
-    kept = seen.ids != NO_LABEL
+    chosen = seen.ids != NO_LABEL
     _, first = np.unique(np.column_stack((message, seen.ids)), axis=0, return_index=True)
-    once = np.zeros(len(kept), np.bool_)
+    once = np.zeros(len(chosen), np.bool_)
     once[first] = True
-    kept &= once
-    counts = np.bincount(message[kept], minlength=len(seen.stamps_ns))
+    chosen &= once
+    counts = np.bincount(message[chosen], minlength=len(seen.stamps_ns))
     return replace(
         seen,
         offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        ids=seen.ids[kept],
-        ranges=seen.ranges[kept],
-        bearings=seen.bearings[kept],
-        covariances=None if seen.covariances is None else seen.covariances[kept],
+        ids=seen.ids[chosen],
+        ranges=seen.ranges[chosen],
+        bearings=seen.bearings[chosen],
+        covariances=None if seen.covariances is None else seen.covariances[chosen],
         hidden=None,
         signatures=None,
     )

@@ -106,15 +106,15 @@ def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: 
     stranger = (subjects <= last_robot) & ~np.isin(subjects, numbers)
     log = log.without(stranger, "of a robot that is not in the team")
     seen = log.measurements.where(log.measurements.subjects > last_robot)
-    met = log.measurements.where(log.measurements.subjects <= last_robot)
-    index = (met.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
+    teammates = log.measurements.where(log.measurements.subjects <= last_robot)
+    index = (teammates.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
     return robot_stream(
         robot=log.robot,
         start_ns=log.start_ns,
         start=_start(world, log),
         intervals=log.intervals,
         observations=grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
-        sightings=grouped(met.stamps_ns, index, met.ranges, met.bearings),
+        sightings=grouped(teammates.stamps_ns, index, teammates.ranges, teammates.bearings),
         teammates=robots,
         truth_ns=log.truth_ns if len(log.truth) else None,
         truth=log.truth if len(log.truth) else None,

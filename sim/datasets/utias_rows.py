@@ -85,8 +85,8 @@ def measurements_of(
     measurements = Measurements(
         nanoseconds(rows[:, 0]), subjects[at], rows[:, 2].copy(), on_circle(rows[:, 3])
     )
-    kept = known & positive
-    single = first_of_each(measurements.stamps_ns, measurements.subjects, kept)
+    usable = known & positive
+    single = first_of_each(measurements.stamps_ns, measurements.subjects, usable)
     notes = (
         counted(backward, "measurement", "earlier than the row before: sorted by time"),
         counted(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
@@ -94,7 +94,7 @@ def measurements_of(
             int(np.count_nonzero(known & ~positive)), "measurement", "dropped: range not above 0"
         ),
         counted(
-            int(np.count_nonzero(kept & ~single)),
+            int(np.count_nonzero(usable & ~single)),
             "measurement",
             "dropped: a second one of the same subject at the same time",
         ),
@@ -148,13 +148,13 @@ def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], 
 def first_of_each(
     stamps_ns: Int64[np.ndarray, " R"],
     subjects: UInt32[np.ndarray, " R"],
-    kept: Bool[np.ndarray, " R"],
+    usable: Bool[np.ndarray, " R"],
 ) -> Bool[np.ndarray, " R"]:
     """Of the kept measurements, the first of each (stamp, subject)."""
-    rows = np.flatnonzero(kept)
+    rows = np.flatnonzero(usable)
     order = rows[np.lexsort((subjects[rows], stamps_ns[rows]))]
     again = (np.diff(stamps_ns[order]) == 0) & (np.diff(subjects[order].astype(np.int64)) == 0)
-    single = kept.copy()
+    single = usable.copy()
     single[order[1:][again]] = False
     return single
 

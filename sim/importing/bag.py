@@ -1,4 +1,4 @@
-"""ROS 2 bags → tables: which topics are what, and what of them is used."""
+"""ROS 2 bags → tables: finds the topics, and converts their messages."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -17,28 +17,34 @@ POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceS
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 STATIC = "tf_static"
 TRUTH_WORDS = ("truth", "gt", "mocap", "vicon", "vrpn", "optitrack")
-LOOKED_AT = 2000
-"""Messages of /tf that are looked at for tags."""
+SAMPLED_MESSAGES = 2000
+"""Number of messages of /tf that are searched for tags."""
 
 
 class UndecidedError(DatasetError):
-    """A bag whose topics do not say by themselves what they are; the text says what to type."""
+    """The names and types of a bag's topics do not decide which are used; the text says what to
+    type.
+    """
 
 
 @dataclass
 class Imported:
-    """A bag's robots; said: in words, what was taken and what was left out, and why."""
+    """The tables of a bag's robots.
+
+    notes: what was used, what was left out and why, in words. messages: number of messages that
+    were read.
+    """
 
     robots: list[RobotTables]
-    said: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     messages: int = 0
 
 
 def imported_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
     """The tables of a bag; raises BagError, UndecidedError.
 
-    topics: which are what; None: as they propose themselves, if there is one way only. robot: the
-    name of its only robot.
+    topics: each robot's topics; None: as their names and types propose them, if there is one way
+    only. robot: the name of the bag's only robot.
     """
     with opened_bag(path) as bag:
         chosen = topics or decided(bag, path, robot)
@@ -83,19 +89,19 @@ def _translated(bag: Bag, topics: Topics) -> Imported:
         for name in robots_by_topic[raw.topic]:
             for measured in translators[name].take(raw.topic, record):
                 tables[name].take(measured)
-    said = [
+    notes = [
         f"{topic}: {count} of {seen[topic]} messages dropped: damaged (first: {first[topic]})"
         for topic, count in sorted(damaged.items())
     ]
-    said += [
+    notes += [
         f"{topic}: {count} messages without a stamp: their time of arrival is taken"
         for topic, count in sorted(unstamped.items())
     ]
     for name, translator in translators.items():
-        said += [f"{name}: {note}" for note in translator.said]
-        said += [f"{name}: {count} dropped: {why}" for why, count in translator.dropped.items()]
-        said += _mounted(translator, tables[name])
-    return Imported(list(tables.values()), said, sum(seen.values()))
+        notes += [f"{name}: {note}" for note in translator.said]
+        notes += [f"{name}: {count} dropped: {why}" for why, count in translator.dropped.items()]
+        notes += _mounted(translator, tables[name])
+    return Imported(list(tables.values()), notes, sum(seen.values()))
 
 
 def _stamped(record: Record, arrival_ns: int) -> Record:
@@ -103,7 +109,9 @@ def _stamped(record: Record, arrival_ns: int) -> Record:
 
 
 def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
-    """The one place of the robot's sensor; that of most frames, if there are several."""
+    """Takes the mount of the robot's sensor into the tables; of several, that of most frames.
+    Returns notes.
+    """
     poses = list(dict.fromkeys(mount.pose for mount in translator.mounts.values()))
     if not poses:
         return []
@@ -128,14 +136,16 @@ def _static_frames(bag: Bag) -> Frames:
 
 
 def proposed_topics(path: Path) -> str:
-    """A bag's topics, and a file that says which are what; raises BagError."""
+    """A bag's topics, and a proposal for the file that assigns them; raises BagError."""
     with opened_bag(path) as bag:
         robots, warnings = _proposed(bag, None)
         return _question(path, bag, robots, warnings)
 
 
 def decided(bag: Bag, path: Path, robot: str | None) -> Topics:
-    """The topics of each robot, if they say so themselves; raises UndecidedError."""
+    """The topics of each robot by their names and types; raises UndecidedError where they do not
+    decide.
+    """
     robots, warnings = _proposed(bag, robot)
     if warnings:
         raise UndecidedError(_question(path, bag, robots, warnings))
@@ -153,7 +163,7 @@ def _question(path: Path, bag: Bag, robots: dict[str, RobotTopics], warnings: li
 
 
 def _proposed(bag: Bag, robot: str | None) -> tuple[dict[str, RobotTopics], list[str]]:
-    """The topics of each robot as their names and types have it, and what is not clear."""
+    """The topics of each robot as their names and types propose them, and what is ambiguous."""
     found = bag.topics
     tagged = _tags_in(bag)
     robots: dict[str, RobotTopics] = {}
@@ -182,7 +192,7 @@ def _proposed(bag: Bag, robot: str | None) -> tuple[dict[str, RobotTopics], list
 def _candidates(
     topics: list[Topic], tagged: set[str], space: str, *, alone: bool
 ) -> tuple[list[str], list[str], list[str]]:
-    """Odometry, detections and truth of one namespace."""
+    """The candidates for odometry, detections and truth in one namespace."""
     here = [topic for topic in topics if alone or _namespace(topic.name) == space]
     true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
     odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
@@ -210,13 +220,13 @@ def _robot_name(space: str, robot: str | None) -> str:
 
 
 def _tags_in(bag: Bag) -> set[str]:
-    """The topics of transforms in which there are tags."""
+    """The topics of transforms that contain tags."""
     found = set()
     for topic in bag.topics:
         if topic.kind != TRANSFORMS or topic.name.rpartition("/")[2] == STATIC:
             continue
         for number, raw in enumerate(bag.messages([topic.name])):
-            if number == LOOKED_AT:
+            if number == SAMPLED_MESSAGES:
                 break
             try:
                 record = decode(raw.kind, raw.data, bag.store)
@@ -230,7 +240,7 @@ def _tags_in(bag: Bag) -> set[str]:
 
 
 def listing(topics: list[Topic]) -> str:
-    """A bag's topics, one a line; what can not be used says so."""
+    """A bag's topics, one a line, with a remark where a topic can not be used."""
     lines = []
     for topic in topics:
         used = "" if topic.kind in READERS else "   (not read here)"
@@ -239,7 +249,7 @@ def listing(topics: list[Topic]) -> str:
 
 
 def as_toml(robots: dict[str, RobotTopics]) -> str:
-    """A file of topics."""
+    """The file that assigns topics to robots, in TOML."""
     lines = []
     for name, topics in robots.items():
         detections = ", ".join(f'"{topic}"' for topic in topics.detections)

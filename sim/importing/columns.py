@@ -1,4 +1,4 @@
-"""Maps of columns: which of a user's columns are ours, and proposals for it."""
+"""Maps of columns: which of a user's columns become which of ours, and proposals for such a map."""
 
 import re
 import tomllib
@@ -14,7 +14,9 @@ from sim.datasets.tables import DatasetError
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One column: scale · (the number in it) + offset. Without both its text is taken as it is."""
+    """One of the user's columns: scale · number + offset. Without both its text is taken as
+    it is.
+    """
 
     column: str
     scale: float = 1.0
@@ -22,9 +24,9 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One table: the files that lie side by side in it (the names' ends), and its columns.
+    """One table: the ends of the names of the files that lie side by side in it, and its columns.
 
-    drop: rows with one of these texts in a (user's) column are no measurements.
+    drop: by the user's column, the texts of rows that are no measurements.
     """
 
     files: tuple[str, ...]
@@ -56,7 +58,7 @@ UNITS = {
     "m": "1", "mm": "1e-3", "cm": "1e-2", "rad": "1", "deg": "0.017453292519943295",
     "m_s": "1", "rad_s": "1", "deg_s": "0.017453292519943295", "mps": "1", "rps": "1",
 }  # fmt: skip
-"""A unit at a name's end, and what one of it is in ours."""
+"""The factor to our unit, by the unit at the end of a column's name."""
 KINDS = ("odometry", "observations", "sightings", "truth", "landmarks", "start")
 FILE_NAMES: Mapping[str, Sequence[str]] = {
     "odometry": ("odom", "wheel", "encoder"),
@@ -73,7 +75,7 @@ PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "t
 
 
 def load_map(path: Path) -> Map:
-    """A map in TOML; raises DatasetError."""
+    """Read a map in TOML; raises DatasetError."""
     try:
         found = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Map)
     except (OSError, UnicodeDecodeError) as error:
@@ -93,27 +95,29 @@ def load_map(path: Path) -> Map:
 
 
 def mapped(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
-    """Our columns as text; raises DatasetError."""
+    """The columns under our names, as text; raises DatasetError."""
     found = {}
     for ours, theirs in columns.items():
-        told = Column(theirs) if isinstance(theirs, str) else theirs
-        if told.column not in table.columns:
-            raise table.fault(f"no column {told.column!r}, which the map has for {ours}")
-        cells = table.columns[told.column]
-        if told.scale == 1.0 and told.offset == 0.0:
+        column = Column(theirs) if isinstance(theirs, str) else theirs
+        if column.column not in table.columns:
+            raise table.fault(f"no column {column.column!r}, which the map has for {ours}")
+        cells = table.columns[column.column]
+        if column.scale == 1.0 and column.offset == 0.0:
             found[ours] = cells
         elif ours == "t_s":
-            scale, offset = Decimal(repr(told.scale)), Decimal(repr(told.offset))
-            table.stamps(told.column, scale)
+            scale, offset = Decimal(repr(column.scale)), Decimal(repr(column.offset))
+            table.stamps(column.column, scale)
             found[ours] = [f"{Decimal(cell) * scale + offset:f}" for cell in cells]
         else:
-            numbers = table.numbers(told.column)[:, 0] * told.scale + told.offset
+            numbers = table.numbers(column.column)[:, 0] * column.scale + column.offset
             found[ours] = [repr(number) for number in numbers.tolist()]
     return found
 
 
 def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
-    """A map in TOML for these files as far as their columns' names tell; and what it lacks."""
+    """A map in TOML for these files as far as the columns' names determine it, and what it
+    lacks.
+    """
     lines: list[str] = []
     lacking: list[str] = []
     kinds: set[str] = set()
@@ -133,7 +137,7 @@ def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
 
 
 def _kind(name: str, header: Sequence[str]) -> tuple[str | None, dict[str, str]]:
-    """The table that most columns are of; a file's name decides between equals."""
+    """The table that has most of these columns; of equals the one that the file is named after."""
     best: tuple[int, int, str, dict[str, str]] | None = None
     for kind in KINDS:
         columns = {}
@@ -156,7 +160,7 @@ def _kind(name: str, header: Sequence[str]) -> tuple[str | None, dict[str, str]]
 
 
 def _near(ours: str, header: Sequence[str]) -> str | None:
-    """The text for our column: one of these, if its name is near."""
+    """The column whose name is close to ours, if there is one."""
     for theirs in header:
         bare, scale = _without_unit(theirs)
         names = {*SYNONYMS.get(ours, ()), _without_unit(ours)[0]}
@@ -168,7 +172,7 @@ def _near(ours: str, header: Sequence[str]) -> str | None:
 
 
 def _without_unit(name: str) -> tuple[str, str]:
-    """A column's name in small letters without its unit, and what the unit is in ours."""
+    """A column's name in small letters without its unit, and the factor of the unit."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     for unit in sorted(UNITS, key=len, reverse=True):
         if plain.endswith(f"_{unit}"):

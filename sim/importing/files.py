@@ -12,7 +12,7 @@ from sim.importing.columns import Map, Table, mapped, proposed
 from sim.importing.tables import RobotTables
 
 QUATERNION = 8
-"""Columns of a trajectory in TUM's format: t x y z qx qy qz qw."""
+"""Number of columns of a trajectory in TUM's format: t x y z qx qy qz qw."""
 
 
 def imported_files(
@@ -22,31 +22,31 @@ def imported_files(
     everyones: Collection[str] = (),
     command: str = "",
 ) -> tuple[RobotTables, list[str]]:
-    """One robot's tables from CSV files; what was taken and left out, in words.
+    """One robot's tables from CSV files, and notes on what was used and left out.
 
-    everyones: the names of all robots' files; a table that only others have is left out. command:
-    what to type with a map. Raises DatasetError; without a map it proposes one, unless every name
-    is ours.
+    everyones: the names of all robots' files; a table whose files only other robots have is left
+    out. command: the command line to repeat with a map. Raises DatasetError; without a map its text
+    proposes one, unless every column has our name.
     """
     files = {path.name: read_table(path, str(path)) for path in paths}
     if len(files) < len(paths):
         raise DatasetError("two files have the same name: import them for one robot each")
     chosen = _by_names(files, command) if columns is None else columns
     tables = RobotTables(robot)
-    said: list[str] = []
+    notes: list[str] = []
     used: set[str] = set()
     for kind, table in chosen.items():
         lacking = [each for each in table.files if not any(n.endswith(each) for n in files)]
         if lacking and all(any(n.endswith(each) for n in everyones) for each in lacking):
-            said.append(f"no {', '.join(lacking)}: no {kind}")
+            notes.append(f"no {', '.join(lacking)}: no {kind}")
             continue
-        said += _take(kind, table, files, tables, used)
-    said += [f"{name}: not used: the map does not name it" for name in files if name not in used]
-    return tables, said
+        notes += _take(kind, table, files, tables, used)
+    notes += [f"{name}: not used: the map does not name it" for name in files if name not in used]
+    return tables, notes
 
 
 def _by_names(files: dict[str, CsvTable], command: str) -> Map:
-    """The map of files whose columns are ours; raises DatasetError with a proposal."""
+    """The map of files whose columns have our names; raises DatasetError with a proposal."""
     found: Map = {}
     for name, table in files.items():
         kind = Path(name).stem
@@ -77,23 +77,23 @@ def _take(
         used.add(named[0])
         side_by_side.append(files[named[0]])
     whole = _joined(side_by_side)
-    said: list[str] = []
+    notes: list[str] = []
     for column, texts in table.drop.items():
         if column not in whole.columns:
             raise whole.fault(f"no column {column!r}, which `drop` names")
-        kept = [cell not in texts for cell in whole.columns[column]]
-        first = kept.index(False) if False in kept else None
+        chosen = [cell not in texts for cell in whole.columns[column]]
+        first = chosen.index(False) if False in chosen else None
         if first is not None:
-            count = kept.count(False)
-            said.append(
+            count = chosen.count(False)
+            notes.append(
                 f"{count} rows dropped: {column} is {' or '.join(texts)} "
                 f"({whole.name}, first at line {whole.lines[first]})"
             )
-            whole = whole.rows(kept)
+            whole = whole.rows(chosen)
     found = mapped(whole, table.columns)
     tables.columns[kind] = list(found)
     tables.rows[kind] = [*zip(*found.values(), strict=True)]
-    return said
+    return notes
 
 
 def _joined(tables: Sequence[CsvTable]) -> CsvTable:
@@ -108,7 +108,9 @@ def _joined(tables: Sequence[CsvTable]) -> CsvTable:
 
 
 def trajectory(path: Path) -> list[tuple[str, object, object, object]]:
-    """(t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or of TUM's format; DatasetError."""
+    """The rows (t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or of TUM's format; raises
+    DatasetError.
+    """
     lines = path.read_text("utf-8", errors="replace").splitlines()
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
     if not rows:

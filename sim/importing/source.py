@@ -1,4 +1,4 @@
-"""Whatever a user has → a data set's folder."""
+"""Imports a user's files, bag, log or data set into a data set's folder."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -34,8 +34,10 @@ MEASURED = ("odometry", "observations", "sightings")
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for. starts: by robot (a pose, then two standard deviations or none);
-    "" is the only robot. truth: a trajectory of the only robot.
+    """What the user has asked for.
+
+    sources: files or folders. starts: initial poses by robot (a pose, then two standard deviations
+    or none); "" is the only robot. truth: a trajectory of the only robot.
     """
 
     sources: Sequence[Path]
@@ -48,15 +50,19 @@ class Request:
 
 @dataclass
 class Report:
-    """What became of it, in words; messages: read from bags."""
+    """The result of an import.
+
+    robots: their names. notes: what was used and left out, in words. messages: number of messages
+    that were read from bags.
+    """
 
     robots: list[str]
-    said: list[str]
+    notes: list[str]
     messages: int = 0
 
 
 def imported(request: Request, folder: Path) -> Report:
-    """Write the data set; raises DatasetError, LogError, ScenarioError."""
+    """Write the data set into `folder`; raises DatasetError, LogError, ScenarioError."""
     source = request.sources[0]
     for path in request.sources:
         if not path.exists():
@@ -70,11 +76,11 @@ def imported(request: Request, folder: Path) -> Report:
         return _csv(_files_by_robot(request), request, folder)
     if len(request.sources) > 1:
         raise DatasetError(f"{request.sources[1]}: one data set or log at a time")
-    return _kept(request, folder)
+    return _own_form(request, folder)
 
 
-def _kept(request: Request, folder: Path) -> Report:
-    """What is a data set or a log already, with the initial poses that are given."""
+def _own_form(request: Request, folder: Path) -> Report:
+    """Copy a data set or a log of ours, with the initial poses that are given."""
     source = request.sources[0]
     given = {"--robot": request.robot, "--columns": request.columns, "--truth": request.truth}
     for option in (name for name, value in given.items() if value is not None):
@@ -82,7 +88,7 @@ def _kept(request: Request, folder: Path) -> Report:
             f"{option}: {source} has its robots' names and tables already; it goes with CSV files "
             "of other columns and with bags"
         )
-    streams, scenario, said = _log(source) if is_own_log(source) else _data_set(source)
+    streams, scenario, notes = _log(source) if is_own_log(source) else _data_set(source)
     robots = {stream.robot: stream for stream in streams.streams}
     for name, (x, y, theta, *sigmas) in request.starts.items():
         robot = _started(name, robots)
@@ -92,12 +98,12 @@ def _kept(request: Request, folder: Path) -> Report:
         robots[robot] = replace(robots[robot], start=start)
     write_folder(replace(streams, streams=tuple(robots.values())), folder)
     (folder / SCENARIO).write_text(folder_scenario(scenario), "utf-8")
-    said += [*streams.notes, *(f"{s.robot}: {note}" for s in streams.streams for note in s.notes)]
-    return Report(list(robots), said)
+    notes += [*streams.notes, *(f"{s.robot}: {note}" for s in streams.streams for note in s.notes)]
+    return Report(list(robots), notes)
 
 
 def _started(name: str, robots: Collection[str]) -> str:
-    """Whose initial pose `--start` gives; raises DatasetError."""
+    """The robot whose initial pose `--start` gives; raises DatasetError."""
     robot = name or (next(iter(robots)) if len(robots) == 1 else "")
     if robot not in robots:
         raise DatasetError(
@@ -107,7 +113,9 @@ def _started(name: str, robots: Collection[str]) -> str:
 
 
 def _is_foreign(source: Path) -> bool:
-    """A folder of CSV files with names of their own, in it or in one folder for each robot."""
+    """Whether a folder has CSV files with names of their own, in it or in one folder for each
+    robot.
+    """
     try:
         kind_of(source)
     except DatasetError:
@@ -116,9 +124,10 @@ def _is_foreign(source: Path) -> bool:
 
 
 def _files_by_robot(request: Request) -> dict[str, list[Path]]:
-    """The CSV files of each robot: of a folder, of each of its folders, or of each one given.
+    """The CSV files of each robot: of a folder, of each of its folders, or of each folder that is
+    given.
 
-    Files that lie beside the robots' folders (the true landmarks') are everyone's.
+    Files beside the robots' folders (the true landmarks) belong to every robot.
     """
     found: dict[str, list[Path]] = {}
     for source in request.sources:
@@ -147,16 +156,18 @@ def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
     everyones = {path.name for paths in files.values() for path in paths}
     command = f"teamslam import {' '.join(map(str, request.sources))} -o {folder}"
     command += f" --robot {request.robot}" if request.robot else ""
-    tables, said = [], []
+    tables, notes = [], list[str]()
     for robot, paths in files.items():
-        of, notes = imported_files(paths, columns, robot, everyones, command)
+        of, found = imported_files(paths, columns, robot, everyones, command)
         tables.append(of)
-        said += notes if len(files) == 1 else [f"{robot}: {note}" for note in notes]
-    return _written(tables, said, request, folder)
+        notes += found if len(files) == 1 else [f"{robot}: {note}" for note in found]
+    return _written(tables, notes, request, folder)
 
 
 def proposal(path: Path) -> str:
-    """What is in a bag, and the file of topics for it; nothing of what is no bag."""
+    """The topics of a bag, and a proposal for the file that assigns them; empty for what is
+    no bag.
+    """
     if not is_bag(path) or is_own_log(path):
         return ""
     try:
@@ -166,7 +177,7 @@ def proposal(path: Path) -> str:
 
 
 def is_own_log(path: Path) -> bool:
-    """Whether it is a log of a team."""
+    """Whether a file is the log of a team."""
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:
@@ -199,14 +210,14 @@ def _bags(request: Request, folder: Path) -> Report:
             f"two bags have the robots {', '.join(names)}: name them by [robots.NAME] in a file "
             "of topics, --ros2 FILE"
         )
-    said = [note for one in found for note in one.said]
-    report = _written(tables, said, request, folder)
+    notes = [note for one in found for note in one.notes]
+    report = _written(tables, notes, request, folder)
     report.messages = sum(one.messages for one in found)
     return report
 
 
 def _written(
-    tables: Sequence[RobotTables], said: list[str], request: Request, folder: Path
+    tables: Sequence[RobotTables], notes: list[str], request: Request, folder: Path
 ) -> Report:
     by_name = {each.robot: each for each in tables}
     if not any(kind in each.rows for each in tables for kind in MEASURED):
@@ -233,5 +244,7 @@ def _written(
         ]
         document = {"base": "recorded", "world": {"path": "."}, "robots": robots}
         (folder / SCENARIO).write_text(tomli_w.dumps(document), "utf-8")
-        said.append(f"{SCENARIO}: the models of `recorded`, with the sensors' places on the robots")
-    return Report([each.robot for each in tables], said)
+        notes.append(
+            f"{SCENARIO}: the models of `recorded`, with the sensors' places on the robots"
+        )
+    return Report([each.robot for each in tables], notes)

@@ -11,9 +11,10 @@ from team.ros2.translator import Measured, Pose, Seen, Speeds
 
 @dataclass
 class RobotTables:
-    """Rows by table; a table with columns of its own choice is in `columns`.
+    """The rows of one robot's tables.
 
-    mount: the pose (x, y, yaw) of the sensor on the base.
+    columns: of tables that choose their columns themselves. mount: the pose (x, y, yaw) of the
+    sensor on the base.
     """
 
     robot: str
@@ -29,7 +30,7 @@ class RobotTables:
         self.rows.setdefault(table, []).append(row)
 
     def take(self, measured: Measured) -> None:
-        """Append what a message of a robot says."""
+        """Append the measurement of one ROS 2 message."""
         time = seconds(measured.stamp_ns)
         match measured:
             case Pose():
@@ -42,8 +43,8 @@ class RobotTables:
                 self.add("observations", ("t_s", "landmark", *POINTS), (time, "", "", ""))
             case Seen(covariances=(_, *_)):
                 columns = ("t_s", "landmark", *POINTS, *POINT_COVARIANCE)
-                told = zip(measured.names, measured.points, measured.covariances, strict=True)
-                for name, point, covariance in told:
+                rows = zip(measured.names, measured.points, measured.covariances, strict=True)
+                for name, point, covariance in rows:
                     self.add("observations", columns, (time, name, *point, *covariance))
             case Seen():
                 mates = isinstance(measured.names[0], str)
@@ -52,7 +53,7 @@ class RobotTables:
                     self.add(table, ("t_s", column, *POINTS), (time, name, *point))
 
     def start(self, pose: Sequence[float], sigmas: Sequence[float] = ()) -> None:
-        """The initial pose; sigmas: its standard deviations (position [m], heading [rad])."""
+        """Set the initial pose; sigmas: its standard deviations (position [m], heading [rad])."""
         row: list[object] = list(pose)
         columns = [*POSES]
         if sigmas:
@@ -62,7 +63,7 @@ class RobotTables:
         self.columns["start"], self.rows["start"] = columns, [row]
 
     def write(self, folder: Path) -> None:
-        """The tables in a folder of the robot's name; true landmarks beside it."""
+        """Write the tables into a folder of the robot's name, and the true landmarks beside it."""
         place = folder / self.robot
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():
@@ -74,5 +75,5 @@ class RobotTables:
 
 
 def _fitted(row: Row, width: int) -> Row:
-    """The row's first cells; empty ones behind a row that is a time alone."""
+    """The row's first `width` cells, filled up with empty ones where the row is a time alone."""
     return [*row, *[""] * width][:width]

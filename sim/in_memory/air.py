@@ -1,5 +1,5 @@
-"""A radio between robots, in team time and by chance that a seed fixes: who reaches whom, delay,
-loss, duplicates, and how many bytes a link carries.
+"""A simulated radio in team time, seeded: who reaches whom, delay, loss, duplicates, and the
+capacity of each link.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,13 +16,13 @@ Reach = Callable[[str, str, int], bool]
 
 
 def always(one: str, other: str, now_ns: int) -> bool:
-    """Everyone reaches everyone."""
+    """Every node reaches every other."""
     return True
 
 
 @dataclass(frozen=True)
 class Meeting:
-    """These nodes reach each other from begin_ns until end_ns, whatever else holds."""
+    """These nodes reach each other from begin_ns until end_ns, whatever their distance."""
 
     nodes: frozenset[str]
     begin_ns: int
@@ -30,7 +30,7 @@ class Meeting:
 
 
 def reach_in(reach: WorldReach) -> Reach:
-    """As the world of a scenario has it."""
+    """The reach of a scenario's world."""
 
     def between(one: str, other: str, now_ns: int) -> bool:
         return reach.between(one, other, now_ns)
@@ -52,7 +52,7 @@ def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
 
 
 def meetings(windows: Sequence[Meeting]) -> Reach:
-    """Only in the given windows, and only whom they name."""
+    """Reach in the given windows only, between the nodes that they name."""
 
     def reach(one: str, other: str, now_ns: int) -> bool:
         return any(
@@ -79,7 +79,7 @@ class Air:
     _number: int = 0
 
     def arrivals(self, sender: str, to: str, size: int, now_ns: int) -> list[int]:
-        """When a message arrives: never, once or twice."""
+        """The arrival times of a message: none if it is lost, two if it is duplicated."""
         if not self.reach(sender, to, now_ns):
             return []
         self.sent[sender, to] = self.sent.get((sender, to), 0) + size

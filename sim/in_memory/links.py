@@ -1,7 +1,7 @@
-"""Simulated links, in team time: delay, loss, partitions, a centre that dies.
+"""Simulated links in team time: delay, loss, partitions, a centre that dies.
 
-Nothing is lost for good: delivery `all` sends a lost submap again. So under the rule `join` none of
-this can change the final map (law 2), only what the team knows meanwhile.
+No submap is lost for good: with the delivery mode `all` it is sent again. So under the rule `join`
+none of this can change the final map (law 2), only the maps before it.
 """
 
 import heapq
@@ -17,19 +17,19 @@ from team.wire.codec import encoded
 RESEND_NS = 1_000_000_000
 """A lost submap is sent again after this time, as often as needed."""
 PATIENCE_NS = 3_000_000_000
-"""The centre takes a robot for lost after this time."""
+"""Time after which the centre considers a robot lost."""
 _FROM_ROBOTS = (ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
 _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Holds the messages for a node until they arrive; at equal times the presence of others
-    comes first.
+    """Delivers the messages to a node at their arrival times; at equal times liveliness tokens come
+    first.
     """
 
     def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
         self._arrival_ns = arrival_ns
-        self._held: list[tuple[int, bool, int, Sample]] = []
+        self._in_flight: list[tuple[int, bool, int, Sample]] = []
         self._sent = 0
 
     def say(self, at_ns: int, message: m.Liveliness) -> None:
@@ -44,18 +44,18 @@ class Link:
         for sample in samples:
             self._hold(self._arrival_ns(sample, now_ns), sample, sent=True)
         there = []
-        while self._held and self._held[0][0] <= now_ns:
-            there.append(heapq.heappop(self._held)[-1])
+        while self._in_flight and self._in_flight[0][0] <= now_ns:
+            there.append(heapq.heappop(self._in_flight)[-1])
         return there
 
     def _hold(self, at_ns: int, sample: Sample, *, sent: bool) -> None:
-        heapq.heappush(self._held, (at_ns, sent, self._sent, sample))
+        heapq.heappush(self._in_flight, (at_ns, sent, self._sent, sample))
         self._sent += 1
 
     @property
     def next_ns(self) -> int | None:
         """Arrival time of the next message that is on its way."""
-        return self._held[0][0] if self._held else None
+        return self._in_flight[0][0] if self._in_flight else None
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,11 @@ class Partition:
 
 @dataclass(frozen=True)
 class Conditions:
-    """loss: of submaps on the way to the centre, the probability for each transmission.
+    """The conditions of a team's links.
 
-    delay_ns: of submaps to the centre. down_ns: from when until when there is no centre; the one
-    that comes then knows nothing and asks the robots.
+    loss: the probability that a submap's transmission to the centre is lost. delay_ns: of submaps
+    to the centre. down_ns: from when until when there is no centre; the next centre starts empty
+    and requests everything from the robots.
     """
 
     delay_ns: int = 0
@@ -135,7 +136,7 @@ class Conditions:
 def _behind(
     cuts: Sequence[Partition], now_ns: int, sample: Sample, channels: Sequence[ch.Channel]
 ) -> int:
-    """`now_ns`, or the end of the cuts that lie there, for what crosses them."""
+    """`now_ns`, or the end of the partitions that a message crosses at that time."""
     found = ch.channel_of(sample.key)
     if found is None or found[0] not in channels:
         return now_ns

@@ -1,6 +1,6 @@
-"""A team without a centre in one process: the same nodes, a radio of ours between them, team time.
+"""A team without a centre in one process: the nodes of real peers, a simulated radio, team time.
 
-The world reaches every robot, as its own sensors do; robots reach each other as the air allows.
+The world reaches every robot, as its own sensors do; robots reach each other as `Air` determines.
 """
 
 import heapq
@@ -26,7 +26,7 @@ from team.wire.codec import encoded
 from team.wire.digest import configured
 
 AFTER_S = 3600.0
-"""Team time after the streams' end at which peers that lack something give up."""
+"""Team time [s] after the streams' end at which peers that lack something give up."""
 Make = Callable[[Scenario, RobotConfig], PeerRobot]
 
 
@@ -46,10 +46,10 @@ class _Seat:
 
 
 class PeerTeam:
-    """Peers in a world, and the air between them; `run` yields what a recorder would take.
+    """Peers in a world, and the radio between them; `run` yields what a recorder would record.
 
-    seats: by robot, and that of a centre if there is one. complete_ns: when each robot had its
-    final map, in team time.
+    seats: by robot, and that of a centre if there is one. complete_ns: team time at which each
+    robot had its final map.
     """
 
     def __init__(self, scenario: Scenario, air: Air, make: Make = peer_of) -> None:
@@ -68,12 +68,12 @@ class PeerTeam:
         self._latest: dict[str, tuple[ch.Channel, Sample]] = {}
 
     def seat(self, config: RobotConfig) -> None:
-        """Add a robot without any knowledge: at the start, or after a death."""
+        """Add a robot with an empty set: at the start, or after a death."""
         node = self._make(self.scenario, config)
         self.seats[config.id] = _Seat(node, Boundary(node.name))
 
     def seat_centre(self, restored: Iterable[Member] = ()) -> None:
-        """Add a centre, with the set that it has kept on disk: one more peer."""
+        """Add a centre, one more peer, with the set that it has stored on disk."""
         names = [each.id for each in self.scenario.robots]
         seat = _Seat(PeerCentre(self.scenario.central, names), Boundary(CENTRE))
         seat.node.keep(restored)
@@ -82,7 +82,7 @@ class PeerTeam:
         self._catch_up(CENTRE, seat)
 
     def leave(self, name: str) -> list[Member]:
-        """Remove a robot or the centre; returns what it had kept."""
+        """Remove a robot or the centre; returns the set that it had stored."""
         seat = self.seats.pop(name)
         for other in self.seats.values():
             other.reached.discard(name)
@@ -91,8 +91,10 @@ class PeerTeam:
     def run(
         self, world: World, steps: Callable[["PeerTeam"], None] | None = None
     ) -> Iterator[Sample]:
-        """Until all peers have the same final map and nothing is on its way; `steps` is called
-        once a round, and may kill and seat.
+        """Run until all peers have the same final map and nothing is on its way; yields the
+        messages.
+
+        steps: called once a round; it may remove and add peers.
         """
         self._world, self._world_boundary = world, Boundary("world")
         self._source(world.begin())
@@ -125,8 +127,8 @@ class PeerTeam:
         self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
 
     def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
-        """A robot that died is there again, with what it has kept on disk; it asks its source for
-        what comes behind that.
+        """Start a robot again after its death, with the set that it had stored; it requests the
+        measurements after those from its source.
         """
         world = self._world
         assert isinstance(world, WorldNode)
@@ -143,21 +145,21 @@ class PeerTeam:
             )
             for reply in world.measurements(encoded(request)):
                 key = ch.MEASUREMENTS.key(config.id)
-                said = seat.boundary.take_reply(seat.node, key, reply, m.Measurement)
-                self._say(config.id, said)
+                outgoing = seat.boundary.take_reply(seat.node, key, reply, m.Measurement)
+                self._say(config.id, outgoing)
             if seat.node.node.next_measurement == first:
                 break
         self._catch_up(config.id, seat)
 
     def hear(self, name: str, sample: Sample) -> None:
-        """Give an operator's message to one robot alone."""
+        """Deliver an operator's message to one robot alone."""
         seat = self.seats[name]
         self._say(name, seat.boundary.take(seat.node, sample))
 
     # The world.
 
-    def _source(self, said: Sequence[Outgoing]) -> None:
-        for each in said:
+    def _source(self, outgoing: Sequence[Outgoing]) -> None:
+        for each in outgoing:
             sample = self._sample(each)
             self._log.append(sample)
             found = ch.channel_of(sample.key)
@@ -184,9 +186,11 @@ class PeerTeam:
 
     # The air.
 
-    def _say(self, robot: str, said: Sequence[Outgoing]) -> None:
-        """What a robot says reaches the world, and others as far as the air carries it."""
-        for out in said:
+    def _say(self, robot: str, outgoing: Sequence[Outgoing]) -> None:
+        """Deliver a robot's messages to the world, and to others as far as the radio
+        carries them.
+        """
+        for out in outgoing:
             if out.channel is ch.MEMBERS:
                 request = Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
                 to = ch.robot_of(out.name) or out.name
@@ -240,7 +244,7 @@ class PeerTeam:
 
     @property
     def _agree(self) -> bool:
-        """Whether all have a final map and one set, and nothing is on its way."""
+        """Whether all have a final map and the same set, and nothing is on its way."""
         finals = [seat.node.final for seat in self.seats.values()]
         if len(self.seats) < len(self.scenario.robots):
             return False
@@ -258,7 +262,7 @@ class PeerTeam:
 
 
 def _listened(node: PeerRobot | PeerCentre) -> tuple[ch.Channel, ...]:
-    """What a robot subscribes to under its name, or a centre whoever it names."""
+    """The channels that a robot subscribes to under its name, or a centre under any."""
     return node.listens if isinstance(node, PeerRobot) else node.overhears
 
 

@@ -20,8 +20,9 @@ from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.digest import configured
 
 ROUND_S = 1.0
-"""Team time of one round: every robot gets its measurements before the next round, so that none
-is windows ahead of its teammates' messages, as in real time."""
+"""Team time [s] of one round: every robot gets its measurements of a round before the next, so that
+none is windows ahead of its teammates' messages, as in real time.
+"""
 
 
 @runtime_checkable
@@ -48,7 +49,7 @@ class World(Protocol):
 
 @dataclass
 class _Seat:
-    """A node, its bus, the link over which the others' messages reach it."""
+    """A node, its bus, and the link that delivers the others' messages to it."""
 
     node: World | RobotNode | CentralNode
     bus: MemoryBus
@@ -72,7 +73,9 @@ def run_team(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
     central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
-    """Run the team to its final map; everything that a recorder would take, in its order."""
+    """Run the team to its final map; returns the samples that a recorder would record, in its
+    order.
+    """
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
     announced = configured("world", 0, 0, scenario)
     world = WorldNode(
@@ -88,9 +91,9 @@ def run_nodes(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
     central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
-    """Run the scenario's robots and centre in a world, until nothing is on its way any more.
+    """Run the scenario's robots and centre in a world until no message is on its way.
 
-    conditions: what becomes of messages and of the centre; none: everything arrives at once.
+    conditions: of the links and the centre; None: every message arrives at once.
     """
     conditions = Conditions() if conditions is None else conditions
     network = MemoryNetwork()
@@ -169,7 +172,7 @@ def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _
 
 
 def final_map(samples: list[Sample]) -> m.FusedMap:
-    """The team's final map among what a run sent."""
+    """The team's final map among the samples of a run."""
     for sample in reversed(samples):
         if sample.key == ch.FINAL_MAP.key():
             _, _, message = opened(sample)

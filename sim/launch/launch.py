@@ -20,11 +20,13 @@ from team.wire.bus import BusError
 from team.wire.zenoh.bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
-"""The router must say where it listens within this time; a busy machine starts Python slowly."""
+"""Time [s] within which the router must report its endpoint; a busy machine starts Python
+slowly.
+"""
 POSES = (ch.OWN_POSE, ch.TEAM_POSE)
-"""Who only looks on can do without some of them, when it does not keep up."""
+"""Channels of which an observer that does not keep up may lose messages."""
 REFUSED = 2
-"""The exit status of a command that can not do what it was asked for."""
+"""The exit status of a command that can not do what it was asked to."""
 
 
 class LaunchError(RuntimeError):
@@ -33,9 +35,10 @@ class LaunchError(RuntimeError):
 
 @dataclass
 class Outcome:
-    """What a launch left behind.
+    """The result of a launch.
 
-    restarts: how often each process was started again. used: what each took, all its lives.
+    restarts: how often each process was started again. used: the resources of each process, over
+    all its lives.
     """
 
     log: Path
@@ -51,9 +54,9 @@ class Outcome:
 def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
-    `show` is called again and again with what is known. A process that dies is started again, or
-    given up (`sim.launch.supervision`). Raises BusError when the router can not listen there,
-    LaunchError when it does not come up. SIGINT and SIGTERM end every process and raise
+    `show` is called again and again with the state of the team. A process that dies is started
+    again, or given up (`sim.launch.supervision`). Raises BusError when the router can not listen at
+    its endpoint, LaunchError when it does not start. SIGINT and SIGTERM end every process and raise
     KeyboardInterrupt.
     """
     began = time.monotonic()
@@ -136,16 +139,16 @@ def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> S
 
 
 def _signer(own: Credentials) -> Signs:
-    """Imported here: without keys nothing is signed."""
+    """The signer of orders, imported here, since without keys nothing is signed."""
     from team.keys.signing import Signer
 
     return Signer(own)
 
 
 def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, ZenohBus]:
-    """Where the router listens, and this process's own bus there.
+    """The router's endpoint, and this process's own bus there.
 
-    A router that is killed meanwhile is started again; what it refuses by itself is raised.
+    A router that is killed meanwhile is started again; its own refusal is raised.
     """
     while True:
         try:
@@ -163,7 +166,7 @@ def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, 
 
 
 def _endpoint(service: Supervised) -> str:
-    """Where the router listens. Started again it listens there, too."""
+    """The router's endpoint. Started again, it listens there, too."""
     router = service.child
     deadline = time.monotonic() + ROUTER_PATIENCE_S
     while time.monotonic() < deadline:
@@ -173,9 +176,9 @@ def _endpoint(service: Supervised) -> str:
                 service.arguments[2] = endpoint
                 return endpoint
         if router.exit is not None:
-            said = "\n".join(router.last_lines()).removeprefix("error: ")
+            words = "\n".join(router.last_lines()).removeprefix("error: ")
             refused = BusError if router.exit == REFUSED else LaunchError
-            raise refused(said or f"the router {router.ended().how}")
+            raise refused(words or f"the router {router.ended().how}")
         time.sleep(0.02)
     raise LaunchError(f"the router did not come up within {ROUTER_PATIENCE_S:g} s")
 

@@ -1,6 +1,7 @@
-"""What a launch asks of Linux and Python does not offer: orphans' parent, a parent's death, a name.
+"""Features of Linux that Python does not offer: adopting orphans, a parent's death, the command
+line.
 
-Elsewhere these do nothing and say so.
+On other systems these functions do nothing and return that.
 """
 
 import ctypes
@@ -22,7 +23,7 @@ def _prctl(option: int, value: int) -> bool:
 
 
 def adopt_orphans() -> bool:
-    """Let this process be the parent of descendants whose parent ends; whether it is from now."""
+    """Become the parent of descendants whose parent ends; returns whether the system allows it."""
     return sys.platform == "linux" and _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
@@ -33,14 +34,14 @@ def end_with_parent(number: signal.Signals) -> None:
 
 
 def threads() -> int:
-    """How many threads this process has, those of libraries included."""
+    """The number of this process's threads, those of libraries included."""
     return len(os.listdir("/proc/self/task"))
 
 
 def write_command_line(words: Sequence[str]) -> None:
     """Show other words as the command line of this process, in `ps` and /proc.
 
-    They take the place of those that it was started with, and are cut to their length.
+    They overwrite the original words, and are cut to their length.
     """
     from_third = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     begin, end = (int(from_third[field - 3]) for field in (_ARG_START, _ARG_END))

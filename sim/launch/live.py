@@ -1,4 +1,4 @@
-"""What a user sees while a team runs: a live table in a terminal, plain lines elsewhere."""
+"""Shows a running team: a live table in a terminal, plain lines elsewhere."""
 
 import sys
 import time
@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 LINE_S = 5.0
 """Wall time between two plain lines."""
 SETTLED_S = 5.0
-"""A warning that a node takes back sooner, as while a team starts, is no line."""
+"""A warning that a node withdraws sooner [s], as while a team starts, is not printed as a line."""
 PATIENCE_S = 8.0
-"""Processes start slowly on a busy machine: nobody is missed before."""
+"""Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
 
 
 @contextmanager
 def shown(title: str) -> Iterator[Callable[[Watch], None]]:
-    """A function that shows the state of a run again and again, fit for where it is printed."""
+    """A function that shows the state of a run again and again, in the form that fits the
+    output.
+    """
     console = Console(stderr=True)
     if console.is_terminal and sys.stderr.isatty():
         with Live(console=console, refresh_per_second=4, transient=True) as live:
@@ -49,7 +51,7 @@ class _Lines:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._due = 0.0
-        self._said: set[str] = set()
+        self._shown: set[str] = set()
         self._since: dict[str, float] = {}
         self._last: Watch | None = None
         self._noted = 0
@@ -63,8 +65,8 @@ class _Lines:
         self._noted = len(watch.notes)
         self._warn(watch, SETTLED_S)
         for words in () if watch.fused is None else watch.fused.joined:
-            if words not in self._said:
-                self._said.add(words)
+            if words not in self._shown:
+                self._shown.add(words)
                 self._print(watch, words)
         now = time.monotonic()
         if now < self._due or watch.world is None:
@@ -87,7 +89,7 @@ class _Lines:
         )
 
     def end(self) -> None:
-        """What is warned of in the end is said, however short it has been."""
+        """Print the warnings that are left at the end, however short they have lasted."""
         if self._last is not None:
             self._warn(self._last, 0.0)
 
@@ -97,8 +99,8 @@ class _Lines:
         for warning in warnings:
             key = without_decimals(warning)
             lasting = warning in watch.failures or now - self._since[key] >= settled_s
-            if lasting and key not in self._said:
-                self._said.add(key)
+            if lasting and key not in self._shown:
+                self._shown.add(key)
                 self._print(watch, f"warning: {warning}")
 
     def _print(self, watch: Watch, text: str) -> None:
@@ -109,8 +111,8 @@ class _Lines:
 
 
 def _done(watch: Watch) -> float:
-    """The share of the world's measurements that the robots have taken; it may be far ahead of
-    them.
+    """The share of the world's measurements that the robots have consumed; the world may be far
+    ahead of them.
     """
     total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
     robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
@@ -119,27 +121,29 @@ def _done(watch: Watch) -> float:
 
 
 def _warnings(watch: Watch) -> list[str]:
-    """Failures and what the nodes warn of; that some are not there yet is none for a while.
+    """The failures, and the nodes' warnings; absent nodes are warned of after PATIENCE_S only.
 
-    While the team starts everyone misses everyone: the world says it for all of them.
+    While the team starts every node lacks every other: the world's warning stands for all.
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
         return list(watch.failures)
     world = watch.world
-    said = sorted(watch.statuses.items())
+    statuses = sorted(watch.statuses.items())
     if world is None:
-        said = [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
-        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in said if s.warnings]
+        statuses = (
+            [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
+        )
+        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in statuses if s.warnings]
     elif world.state == "waiting":
         texts = [f"{world.node}: {w}" for w in world.warnings]
     else:
-        said += [(world.node, world)] if watch.drivers else []
-        texts = [f"{node}: {w}" for node, status in said for w in status.warnings]
+        statuses += [(world.node, world)] if watch.drivers else []
+        texts = [f"{node}: {w}" for node, status in statuses for w in status.warnings]
     return [*watch.failures, *texts]
 
 
 def _share(watch: Watch) -> str:
-    """The same in words: nobody knows how much drivers will measure yet."""
+    """The progress in words: it is not known how much drivers will measure yet."""
     live = watch.world is not None and watch.world.node == DRIVERS
     return f"{_done(watch):.0%}" + " of what came so far" * live
 
@@ -182,7 +186,7 @@ _COLUMNS = (
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
-"""Robots with a row of their own: a table that is higher than the terminal would be cut."""
+"""Most robots with a row of their own: a table that is higher than the terminal would be cut."""
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
@@ -214,8 +218,8 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
 
 
 def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
-    """How much of the set a robot has, the age of the newest that it has of the others, and how
-    many of these have the same set.
+    """How much of the set a robot has, the age of the newest submap that it has of the others, and
+    how many of these have the same set.
     """
     figures = statuses[f"robot/{robot}"].figures
     sets = [status.figures.get("set_submaps", 0.0) for status in statuses.values()]
@@ -231,7 +235,7 @@ def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
 
 
 def _map_lines(watch: Watch) -> list[str]:
-    """What the team's map is made of, and whether it can be believed."""
+    """The contents of the team's map, and its warnings."""
     fused, central, world = watch.fused, watch.statuses.get("central"), watch.world
     if fused is None:
         return ["no fused map yet"]
@@ -246,7 +250,9 @@ def _map_lines(watch: Watch) -> list[str]:
 
 
 def _consistency(watch: Watch) -> str:
-    """The consistency monitor; against the truth NEES and coverage of the map's landmarks."""
+    """The consistency monitor's figures; against the truth NEES and coverage of the map's
+    landmarks.
+    """
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
     parts = [

@@ -1,4 +1,4 @@
-"""What is to be launched."""
+"""The plan of a launch: the scenario, the files and the options of its processes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from sim.scenarios.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What is to be launched."""
+    """What `launch` starts, with which files and options."""
 
     scenario: Scenario
     folder: Path
@@ -22,5 +22,7 @@ class Plan:
 
     @property
     def door(self) -> list[str]:
-        """How every process gets in: the option, or nothing where the door is open."""
+        """The option by which every process connects with its certificate; empty where no keys are
+        used.
+        """
         return [] if self.keys is None else ["--keys", str(self.keys)]

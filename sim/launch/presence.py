@@ -19,9 +19,9 @@ APART_S = 1.0
 
 @dataclass
 class Member:
-    """One node: whether its token is there, its last status, and what it counted in which time.
+    """One node: its liveliness, its last status, and what it counted in which time.
 
-    clock_s: its team time less its machine's wall clock; None where it says no team time.
+    clock_s: its team time less its machine's wall clock; None where it reports no team time.
     """
 
     alive: bool = False
@@ -31,7 +31,7 @@ class Member:
     _last: tuple[float, float] | None = field(default=None, repr=False)
 
     def take(self, status: m.Status, wall_ns: int) -> None:
-        """A status, and when it was said by the node's own wall clock."""
+        """Take a status, published at this time of the node's own wall clock."""
         self.status = status
         count = status.figures.get("measurements", status.figures.get("submaps", 0.0))
         self._last = 1e-9 * wall_ns, count
@@ -41,7 +41,7 @@ class Member:
 
     @property
     def rate(self) -> float | None:
-        """Measurements (of the centre submaps) a second while it was looked at."""
+        """Measurements (of the centre submaps) per second during the observation."""
         if self._first is None or self._last is None or self._last[0] <= self._first[0]:
             return None
         return (self._last[1] - self._first[1]) / (self._last[0] - self._first[0])
@@ -80,8 +80,8 @@ class Presence:
             case m.Status():
                 self._of(message.node).take(message, wall_ns)
             case m.StreamHead():
-                held = self.heads.get(message.robot)
-                self.heads[message.robot] = later_head(message, held)
+                head = self.heads.get(message.robot)
+                self.heads[message.robot] = later_head(message, head)
             case m.TeamEnd():
                 self.is_to_end = True
             case m.FusedMap():
@@ -90,7 +90,7 @@ class Presence:
                 pass
 
     def is_there(self, node: str) -> bool:
-        """Whether the node's token is there."""
+        """Whether the node is alive."""
         return node in self.members and self.members[node].alive
 
     @property
@@ -101,7 +101,7 @@ class Presence:
         return sorted(found | self.heads.keys())
 
     def clocks(self) -> dict[str, float]:
-        """Of each driver that measures, how far its clock is ahead of the team's middle one [s]."""
+        """The offset [s] of each measuring driver's clock from the median clock of the team."""
         found = {
             node: member.clock_s
             for node, member in self.members.items()
@@ -111,41 +111,43 @@ class Presence:
         return {node: clock_s - middle for node, clock_s in found.items()}
 
     def advice(self) -> list[str]:
-        """Which nodes wait for which, and what to do."""
-        said = []
+        """The nodes that wait for others, with the remedy."""
+        advice = []
         if self.has_ended:
-            said.append("the final map is out: the team has ended")
+            advice.append("the final map is out: the team has ended")
         if not self.is_there("central"):
-            said.append("no centre: robots map on, nobody joins their maps; start teamslam central")
+            advice.append(
+                "no centre: robots map on, nobody joins their maps; start teamslam central"
+            )
         world = self.is_there("world")
         for robot in [] if world else self.robots:
-            said += self._of_robot(robot)
+            advice += self._of_robot(robot)
         clocks = self.clocks()
         for node, ahead_s in sorted(clocks.items()):
             if abs(ahead_s) > APART_S and len(clocks) > 1:
                 way = "ahead of" if ahead_s > 0 else "behind"
-                said.append(
+                advice.append(
                     f"{node} stamps {abs(ahead_s):.1f} s {way} the others: set its machine's clock "
                     "(NTP, PTP), or stamp with the clock that the others have"
                 )
         for node, member in sorted(self.members.items()):
             if member.alive and member.status is not None:
-                said += [f"{node}: {warning}" for warning in member.status.warnings]
-        return said
+                advice += [f"{node}: {warning}" for warning in member.status.warnings]
+        return advice
 
     def _of_robot(self, robot: str) -> list[str]:
         has_driver, head = self.is_there(ch.source_node(robot)), self.heads.get(robot)
         ended = head is not None and head.state == "ended"
-        said = []
+        advice = []
         if not self.is_there(ch.robot_node(robot)):
-            said.append(
+            advice.append(
                 f"{robot} has no process: its driver keeps what it measures; start "
                 f"teamslam robot SCENARIO {robot}, or go on by teamslam end --without {robot}"
             )
         if not (has_driver or ended or self.has_ended):
-            kept = "" if head is None else f" after measurement {head.measurements - 1}"
-            said.append(
-                f"{robot} has no driver{kept}: start it, or end the team by teamslam end, or go on "
-                f"by teamslam end --without {robot}"
+            resumed = "" if head is None else f" after measurement {head.measurements - 1}"
+            advice.append(
+                f"{robot} has no driver{resumed}: start it, or end the team by teamslam end, or go "
+                f"on by teamslam end --without {robot}"
             )
-        return said
+        return advice

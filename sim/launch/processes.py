@@ -1,4 +1,4 @@
-"""How the processes of a team are started: forked from the warm template, or each from scratch."""
+"""Starts the processes of a team: forked from the warm template, or each from scratch."""
 
 import json
 import os
@@ -19,14 +19,14 @@ from team.the_end import SINCE
 # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
 PROGRAM = (sys.executable, "-P", "-m", "sim")
 TEMPLATE = "template"
-"""`python -m sim template FD ESTIMATOR RULE`: what a launch starts, no command of a user's."""
+"""`python -m sim template FD ESTIMATOR RULE`: started by `launch`, no command for users."""
 LOOK_S = 0.005
-"""Between two looks at a process that is to end."""
+"""Time [s] between two checks of a process that is to end."""
 PATIENCE_S = 600.0
-"""A template answers within this time, though it may have to compile all kernels before."""
+"""Time [s] within which a template answers, though it may have to compile all kernels before."""
 _LARGEST_ANSWER = 64
 _ROOM = 4_096
-"""Bytes of a forked process's command line; the template is started with as many spaces."""
+"""Bytes of a forked process's command line; the template is started with that many spaces."""
 _ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -41,9 +41,10 @@ _ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Used:
-    """What a process has taken: CPU, its largest resident set, and its share of memory at the end.
+    """The resources of a process: CPU, its largest resident set, and its share of memory at the
+    end.
 
-    The pages that n processes have in common count 1/n in the share of each. None: not known.
+    A page that n processes have in common counts 1/n in the share of each. None: not known.
     """
 
     cpu_s: float = 0.0
@@ -51,7 +52,7 @@ class Used:
     pss_mb: float | None = None
 
     def and_later(self, later: "Used") -> "Used":
-        """Of two lives of one process, this one the earlier."""
+        """The resources of two lives of one process, of which this one is the earlier."""
         pss_mb = self.pss_mb if later.pss_mb is None else later.pss_mb
         peak_rss_mb = max(self.peak_rss_mb, later.peak_rss_mb)
         return Used(self.cpu_s + later.cpu_s, peak_rss_mb, pss_mb)
@@ -60,8 +61,8 @@ class Used:
 class Process:
     """A child of this process by its id.
 
-    exit: its status (negative: the signal that ended it), None while it runs. used: what it has
-    taken; of its share of memory the last that was measured.
+    exit: its status (negative: the signal that ended it), None while it runs. used: its resources;
+    of its share of memory the last measurement.
     """
 
     def __init__(self, pid: int, started: "subprocess.Popen[bytes] | None" = None) -> None:
@@ -109,17 +110,17 @@ class Process:
 class Starter:
     """Starts the processes of one run; a context that ends the template.
 
-    warm: the estimator and the rule whose kernels a template loads, from which all are forked; None
-    or where the system has no orphans' parent: each is started from scratch, as whoever comes after
-    a template that has died. said: where the template tells what went wrong. compiled: called while
-    the template compiles kernels, with how many it has of about how many.
+    warm: the estimator and the rule whose kernels a template loads, from which all are forked. With
+    None, on a system that can not adopt orphans, and after a template has died, each process is
+    started from scratch. log: the file for the template's errors. compiled: called while the
+    template compiles kernels, with the number compiled and the estimated total.
     """
 
     def __init__(
         self,
         since_ns: int,
         warm: tuple[str, str] | None,
-        said: Path,
+        log: Path,
         compiled: Callable[[int, int], None] = lambda done, of: None,
     ) -> None:
         self._compiled, self._done = compiled, 0
@@ -127,7 +128,7 @@ class Starter:
         self._template: Process | None = None
         self._asks: socket.socket | None = None
         if warm is not None and adopt_orphans():
-            self._start_template(warm, said)
+            self._start_template(warm, log)
 
     def __enter__(self) -> Self:
         return self
@@ -158,7 +159,9 @@ class Starter:
         return Process(started.pid, started)
 
     def _forked(self, asks: socket.socket, words: Sequence[str], output: int) -> int:
-        """The id of a process that the template has forked; OSError if it does not answer."""
+        """The id of a process that the template has forked; raises OSError if it does not
+        answer.
+        """
         socket.send_fds(asks, [json.dumps(list(words)).encode()], [output])
         while answer := asks.recv(_LARGEST_ANSWER):
             match answer.decode().split():
@@ -169,11 +172,11 @@ class Starter:
                     self._compiled(self._done, max(self._done, int(of)))
         raise ConnectionResetError("the template has ended")
 
-    def _start_template(self, warm: tuple[str, str], said: Path) -> None:
+    def _start_template(self, warm: tuple[str, str], log: Path) -> None:
         self._asks, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._asks.settimeout(PATIENCE_S)
         number = str(theirs.fileno())
-        with theirs, said.open("wb") as file:
+        with theirs, log.open("wb") as file:
             started = subprocess.Popen(  # noqa: S603 - our own program, no shell
                 [*PROGRAM, TEMPLATE, number, *warm, " " * _ROOM],
                 stdin=subprocess.DEVNULL,
@@ -198,7 +201,7 @@ class Starter:
 def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
     """A child's environment: one BLAS thread, tied to this process, unbuffered output.
 
-    since_ns: when the run began, for a child that is started again after its end.
+    since_ns: the beginning of the run, for a child that is started again after the end of the run.
     """
     tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
     return {**mine, **_ONE_THREAD, **tied}

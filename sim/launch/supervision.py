@@ -1,8 +1,8 @@
 """Supervises the processes of a team: restarts those that die and gives up those without progress.
 
-Recorder and viewer are not essential to the map: where they are given up the team goes on, and the
-run fails in the end. A robot that is given up is named as lost in the final map. Without router,
-world or centre there is no map: then the run ends. Peers do without a centre.
+The map does not need recorder and viewer: where they are given up the team goes on, and the run
+fails in the end. A robot that is given up is named as lost in the final map. Without router, world
+or centre there is no map: then the run ends. Peers need no centre.
 """
 
 import time
@@ -18,13 +18,13 @@ from team.wire.bus import Bus, BusError, Outgoing
 SILENT_S = 10.0
 """A running process without a message for this long [s] is named."""
 STARTING_S = 60.0
-"""… and a starting process without any message for this long: a busy machine is slow."""
+"""A starting process without any message for this long [s] is named: a busy machine is slow."""
 MEASURE_S = 2.0
 """Time [s] between two measurements of the processes' memory; the last is at the final map."""
-HEARD_S = 1.0
-"""Whoever leaves with the final map may leave so long before that map is heard of here."""
+END_HEARD_S = 1.0
+"""Time [s] after a process's end within which the final map may still arrive here."""
 LEAVING_S = 60.0
-"""A process that is left this long [s] after the final map is ended, and named."""
+"""A process that still runs this long [s] after the final map is ended, and named."""
 _NODES = {"router": "router", "world": "world", "central": "central"}
 _WITHOUT_IT_NO_MAP = frozenset(_NODES)
 
@@ -46,9 +46,10 @@ def supervise(
     show: Callable[[Watch], None],
     end_silent_s: float | None,
 ) -> None:
-    """Until every process but the router, the first, has ended or is given up.
+    """Watch the processes until all but the router, the first, have ended or are given up.
 
-    end_silent_s: a process that has said nothing for so long is ended, so that it is started again.
+    end_silent_s: a process without a message for this long [s] is ended, so that it is started
+    again.
     """
     silence, memory = Silence(end_silent_s), Memory()
     over_at: float | None = None
@@ -83,7 +84,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     status = service.child.exit
     if status is None:
         return
-    if status > 0 and not is_final and not service.has_ended_for(HEARD_S):
+    if status > 0 and not is_final and not service.has_ended_for(END_HEARD_S):
         return  # it may know of a provisional end that is not heard of yet
     failed_at_the_end = is_final and status > 0
     if (status == 0 and service.name != "router") or failed_at_the_end:
@@ -141,17 +142,19 @@ class Silence:
         self._named: set[int] = set()
 
     def look(self, services: Sequence[Supervised], watch: Watch) -> None:
-        """Name each process that has been silent for SILENT_S, once; end it if that is wished."""
+        """Name each process that has been silent for SILENT_S, once; end it where end_silent_s says
+        so.
+        """
         now = time.monotonic()
         for service in services:
             child = service.child
             if not service.is_watched or service.due is not None or child.exit is not None:
                 continue
-            heard = watch.heard.get(node_of(service.name), 0.0)
+            last_message = watch.last_message.get(node_of(service.name), 0.0)
             if service.name == "router":  # it says nothing itself: all others are silent with it
-                heard = max(watch.heard.values(), default=0.0)
-            silent_s = now - max(heard, child.started)
-            starts = heard < child.started and not child.is_stopped
+                last_message = max(watch.last_message.values(), default=0.0)
+            silent_s = now - max(last_message, child.started)
+            starts = last_message < child.started and not child.is_stopped
             if silent_s < (STARTING_S if starts else SILENT_S):
                 self._named.discard(child.pid)
                 continue

@@ -25,7 +25,7 @@ _PROC = Path("/proc")
 class Ended:
     """How a process ended: its exit status (negative: the signal that ended it), its last lines.
 
-    asked: we had asked it to stop, and it did. used: what it took.
+    asked: it was asked to stop, and did. used: its resources.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Ended:
 
     @property
     def how(self) -> str:
-        """In words."""
+        """The end in words."""
         if self.exit < 0:
             return f"was ended by {signal.Signals(-self.exit).name}"
         return f"ended with exit status {self.exit}"
@@ -73,7 +73,7 @@ class Child:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether it is there but does not run (SIGSTOP), where the system tells."""
+        """Whether the process exists but does not run (SIGSTOP), where the system reports it."""
         try:
             state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
         except (OSError, IndexError):
@@ -81,7 +81,7 @@ class Child:
         return state in "Tt"
 
     def kill(self) -> None:
-        """End it, stopped or not; nobody asked it before."""
+        """End it, stopped or not, without asking before."""
         self._process.signal(signal.SIGKILL)
 
     def stop(self) -> None:
@@ -91,32 +91,33 @@ class Child:
             self._process.signal(signal.SIGTERM)
 
     def end(self, deadline: float) -> Ended:
-        """Wait until `deadline` (monotonic), then end it; how it ended."""
+        """Wait until `deadline` (monotonic), then end it; returns how it ended."""
         while not self._process.wait(max(0.0, deadline - time.monotonic())):
             self.kill()
             deadline = math.inf
         return self.ended()
 
     def ended(self) -> Ended:
-        """How it ended; call when it has."""
+        """How it ended; to be called once it has."""
         status = self.exit
         assert status is not None
         asked = self._asked and status != -signal.SIGKILL
         return Ended(self.name, self.pid, status, self.last_lines(), asked, self._process.used)
 
     def last_lines(self) -> tuple[str, ...]:
-        """The end of what it printed."""
+        """The last lines of its output."""
         text = self.output.read_bytes()[self._before :].decode("utf-8", "replace")
         return tuple(text.splitlines()[-LAST_LINES:])
 
 
 @dataclass
 class Supervised:
-    """A process that is started again by the same command when it dies, after longer and longer.
+    """A process that is started again by the same command when it dies, after longer and longer
+    waits.
 
-    One that dies FRUITLESS times in a row without getting any further is given up. reached: how far
-    it had come at its last death, in whatever it counts. ended_s: when its end was seen, by a
-    monotonic clock. used: what its earlier lives took.
+    A process that dies FRUITLESS times in a row without progress is given up. reached: its progress
+    at its last death, in its own unit. ended_s: when its end was noticed, by a monotonic clock.
+    used: the resources of its earlier lives.
     """
 
     name: str
@@ -138,16 +139,16 @@ class Supervised:
 
     @property
     def is_watched(self) -> bool:
-        """Whether it runs, or will again."""
+        """Whether it runs, or will run again."""
         return not (self.over or self.given_up)
 
     def has_ended_for(self, time_s: float) -> bool:
-        """Whether its end was seen at least so long ago."""
+        """Whether its end was noticed at least this long ago."""
         self.ended_s = self.ended_s or time.monotonic()
         return time.monotonic() - self.ended_s >= time_s
 
     def died(self, reached: float) -> None:
-        """Note a death; it will be started again, or is given up."""
+        """Note a death: the process will be started again, or is given up."""
         self.fruitless = 1 if reached > self.reached else self.fruitless + 1
         self.reached = max(self.reached, reached)
         if self.fruitless >= FRUITLESS:
@@ -166,7 +167,9 @@ class Supervised:
 
 
 def end_all(children: Sequence[Child], *, last: str = "recorder") -> list[Ended]:
-    """Ask all to stop and end those that do not; the one named `last` is asked after the others."""
+    """Ask all to stop and end those that do not; the child named `last` is asked after the
+    others.
+    """
     ended = {}
     for group in (
         [c for c in children if c.name not in (last, "router")],

@@ -2,7 +2,7 @@
 
 `launch` starts it first. Each process of the team is forked from it, which takes milliseconds where
 imports and kernels take two seconds, and shares its memory. A forked process has the launch as its
-parent, its own session, no input and its output in its own file, and goes on as if it had been
+parent, its own session, no input and its output in its own file, and continues as if it had been
 started by its command line: docs/decisions/0076-warm-template.md.
 """
 
@@ -26,7 +26,7 @@ from sim.launch.processes import TEMPLATE
 
 LARGEST_REQUEST = 65_536
 LIGHT = ("team.keys.roster", "team.shell", "team.wire.zenoh.bus")
-"""What the router needs: it is forked before anything else is imported."""
+"""Modules that the router needs: it is forked before anything else is imported."""
 HEAVY = (
     "central.desk.view.viewer",
     "central.main",
@@ -38,22 +38,23 @@ HEAVY = (
     "team.recording.shell",
     "team.robot.main",
 )
-"""What all others need."""
+"""Modules that all other processes need."""
 
 
 @dataclass(frozen=True)
 class _Request:
-    """What to start, and the file for its output."""
+    """The command line to start, and the file for its output."""
 
     words: list[str]
     output: int
 
 
 def become_a_process(prepare: Callable[[], object]) -> None:
-    """Be the template that sys.argv speaks of; return in each forked process, with its sys.argv.
+    """Become the template that sys.argv describes; returns in each forked process, with its
+    sys.argv.
 
-    The template itself never returns: it ends when its launch does. prepare: what else every
-    process would do first.
+    The template itself never returns: it ends when its launch does. prepare: initialisation that
+    every process would do first.
     """
     end_with_parent(signal.SIGKILL)
     launch, estimator, rule = os.getppid(), sys.argv[3], sys.argv[4]
@@ -77,7 +78,9 @@ def become_a_process(prepare: Callable[[], object]) -> None:
 
 
 def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
-    """Load all kernels; if that was never done, two processes compile them and tell how far."""
+    """Load all kernels; if they were never compiled, two processes compile them and report the
+    progress.
+    """
     from sim.launch import warm_up
     from team.estimation.compiling import compilations
 
@@ -94,9 +97,9 @@ def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
 
 
 def end_by(run: Callable[[], None]) -> NoReturn:
-    """Run, and end this forked process as Python would, but for taking all modules apart.
+    """Call `run`, and end this forked process as Python would, but without freeing its modules.
 
-    That would copy every page that it shares with the others: 0.2 s and 100 MB each.
+    Freeing them would copy every page that it shares with the others: 0.2 s and 100 MB each.
     """
     status: object = None
     try:
@@ -117,7 +120,7 @@ def _is_asked(asked: socket.socket, patience_s: float) -> bool:
 
 
 def _serve(asked: socket.socket, launch: int) -> bool:
-    """Fork the process that is asked for; True in that process."""
+    """Fork the process that is asked for; returns True in that process."""
     request = _received(asked)
     if threads() != 1:
         sys.exit(f"the template has {threads()} threads: a fork would not be safe")
@@ -159,7 +162,7 @@ def _fork_again(write: int, launch: int) -> None:
 
 
 def _begin(request: _Request) -> None:
-    """Be the process that was asked for: its session, its streams, its words."""
+    """Become the requested process: its session, its streams, its command line."""
     os.setsid()
     nothing = os.open(os.devnull, os.O_RDONLY)
     for source, target in ((nothing, 0), (request.output, 1), (request.output, 2)):

@@ -1,6 +1,6 @@
 """Compares a running team's poses and map with the truth as they arrive.
 
-An evaluation like `central.desk.evaluation` of what has arrived so far; without a truth it stays
+It computes `central.desk.evaluation`'s figures of what has arrived so far; without truth it stays
 empty.
 """
 
@@ -13,7 +13,7 @@ from team.wire import messages as m
 from team.wire.bus import Sample
 
 EVERY_NS = 1_000_000_000
-"""A robot's pose is judged at most once per this much team time; the others are not decoded."""
+"""A robot's pose is compared at most once per this much team time; the others are not decoded."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class _Robot:
     given_map: bool = False
 
     def judge(self) -> None:
-        """Every pose that the truth has reached; truth that no later pose needs is let go."""
+        """Compare every pose up to the newest truth; forgets truth that no later pose needs."""
         if (found := self.errors.known()) is not None:
             self.tally.take(found.nees, 3)
             self.errors.forget(int(found.stamps_ns[-1]))
@@ -64,7 +64,7 @@ class LiveErrors:
         return known.errors.is_due(sample.stamp_ns)
 
     def take(self, channel: ch.Channel, message: m.Message) -> None:
-        """Take one message of any channel; of the others there is nothing to learn."""
+        """Take one message of any channel; those of other channels are ignored."""
         match message:
             case m.PoseEstimate():
                 self._take_pose(message, given_map=channel is ch.TEAM_POSE)

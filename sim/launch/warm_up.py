@@ -27,15 +27,17 @@ from team.wire.channels import SUBMAP, channel_of
 
 _VERSIONS = (sys.version, numba.__version__, binding.get_host_cpu_name())
 _STEPS = 48
-"""So many seconds that robots take maps with submaps of theirs that are not in them."""
+"""Number of one-second steps of the small team's run."""
 PLACES = np.array([[10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0], [10.0, 20.0]])
-"""Landmarks that nobody saw [m]."""
+"""Positions [m] of the made-up landmarks."""
 
 
 def warm_up(estimator: str, fusion: str) -> None:
-    """Run a small team of two in memory with estimator and rule, unless this program has before.
+    """Run a small team of two in memory with estimator and rule, unless this program has done so
+    before.
 
-    They move by different models, and the centre's loss is robust: kernels of both kinds are ready.
+    The robots have different motion models, and the centre's loss is robust, so that kernels of
+    both kinds are compiled.
     """
     if not is_warm(estimator, fusion):
         run_small_team(estimator, fusion)
@@ -49,7 +51,7 @@ def is_warm(estimator: str, fusion: str) -> bool:
 
 
 def note_warm(estimator: str, fusion: str) -> None:
-    """Say so beside the kernels."""
+    """Note beside the kernels that they are compiled."""
     stamp = _stamp(estimator, fusion)
     with suppress(OSError):  # then the next launch does it again
         if stamp is not None:
@@ -64,7 +66,9 @@ def _stamp(estimator: str, fusion: str) -> Path | None:
 
 
 def _program(estimator: str, fusion: str) -> str:
-    """Digest of what is compiled for the two: our sources, the compiler and the processor."""
+    """Digest of what the kernels of the two depend on: our sources, the compiler and the
+    processor.
+    """
     digest = hashlib.blake2b(digest_size=8)
     for text in (*_VERSIONS, estimator, fusion):
         digest.update(f"{text}\n".encode())
@@ -78,7 +82,8 @@ def _program(estimator: str, fusion: str) -> str:
 def run_small_team(estimator: str, fusion: str) -> None:
     """Run a small team of two in memory: every kernel that the pair uses is compiled or loaded.
 
-    They move by different models, and the centre's loss is robust: kernels of both kinds are ready.
+    The robots have different motion models, and the centre's loss is robust, so that kernels of
+    both kinds are compiled.
     """
     for _ in _small_team(estimator, fusion):
         pass
@@ -86,14 +91,14 @@ def run_small_team(estimator: str, fusion: str) -> None:
 
 
 def run_to_the_first_submap(estimator: str, fusion: str) -> None:
-    """The same until the centre has something to do: most kernels of the robots."""
+    """The same until the centre has its first submap: this needs most kernels of the robots."""
     for sample in _small_team(estimator, fusion):
         if channel_of(sample.key) == (SUBMAP, "r1"):
             return
 
 
 def fold_made_up_submaps() -> Fold:
-    """Six submaps of two robots that nobody drove, folded: the kernels of the centre alone."""
+    """The fold of six made-up submaps of two robots: this needs the kernels of the centre alone."""
     ids = np.arange(5, dtype=np.uint32)
     fold = EMPTY_FOLD
     for robot in ("r1", "r2"):

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 TURN_S = 0.1
 DRIVERS = "drivers"
-"""Who measures in a live team, as one node."""
+"""The drivers of a live team, as one node."""
 _PROGRESS = ("measurements", "submaps", "messages")
-"""Figures of a status that grow as its node gets on."""
+"""Figures of a status that grow with the node's progress."""
 
 
 def _no_errors() -> "LiveErrors":
-    """Imported here: it takes longer than all else that a launch needs to start its processes."""
+    """An empty `LiveErrors`, imported here: the import takes longer than starting the processes."""
     from sim.launch.truth import LiveErrors
 
     return LiveErrors()
@@ -31,14 +31,14 @@ def _no_errors() -> "LiveErrors":
 
 @dataclass
 class Watch:
-    """What is known of the team while it runs: the last status of each node, and the last map.
+    """The state of the team while it runs: the last status of each node, and the last map.
 
-    robots: how many there are to be. drivers: of a live team, whose drivers are waited for. errors:
-    against the truth, where there is one. place: by what other commands reach the team. notes: what
-    became of processes, in words. restarts: how often each was started again. given_up: those that
-    were. heard: when each node's last status came. peers: the robots that are to have a
-    final map of their own; concluded: whose is there, concluded_s: since when. signer: signs
-    orders, where there are keys.
+    robots: their number. drivers: of a live team, whose drivers are waited for. errors: of poses
+    and map, where there is truth. place: the options by which other commands reach the team. notes:
+    events of processes, in words. restarts: how often each process was started again. given_up: the
+    nodes that were given up. last_message: the time of each node's last status. peers: the robots
+    that are to have a final map of their own; concluded: those that have it; concluded_s: since
+    when. signer: signs orders, where there are keys.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class Watch:
     notes: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     given_up: list[str] = field(default_factory=list)
-    heard: dict[str, float] = field(default_factory=dict)
+    last_message: dict[str, float] = field(default_factory=dict)
     drivers: tuple[str, ...] | None = None
     peers: frozenset[str] = frozenset()
     concluded: dict[str, m.Concluded] = field(default_factory=dict)
@@ -61,7 +61,7 @@ class Watch:
 
     @property
     def world(self) -> m.Status | None:
-        """The world's status; of a live team that of all its drivers together."""
+        """The world's status; of a live team the sum of all its drivers' statuses."""
         if self.drivers is None:
             return self.statuses.get("world")
         there = [s for node, s in self.statuses.items() if node.startswith("source/")]
@@ -83,9 +83,7 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the final map is there: the centre's, and that of every peer that is waited
-        for.
-        """
+        """Whether the final map is there: the centre's, and that of every expected peer."""
         if self.fused is None or not self.fused.final:
             return False
         lost = {*self.fused.lost, *(name.removeprefix("robot-") for name in self.given_up)}
@@ -95,9 +93,9 @@ class Watch:
         """Take the messages that have arrived since the last call."""
         for sample in bus.receive(TURN_S):
             self._take(sample)
-            said = self._centre.of(sample) if self.peers else None
-            if said is not None:
-                self._take(said)
+            counterpart = self._centre.of(sample) if self.peers else None
+            if counterpart is not None:
+                self._take(counterpart)
 
     def _take(self, sample: Sample) -> None:
         found = ch.channel_of(sample.key)
@@ -109,7 +107,7 @@ class Watch:
             return
         if isinstance(message, m.Status):
             self.statuses[message.node] = message
-            self.heard[message.node] = time.monotonic()
+            self.last_message[message.node] = time.monotonic()
         elif isinstance(message, m.FusedMap) and channel in (ch.FUSED_MAP, ch.FINAL_MAP):
             self.fused = message if is_newer_map(message, self.fused) else self.fused
         elif isinstance(message, m.Fault):
@@ -121,7 +119,7 @@ class Watch:
             self.errors.take(channel, message)
 
     def _take_fault(self, fault: m.Fault) -> None:
-        """The first of a node is a failure by name; its status counts the rest."""
+        """Note the first fault of a node as a failure; its status counts the others."""
         named = f"{fault.node} set aside "
         if not any(failure.startswith(named) for failure in self.failures):
             what = f"{fault.origin}: {fault.error} at {fault.place}: {fault.text}"

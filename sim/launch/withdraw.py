@@ -16,7 +16,7 @@ NO_CENTRE = "no centre and no peer answers; is the team running there? see --tea
 PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
 """The channels of peers' own folds."""
 _PEER = "*"
-"""Stands among the robots that were heard of once one has said that it folds by itself."""
+"""Stands in the set of reporters once a peer has announced its own fold."""
 
 
 class WithdrawError(RuntimeError):
@@ -63,11 +63,10 @@ def withdraw(
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
 ) -> None:
-    """Order that nobody waits for a robot any more, and wait until a centre or a peer says that it
-    follows.
+    """Order that nobody waits for a robot any more, and wait until a centre or a peer confirms it.
 
     signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
-    no peer, no such robot, or no such word within the time.
+    no peer, no such robot, or no confirmation within the time.
     """
     for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
@@ -82,8 +81,8 @@ def give_up(
             if isinstance(message, m.FusedMap) and message.final:
                 return
             folds = name == "central" or name.startswith("robot/")
-            said = message.warnings if isinstance(message, m.Status) and folds else ()
-            if any(warning.startswith(f"{robot} is given up") for warning in said):
+            warnings = message.warnings if isinstance(message, m.Status) and folds else ()
+            if any(warning.startswith(f"{robot} is given up") for warning in warnings):
                 return
     raise WithdrawError(f"nobody has followed within {patience_s:g} s; the order stands")
 
@@ -91,7 +90,7 @@ def give_up(
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
     """Order a live team to end, and wait until the centre repeats the order, or a peer follows.
 
-    Raises WithdrawError where there is neither, the team has a world, or no such word within the
+    Raises WithdrawError where there is neither, the team has a world, or no confirmation within the
     time.
     """
     for channel in (ch.TEAM_END, ch.FINAL_MAP):
@@ -115,20 +114,20 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
 
 
 def await_fold(bus: Bus) -> None:
-    """Wait until a centre is alive or a peer says that it folds; raises WithdrawError where none
-    does within CENTRE_S.
+    """Wait until a centre is alive or a peer has announced its fold; raises WithdrawError where
+    none has within CENTRE_S.
     """
-    until, heard = time.monotonic() + CENTRE_S, set[str]()
+    until, reporters = time.monotonic() + CENTRE_S, set[str]()
     for channel in PEERS:
         bus.subscribe(channel)
-    while not (bus.is_alive("central") or _PEER in heard):
+    while not (bus.is_alive("central") or _PEER in reporters):
         if time.monotonic() > until:
             raise WithdrawError(NO_CENTRE)
-        _maps(bus, heard)
+        _maps(bus, reporters)
 
 
 def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
-    """Wait until a centre, or a peer, is there, and the robot has been heard of."""
+    """Wait until a centre, or a peer, is there, and a message of the robot has arrived."""
     until = time.monotonic() + CENTRE_S
     folds = False
     while time.monotonic() < until:
@@ -143,7 +142,9 @@ def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
 
 
 def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:
-    """The maps that have come; the robots that anything speaks of are noted."""
+    """The maps that have arrived; the names of all robots in arrived messages are added to
+    `robots`.
+    """
     found = []
     for channel, name, message in sound(bus.receive(LOOK_S)):
         if channel is ch.ROBOT_CONFIG:

@@ -1,7 +1,7 @@
-"""Whether robots and centre run with the configurations that the world's scenario gives them.
+"""Checks that robots and centre run with the configurations that the world's scenario gives them.
 
-Processes that were started by hand may have been given other options. What a robot or the centre
-announces is compared with the scenario, field by field.
+Processes that were started by hand may have been given other options. The announcement of each
+robot and of the centre is compared with the scenario, field by field.
 """
 
 import json
@@ -11,19 +11,19 @@ from typing import Any
 from team.wire import messages as m
 
 SHOWN = 3
-"""Fields that differ which are named; one that was given a whole other scenario has dozens."""
+"""Most differing fields that a warning names; with a whole other scenario there are dozens."""
 REMEDY = "start it again with the same scenario and options"
 
 
 class Configurations:
-    """What is to be announced, by node, and what has been.
+    """The expected configurations by node, and the announcements that have arrived.
 
-    A node's newest announcement counts. Nothing is compared when nothing is to be announced.
+    A node's newest announcement counts. Nothing is compared where nothing is expected.
     """
 
     def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
         self._expected = expected
-        self._heard: set[str] = set()
+        self._announced: set[str] = set()
         self._right: set[str] = set()
         self._mismatches: dict[str, str] = {}
 
@@ -32,7 +32,7 @@ class Configurations:
         if not self._expected:
             return
         node = announced.node
-        self._heard.add(node)
+        self._announced.add(node)
         self._mismatches.pop(node, None)
         expected = self._expected.get(node)
         if expected is None:
@@ -52,7 +52,9 @@ class Configurations:
 
     @property
     def mismatches(self) -> tuple[str, ...]:
-        """Who differs in what, and the remedy; by node."""
+        """The nodes with another configuration, the fields in which it differs, and the remedy; by
+        node.
+        """
         return tuple(self._mismatches[node] for node in sorted(self._mismatches))
 
     @property
@@ -66,8 +68,8 @@ class Configurations:
         return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 
     def unheard(self, nodes: Collection[str]) -> list[str]:
-        """Of these nodes, those whose announcement is due and has not come."""
-        return sorted((self._expected.keys() & set(nodes)) - self._heard)
+        """Those of these nodes whose announcement is expected and has not arrived."""
+        return sorted((self._expected.keys() & set(nodes)) - self._announced)
 
 
 def differences(announced: str, expected: str) -> list[str]:

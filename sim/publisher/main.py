@@ -1,4 +1,4 @@
-"""The world process: the node's shell, which publishes as long as there is credit."""
+"""The world's process: its node's shell, which publishes as long as there is credit."""
 
 import logging
 import threading
@@ -18,7 +18,7 @@ from team.wire.bus import Bus, Outgoing
 from team.wire.digest import configured
 
 PACE_S = 0.002
-"""Wait when there is nothing to publish: the clock or the credit must move first."""
+"""Wait [s] when there is nothing to publish, until the clock or the credit moves on."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -57,14 +57,14 @@ def run_world(
     if scenario.peers and not scenario.radio.is_perfect:
         reach = reach_of(scenario.radio, streams.streams)
         shell.publish([Outgoing(ch.RADIO, "", plan_of(reach))])
-    said: set[str] = set()
+    named: set[str] = set()
     while shell.going:
         out = node.publish(time.monotonic())
         shell.publish(out)
         shell.take(bus.receive(0.0 if out else PACE_S))
         for mismatch in node.configurations.mismatches:
-            if mismatch not in said:
-                said.add(mismatch)
+            if mismatch not in named:
+                named.add(mismatch)
                 _LOG.warning("%s", mismatch)
         shell.look_for_the_end()
         shell.report()
@@ -75,7 +75,7 @@ def run_world(
 
 
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
-    """What the centre and the robots of a scenario announce, by node."""
+    """The configurations that the centre and the robots of a scenario announce, by node."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
     robots = {node: configured(node, 0, 0, robot) for node, robot in nodes.items()}
     central = configured("central", 0, 0, scenario.central)

@@ -1,7 +1,8 @@
 """The world's node: publishes every robot's measurements in team time, as far as credit allows.
 
-It waits until everyone is there, never drops a measurement, and ends with the last counters. It is
-the source of the streams, so it also answers for what a receiver missed.
+It begins when every expected node is alive, never drops a measurement, and ends with the last
+counters. It is the source of the streams, so it also answers requests for measurements that a
+receiver has missed.
 """
 
 from collections import deque
@@ -28,24 +29,25 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded
 
-HELD_UP_S = 5.0
-"""A node without whose progress the world can not go on is named after so long."""
+BLOCKED_S = 5.0
+"""A node whose credit has been missing for this long [s] is named in the status."""
 RESUME_S = 2.0
-"""A world that is started again waits so long for everyone to say how far he is."""
+"""A world that is started again waits this long [s] for everyone's progress."""
 
 
 @dataclass
 class WorldNode:
-    """`begin`, then `publish` again and again until `ended`; `handle` for what comes in.
+    """Publishes the world: call `begin`, then `publish` again and again until `ended`, and `handle`
+    for each message.
 
     expected: the nodes that must be alive before the first measurement. speed: team seconds per
-    second of the shell's clock; infinite for as fast as credit allows. cache: how many of a robot's
-    last measurements can be asked for again; None: all. Who asks for older ones gets a new
-    incarnation instead: a start at an unknown pose, and measurements that count from there.
-    configurations: what the others are to announce; the world does not begin while one of them has
-    announced something else. tells_map: the robots are told the landmarks, since they only localise
-    themselves. batch_s: team time between two looks at what has come in, at the most. peers: robots
-    whose own final maps the world waits for, too, until they are all of one set.
+    second of the shell's clock; infinite for as fast as credit allows. cache: number of a robot's
+    last measurements that can be requested again; None: all. A request for an older one begins a
+    new incarnation instead: an unknown initial pose, and counters from zero. configurations: the
+    expected announcements; the world does not begin while one forbids it. tells_map: the true
+    landmarks are published for robots that only localise themselves. batch_s: most team time
+    between two readings of incoming messages. peers: robots whose own final maps the world waits
+    for, until all are of the same set.
     """
 
     streams: WorldStreams
@@ -76,8 +78,8 @@ class WorldNode:
         self._began_at: float | None = None
         self._consumed: dict[tuple[str, int], int] = {}
         self._passed_ns: dict[str, int] = {}
-        self._heard_at: float | None = None
-        self._held_up: tuple[str, float] | None = None
+        self._resumed_at: float | None = None
+        self._blocked_by: tuple[str, float] | None = None
         self._clock_s = 0.0
         self._starts: list[Outgoing] = []
         first = [int(x.stamps_ns[0]) for x in self.streams.streams if len(x)]
@@ -92,18 +94,20 @@ class WorldNode:
         ch.GIVEN_UP,
     )
     announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
-    """Listened to as well where configurations are compared."""
+    """Further channels to subscribe to where configurations are compared."""
 
     @property
     def waiting_for(self) -> list[str]:
-        """Who is not there yet, or has not said yet with which configuration."""
+        """The nodes that are not alive yet, or have not announced their configuration yet."""
         if self._began_at is not None:
             return []
         silent = self.configurations.unheard(self.expected & self._alive)
         return sorted([*(self.expected - self._alive), *silent])
 
     def begin(self) -> list[Outgoing]:
-        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
+        """The first messages: the scenario, the true landmarks for the evaluator, and the known map
+        if robots only localise themselves.
+        """
         out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
         if self.streams.landmarks is not None:
             order = np.argsort(self.streams.landmark_ids)
@@ -114,14 +118,18 @@ class WorldNode:
             )
             out.append(Outgoing(ch.TRUTH_LANDMARKS, "", truth))
             if self.tells_map:
-                told = m.KnownMap(stamp_ns=self._first_ns, ids=truth.ids, positions=truth.positions)
-                out.append(Outgoing(ch.KNOWN_MAP, "", told))
+                known = m.KnownMap(
+                    stamp_ns=self._first_ns, ids=truth.ids, positions=truth.positions
+                )
+                out.append(Outgoing(ch.KNOWN_MAP, "", known))
         for stream in self.streams.streams:
             out += for_the_evaluator(stream)
         return out
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true: credit for what never was, a final map before the end."""
+        """Why a message can not be true: credit for more than was published, a final map before the
+        end.
+        """
         match message:
             case m.Progress():
                 source = self._sources.get(message.robot)
@@ -173,13 +181,15 @@ class WorldNode:
         return []
 
     def _finish(self) -> None:
-        """The centre, if there is to be one, and every peer have their final maps.
+        """End once the centre, if one is expected, and every peer have their final maps.
 
-        Peers do without a centre: one that is not there is not waited for.
+        Peers need no centre: an absent one is not waited for.
         """
-        said = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
-        agreed = len(said) == len(self.peers) and len({each.digest for each in said}) <= 1
-        waits = self.centre and (not said or "central" in self._alive)
+        conclusions = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
+        agreed = (
+            len(conclusions) == len(self.peers) and len({each.digest for each in conclusions}) <= 1
+        )
+        waits = self.centre and (not conclusions or "central" in self._alive)
         central = self.final is not None or not waits
         self.finished = self.finished or (agreed and central)
 
@@ -196,7 +206,9 @@ class WorldNode:
             source.consumed = max(source.consumed, source.published)
 
     def _note_consumed(self, progress: m.Progress) -> None:
-        """What robots say before this world has begun is of an earlier life of it."""
+        """Note the progress that robots report before this process has begun: that of an earlier
+        process.
+        """
         stream = (progress.robot, progress.incarnation)
         if progress.robot in self._sources:
             self._consumed[stream] = max(self._consumed.get(stream, 0), progress.measurements)
@@ -214,22 +226,24 @@ class WorldNode:
             self._finish()
 
     def _going_on(self, clock_s: float) -> bool:
-        """Whether an earlier life of this world had begun, and it is known how far everyone is.
+        """Whether an earlier process had begun the world, and everyone's progress is known.
 
-        Robots and recorder report their progress again to whoever comes; the streams are the same
-        for the same scenario, so this life goes on from the least that everybody has, in the same
-        incarnations. What someone has already he drops, what he misses he asks for.
+        Robots and recorder report their progress again to a new world. The streams are the same for
+        the same scenario, so this process continues from the least progress, in the same
+        incarnations. A receiver drops what it has already, and requests what it lacks.
         """
         if not self._consumed:
             return False
-        if self._heard_at is None:
-            self._heard_at = clock_s
+        if self._resumed_at is None:
+            self._resumed_at = clock_s
         robots = {ch.robot_node(name) for name in self._sources}
         waiting = self.waiting_for and robots - {ch.robot_node(n) for n, _ in self._consumed}
-        return not waiting or clock_s - self._heard_at >= RESUME_S
+        return not waiting or clock_s - self._resumed_at >= RESUME_S
 
     def _skip(self) -> list[Outgoing]:
-        """Leave out what everybody has; the starts once more, for a centre that comes later."""
+        """Leave out the measurements that everyone has; returns the initial poses once more, for a
+        centre that starts later.
+        """
         starts = []
         for name, source in self._sources.items():
             incarnation = max(
@@ -251,19 +265,19 @@ class WorldNode:
             if source.published and source.stream.truth_ns is not None:
                 at_ns = int(source.stream.stamps_ns[source.published - 1]) - TRUTH_BATCH_NS
                 source.truth_sent = int(np.searchsorted(source.stream.truth_ns, at_ns))
-        kept = [(r, i) for r, i in self._order if i >= self._sources[self._names[r]].published]
-        self._order = deque(kept)
+        remaining = [(r, i) for r, i in self._order if i >= self._sources[self._names[r]].published]
+        self._order = deque(remaining)
         self._published = sum(source.published for source in self._sources.values())
         self._unrecorded = self._published - sum(self._recorded.values())
-        if kept:
-            robot, index = kept[0]
+        if remaining:
+            robot, index = remaining[0]
             self._paced_ns = int(self._sources[self._names[robot]].stream.stamps_ns[index])
         return starts
 
     @property
     def _out_of_reach(self) -> int:
-        """Measurements that nobody can ask for any more: a recorder that comes late never has
-        them.
+        """Number of measurements that can not be requested any more: a recorder that starts later
+        never gets them.
         """
         if self.cache is None:
             return 0
@@ -271,7 +285,7 @@ class WorldNode:
 
     @property
     def unrecorded(self) -> int:
-        """Measurements that a living recorder still lacks by its own word."""
+        """Number of measurements that a living recorder still lacks by its own progress."""
         if not self._recorder:
             return 0
         return self._published - self._unrecorded - sum(self._recorded.values())
@@ -299,17 +313,17 @@ class WorldNode:
             if stamp_ns >= until_ns:
                 break
             if stamp_ns > horizon:
-                self._held_up = None
+                self._blocked_by = None
                 break
             if (who := self._without_credit(source)) is not None:
-                before = self._held_up
-                self._held_up = before if before and before[0] == who else (who, clock_s)
+                before = self._blocked_by
+                self._blocked_by = before if before and before[0] == who else (who, clock_s)
                 self._clock_s = clock_s
                 break
-            self._held_up = None
+            self._blocked_by = None
             self._order.popleft()
             self.now_ns = max(self.now_ns, stamp_ns)
-            out.append(source.said(index))
+            out.append(source.outgoing(index))
             source.published = index + 1
             self._published += 1
             out += source.truth(stamp_ns)
@@ -327,7 +341,9 @@ class WorldNode:
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _without_credit(self, source: Source) -> str | None:
-        """Who has to get on before the next measurement of this robot; None: nobody."""
+        """The node whose progress is required before the next measurement of this robot; None: no
+        one's.
+        """
         if source.alive and source.published - source.consumed >= CREDIT_MEASUREMENTS:
             return ch.robot_node(source.stream.robot)
         return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
@@ -343,8 +359,8 @@ class WorldNode:
         return m.End(stamp_ns=self.now_ns, streams=ends, notes=tuple(notes))
 
     def measurements(self, request: bytes) -> Iterable[bytes]:
-        """The answer to `MeasurementsRequest`: the published measurements asked for, ANSWER at
-        most.
+        """The answer to a `MeasurementsRequest`: the published measurements that it asks for,
+        ANSWER at most.
         """
         requested = decoded(request, m.MeasurementsRequest)
         source = self._sources.get(requested.robot)
@@ -356,11 +372,11 @@ class WorldNode:
                 self._begin_incarnation(source)
                 return []
             first = source.counter - self.cache
-        kept = msgspec.structs.replace(requested, first=first)
-        return answered(kept, source.counter, lambda n: source.message(source.base + n))
+        within_cache = msgspec.structs.replace(requested, first=first)
+        return answered(within_cache, source.counter, lambda n: source.message(source.base + n))
 
     def _begin_incarnation(self, source: Source) -> None:
-        """The stream can not be continued where the robot is: it begins anew at a free pose."""
+        """Begin the stream anew at an unknown pose, where it can not be continued."""
         source.incarnation += 1
         source.base = source.published - 1
         source.consumed = source.base
@@ -368,7 +384,7 @@ class WorldNode:
         self._starts.append(Outgoing(ch.START, source.stream.robot, start))
 
     def status(self) -> m.Status:
-        """How far the world is, for people."""
+        """The progress of the world, for people."""
         total = self._published + len(self._order)
         figures = {
             "measurements": float(self._published),
@@ -378,8 +394,8 @@ class WorldNode:
         waiting = self.waiting_for
         state = "publishing" if self._began_at is not None else "waiting"
         warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
-        if self._held_up is not None and self._clock_s - self._held_up[1] >= HELD_UP_S:
-            who, since = self._held_up
+        if self._blocked_by is not None and self._clock_s - self._blocked_by[1] >= BLOCKED_S:
+            who, since = self._blocked_by
             warnings = (
                 f"{who} holds the team up: it has got no further for {self._clock_s - since:.0f} s",
             )
@@ -393,6 +409,6 @@ class WorldNode:
 
 
 def expected_nodes(robots: Sequence[str], *, recorder: bool, centre: bool = True) -> frozenset[str]:
-    """Who must be alive before the world begins."""
+    """The nodes that must be alive before the world begins."""
     nodes = {ch.robot_node(robot) for robot in robots} | ({"central"} if centre else set())
     return frozenset(nodes | {"recorder"} if recorder else nodes)

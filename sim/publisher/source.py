@@ -45,16 +45,16 @@ class Source:
 
     @property
     def counter(self) -> int:
-        """Measurements published in this incarnation."""
+        """Number of measurements that were published in this incarnation."""
         return self.published - self.base
 
-    def said(self, index: int) -> Outgoing:
+    def outgoing(self, index: int) -> Outgoing:
         """The measurement at `index` of the whole stream, on its channel."""
         channel = _CHANNEL_OF_KIND[int(self.stream.kinds[index])]
         return Outgoing(channel, self.stream.robot, self.message(index))
 
     def message(self, index: int) -> m.Measurement:
-        """The measurement at `index` of the whole stream, as this incarnation counts it."""
+        """The measurement at `index` of the whole stream, numbered as in this incarnation."""
         stream, kind = self.stream, self.stream.kinds[index]
         stamp_ns = int(stream.stamps_ns[index])
         name = Name(
@@ -74,7 +74,7 @@ class Source:
         return _start(stream.start, name)
 
     def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:
-        """The true poses up to a time that are not said yet, once they span `batch_ns`."""
+        """The true poses up to a time that are not published yet, once they span `batch_ns`."""
         stream = self.stream
         if stream.truth is None or stream.truth_ns is None:
             return []
@@ -106,7 +106,7 @@ def _start(start: s.StartPose | None, name: Name) -> m.InitialPose:
 def _observations(
     z: s.ObservationMeasurement, name: Name
 ) -> m.Observations | m.Points | m.Detections:
-    """A scan as its sensor tells it: without identities, as points, as ranges and bearings."""
+    """A scan in its sensor's form: without identities, as points, or as ranges and bearings."""
     covariances = b"" if z.covariances is None else from_floats(z.covariances)
     if z.hidden:
         return m.Detections(
@@ -141,32 +141,34 @@ def _sightings(t: s.SightingMeasurement, name: Name) -> m.Sightings:
     )
 
 
-def _odometry(told: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
-    """One interval as the odometry tells it."""
-    if told.increment is not None:
+def _odometry(odometry: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
+    """One interval in its odometry's form."""
+    if odometry.increment is not None:
         return m.Increment(
             **name,
-            duration_ns=told.duration_ns,
-            increment=from_floats(told.increment),
-            covariance=b"" if told.covariance is None else from_floats(told.covariance),
+            duration_ns=odometry.duration_ns,
+            increment=from_floats(odometry.increment),
+            covariance=b"" if odometry.covariance is None else from_floats(odometry.covariance),
         )
-    if told.steered:
+    if odometry.steered:
         return m.Steering(
             **name,
-            duration_ns=told.duration_ns,
-            wheel_speed=told.forward,
-            steering=told.yaw_rate,
+            duration_ns=odometry.duration_ns,
+            wheel_speed=odometry.forward,
+            steering=odometry.yaw_rate,
         )
     return m.Odometry(
         **name,
-        duration_ns=told.duration_ns,
-        forward=told.forward,
-        yaw_rate=told.yaw_rate,
+        duration_ns=odometry.duration_ns,
+        forward=odometry.forward,
+        yaw_rate=odometry.yaw_rate,
     )
 
 
 def for_the_evaluator(stream: RobotStream) -> list[Outgoing]:
-    """The true identities of what is told without, and where another sensor says the robot was."""
+    """The true identities of unidentified detections, and the path that another sensor (GPS)
+    measured.
+    """
     out, seen, first_ns = [], stream.landmark_detections, int(stream.stamps_ns[0])
     if seen.hidden is not None and seen.hidden.any():
         rows = np.repeat(seen.hidden, np.diff(seen.offsets))

@@ -35,7 +35,7 @@ class RadioBus:
         self._radio = radio
         self._reach = reach
         self._done = False
-        self._held: list[tuple[float, int, Sample]] = []
+        self._in_flight: list[tuple[float, int, Sample]] = []
         self._count = 0
         self._busy: dict[str, float] = {}
         self._tokens: dict[str, bool] = {}
@@ -83,14 +83,14 @@ class RadioBus:
     def answer(self, channel: ch.Channel, name: str, answer: Answer) -> None:
         """Answer; a question from out of reach has not been heard."""
 
-        def heard(request: bytes) -> Iterable[bytes]:
+        def answer_in_reach(request: bytes) -> Iterable[bytes]:
             if channel is ch.MEMBERS:
                 asker = ch.robot_of(decoded(request, m.MembersRequest).node)
                 if asker is not None and not self._reaches(asker, self._now_ns):
                     return []
             return answer(request)
 
-        self._bus.answer(channel, name, heard)
+        self._bus.answer(channel, name, answer_in_reach)
 
     def receive(self, timeout_s: float) -> list[Sample]:
         """What the radio lets through, and who has come into reach or left it."""
@@ -99,21 +99,21 @@ class RadioBus:
             found = ch.channel_of(sample.key)
             if found is not None and found[0] is ch.RADIO:
                 self._reach = reach_in(sample.payload) or self._reach
-            elif found is None or (by := self._said_by(*found)) is None:
+            elif found is None or (by := self._sender(*found)) is None:
                 through.append(sample)
             elif found[0] is ch.ALIVE:
                 self._note(by, sample)
             else:
                 self._carry(by, sample, through)
         now_s = time.monotonic()
-        while self._held and self._held[0][0] <= now_s:
-            through.append(heapq.heappop(self._held)[-1])
-        heard = [*self._changes(), *through]
-        if self.tap is not None and heard:
-            self.tap(heard)
-        return heard
+        while self._in_flight and self._in_flight[0][0] <= now_s:
+            through.append(heapq.heappop(self._in_flight)[-1])
+        received = [*self._changes(), *through]
+        if self.tap is not None and received:
+            self.tap(received)
+        return received
 
-    def _said_by(self, channel: ch.Channel, name: str) -> str | None:
+    def _sender(self, channel: ch.Channel, name: str) -> str | None:
         """The other robot that says something by radio; None: it is not by radio, or our own."""
         if channel.name not in _RADIO:
             return None
@@ -134,7 +134,7 @@ class RadioBus:
             through.append(sample)
             return
         self._count += 1
-        heapq.heappush(self._held, (time.monotonic() + wait_s, self._count, sample))
+        heapq.heappush(self._in_flight, (time.monotonic() + wait_s, self._count, sample))
 
     def _reaches(self, other: str, at_ns: int) -> bool:
         reach = self._reach

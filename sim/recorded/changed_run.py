@@ -37,21 +37,21 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
     asked = {*changes.without, *(r for robots, _ in changes.partitions for r in robots)}
     for name in sorted(asked - set(names)):
         raise ScenarioError(f"no robot {name} in the log; there are {', '.join(names)}")
-    kept = tuple(robot for robot in scenario.robots if robot.id not in changes.without)
-    if not kept:
+    robots = tuple(robot for robot in scenario.robots if robot.id not in changes.without)
+    if not robots:
         raise ScenarioError("a team without robots has nothing to compute")
     front = {"particles": changes.particles, "window_s": changes.window_s}
     front = {name: value for name, value in front.items() if value is not None}
     noise = dict(changes.noise)
-    kept = tuple(
+    robots = tuple(
         with_noise(
             msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, **front)),
             noise,
         )
-        for r in kept
+        for r in robots
     )
     changed = with_options(
-        msgspec.structs.replace(scenario, robots=kept),
+        msgspec.structs.replace(scenario, robots=robots),
         seed=changes.seed,
         estimator=changes.estimator,
         fusion=changes.fusion,

@@ -33,12 +33,12 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
     """
     log = open_log(path)
     messages = [opened(sample)[2] for sample in log.samples(CHANNELS)]
-    told = [each.configuration for each in messages if isinstance(each, m.Configuration)]
+    configurations = [each.configuration for each in messages if isinstance(each, m.Configuration)]
     by_recorder = log.metadata.get("scenario")  # of a team without a world
-    told = told or ([] if by_recorder is None else [by_recorder])
-    if not told:
+    configurations = configurations or ([] if by_recorder is None else [by_recorder])
+    if not configurations:
         raise ScenarioError(f"{path}: the log does not say the world's scenario")
-    scenario = loads(told[-1])
+    scenario = loads(configurations[-1])
     clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
     return recorded_streams(messages, path.name, clocks), scenario
 
@@ -111,8 +111,8 @@ def _one_kind(robot: str, messages: Sequence[m.Message]) -> type[m.Message] | No
     """The class of all of these messages; raises ValueError where they differ."""
     kinds = {type(each) for each in messages}
     if len(kinds) > 1:
-        told = " and ".join(sorted(kind.__name__ for kind in kinds))
-        raise ValueError(f"{robot}: its stream has {told}; one form is needed")
+        names = " and ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"{robot}: its stream has {names}; one form is needed")
     return kinds.pop() if kinds else None
 
 
@@ -123,14 +123,14 @@ def _intervals(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: fl
     durations = np.array([each.duration_ns for each in odometry], dtype=np.int64)
     kind = _one_kind(robot, odometry)
     if kind is m.Increment:
-        told = [each for each in odometry if isinstance(each, m.Increment)]
-        increments = np.array([floats(each.increment, "increment") for each in told])
-        claims = {bool(each.covariance) for each in told}
+        given = [each for each in odometry if isinstance(each, m.Increment)]
+        increments = np.array([floats(each.increment, "increment") for each in given])
+        claims = {bool(each.covariance) for each in given}
         if len(claims) > 1:
             raise ValueError(f"{robot}: only some of its increments have a covariance")
         if not claims.pop():
             return moved(ends, durations, increments)
-        matrices = np.array([floats(each.covariance, "covariance") for each in told])
+        matrices = np.array([floats(each.covariance, "covariance") for each in given])
         return moved(ends, durations, increments, matrices.reshape(-1, 3, 3))
     pairs = np.array([
         (each.wheel_speed, each.steering)
@@ -153,8 +153,8 @@ def _observations(robot: str, messages: Sequence[m.AnyScan]) -> Detections:
     none = np.empty(0)
     points = claimed = None
     if kind is m.Points:
-        told = [floats(x.positions, "positions") for x in messages if isinstance(x, m.Points)]
-        points = np.concatenate([none, *told]).reshape(-1, 2)
+        given = [floats(x.positions, "positions") for x in messages if isinstance(x, m.Points)]
+        points = np.concatenate([none, *given]).reshape(-1, 2)
     claims = {bool(messages[k].covariances) for k in full}
     if len(claims) > 1:
         raise ValueError(f"{robot}: only some of its observations have covariances")

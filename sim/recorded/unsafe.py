@@ -63,15 +63,15 @@ def _seen_from_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
 
     l' = R(θ)ᵀ (l − p), with its Jacobian.
     """
-    kept = np.flatnonzero(np.isin(whole.ids, ids))
-    if not len(kept):
+    chosen = np.flatnonzero(np.isin(whole.ids, ids))
+    if not len(chosen):
         return initial_map(np.zeros(3), None)
     x, y, heading = whole.mean[:3]
     c, s = np.cos(heading), np.sin(heading)
     turn = np.array([[c, s], [-s, c]])
-    J = np.zeros((3 + 2 * len(kept), len(whole.mean)))
+    J = np.zeros((3 + 2 * len(chosen), len(whole.mean)))
     mean = np.zeros(len(J))
-    for row, k in enumerate(kept):
+    for row, k in enumerate(chosen):
         rows, columns = slice(3 + 2 * row, 5 + 2 * row), slice(3 + 2 * k, 5 + 2 * k)
         offset = whole.mean[columns] - (x, y)
         mean[rows] = turn @ offset
@@ -79,4 +79,4 @@ def _seen_from_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
         J[rows, 2] = np.array([[-s, c], [-c, -s]]) @ offset
         J[rows, columns] = turn
     covariance = J @ whole.covariance @ J.T
-    return WholeMap(whole.ids[kept], mean, 0.5 * (covariance + covariance.T))
+    return WholeMap(whole.ids[chosen], mean, 0.5 * (covariance + covariance.T))

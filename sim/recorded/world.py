@@ -38,7 +38,7 @@ class RecordedWorld:
 
     def __init__(self, log: Samples, without: Collection[str] = ()) -> None:
         self._configured: m.Configuration | None = None
-        self._said: list[Outgoing] = []
+        self._outgoing: list[Outgoing] = []
         self._notes: tuple[str, ...] = ()
         published: dict[tuple[str, int, int], tuple[int, Outgoing]] = {}
         truths: list[tuple[int, Outgoing]] = []
@@ -57,9 +57,9 @@ class RecordedWorld:
                 case m.Truth():
                     truths.append((message.stamp_ns, Outgoing(channel, name, message)))
                 case m.TruthLabels() | m.TruthPositions() if name not in without:
-                    self._said.append(Outgoing(channel, name, message))
+                    self._outgoing.append(Outgoing(channel, name, message))
                 case m.TruthLandmarks():
-                    self._said.append(Outgoing(channel, "", message))
+                    self._outgoing.append(Outgoing(channel, "", message))
                 case m.Configuration():
                     self._configured = message
                 case m.End():
@@ -84,21 +84,21 @@ class RecordedWorld:
     def announce(self, scenario: Scenario) -> None:
         """The scenario that `begin` will name; raises RerunError if it needs a map there is not."""
         if scenario.estimator in NEEDS_MAP:
-            truth = [o.message for o in self._said if isinstance(o.message, m.TruthLandmarks)]
+            truth = [o.message for o in self._outgoing if isinstance(o.message, m.TruthLandmarks)]
             if not truth:
                 raise RerunError(
                     f"the estimator {scenario.estimator} needs a map of the landmarks, "
                     "and the log has none"
                 )
-            told = m.KnownMap(
+            known = m.KnownMap(
                 stamp_ns=truth[0].stamp_ns, ids=truth[0].ids, positions=truth[0].positions
             )
-            self._said.append(Outgoing(ch.KNOWN_MAP, "", told))
-        self._said.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
+            self._outgoing.append(Outgoing(ch.KNOWN_MAP, "", known))
+        self._outgoing.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
 
     def begin(self) -> list[Outgoing]:
         """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
-        return self._said
+        return self._outgoing
 
     def publish(self, clock_s: float) -> list[Outgoing]:
         """The next STEP_NS of team time; with the last of them the end."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
-SAID_ONCE = ("seed", "estimator", "fusion")
+TOP_LEVEL = ("seed", "estimator", "fusion")
 """Fields of robots and centre that the scenario has once, at its top, for all of them."""
 
 _IN_WORDS = {
@@ -54,7 +54,7 @@ def check_known(name: str, known: list[str], at: str) -> None:
     where = f"at {at}" if at else "at the top"
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"; did you mean `{close[0]}`?" if close else ""
-    if name in SAID_ONCE:
+    if name in TOP_LEVEL:
         hint = f"; `{name}` is said once for the whole team, at the top of the file"
     raise ScenarioError(f"unknown field `{name}` {where}; known: {', '.join(known)}{hint}")
 
@@ -76,4 +76,4 @@ def _is_struct(declared: Any) -> bool:
 
 def _here(name: str, at: str) -> bool:
     """The known fields; those that the scenario has once are known at the top only."""
-    return not at or name not in SAID_ONCE
+    return not at or name not in TOP_LEVEL

@@ -175,8 +175,8 @@ def _kind_of(path: str, otherwise: str) -> str:
 
 def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
     """The robots that the data set has; where it has none of them, its own after their pattern."""
-    kept = [robot for robot in robots if robot["id"] in names]
-    return kept or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
+    chosen = [robot for robot in robots if robot["id"] in names]
+    return chosen or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
 
 
 def dumps(scenario: Scenario) -> str:

@@ -78,15 +78,15 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     else:
         with opened(world.path, UTIAS_MARKER) as files:
             present = {f"r{number}" for number in present_robots(files)}
-    kept = tuple(robot for robot in scenario.robots if robot.id in present)
+    remaining = tuple(robot for robot in scenario.robots if robot.id in present)
     missing = [robot.id for robot in scenario.robots if robot.id not in present]
-    if not kept or not missing:
+    if not remaining or not missing:
         return scenario, None
     named = (name for name in world.unknown_starts if name.removeprefix("!") not in missing)
     world = msgspec.structs.replace(world, unknown_starts=tuple(named))
-    team = ", ".join(robot.id for robot in kept)
-    said = f"{', '.join(missing)}: no files in {Path(world.path).name}; the team is {team}"
-    return msgspec.structs.replace(scenario, robots=kept, world=world), said
+    team = ", ".join(robot.id for robot in remaining)
+    note = f"{', '.join(missing)}: no files in {Path(world.path).name}; the team is {team}"
+    return msgspec.structs.replace(scenario, robots=remaining, world=world), note
 
 
 def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:

@@ -6,7 +6,7 @@ import msgspec
 import tomli_w
 
 from central.config import CentralConfig
-from sim.scenarios.checks import SAID_ONCE
+from sim.scenarios.checks import TOP_LEVEL
 from sim.scenarios.scenario import Scenario
 from sim.world.config import UtiasWorld, starts_unknown
 from team.config import RobotConfig
@@ -17,29 +17,29 @@ def data_set_scenario(scenario: Scenario) -> str:
 
     The robots are called r1, r2, … as in every UTIAS world. What is as by default is left out.
     """
-    head = {name: getattr(scenario, name) for name in ("name", *SAID_ONCE, "exchange")}
+    head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
     robots = [
-        {"id": f"r{i}"} | _chosen(robot, RobotConfig, ("id", *SAID_ONCE))
+        {"id": f"r{i}"} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
         for i, robot in enumerate(scenario.robots, 1)
     ]
     world = {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ())
-    central = _chosen(scenario.central, CentralConfig, SAID_ONCE)
+    central = _chosen(scenario.central, CentralConfig, TOP_LEVEL)
     document = head | {"world": world} | ({"central": central} if central else {})
     return tomli_w.dumps(document | {"robots": robots})
 
 
 def folder_scenario(scenario: Scenario) -> str:
     """The same robots and centre for the folder of CSV tables where this text lies."""
-    head = {name: getattr(scenario, name) for name in ("name", *SAID_ONCE, "exchange")}
+    head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
     robots = [
-        {"id": robot.id} | _chosen(robot, RobotConfig, ("id", *SAID_ONCE))
+        {"id": robot.id} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
         for robot in scenario.robots
     ]
     world: dict[str, Any] = {"kind": "folder", "path": "."}
     unknown = [robot.id for robot in scenario.robots if starts_unknown(scenario.world, robot.id)]
     if unknown:
         world["unknown_starts"] = unknown
-    central = _chosen(scenario.central, CentralConfig, SAID_ONCE)
+    central = _chosen(scenario.central, CentralConfig, TOP_LEVEL)
     document = head | {"world": world} | ({"central": central} if central else {})
     return tomli_w.dumps(document | {"robots": robots})
 

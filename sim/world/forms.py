@@ -1,7 +1,8 @@
 """Further forms of a simulated robot's measurements.
 
-Odometry as motions on SE(2), with or without a covariance, or as a car's encoders; landmarks as
-points, each with a covariance of its own. The formulas are written here, not taken from the filter.
+Odometry as motions on SE(2), with or without a covariance, or as a car's encoder values; landmarks
+as points, each with a covariance of its own. The formulas are written here, not taken from the
+filter.
 """
 
 import numpy as np
@@ -14,11 +15,11 @@ from team.config import MotionModel, Sensor
 Rows = Float[np.ndarray, "K 3"]
 
 LARGEST_CORRELATION = 0.8
-"""Of what a measurement with a covariance of its own tells, at most so much to either side."""
+"""Largest absolute correlation of range and bearing in a measurement's own covariance."""
 
 
 def seen_from(poses: Rows, mount: tuple[float, float, float]) -> Rows:
-    """Where a sensor is that is mounted there on a base at these poses."""
+    """The poses of a sensor that is mounted at `mount` on a base at these poses."""
     x, y, heading = mount
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return np.column_stack([
@@ -31,7 +32,7 @@ def _turned(xy: Float[np.ndarray, "K 2"], angle: Column) -> Float[np.ndarray, "K
     return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
 
 
-def increments_told(
+def measured_increments(
     motion: MotionModel,
     poses: Float[np.ndarray, "K_plus_1 3"],
     steps: Float[np.ndarray, "K 2"],
@@ -39,10 +40,12 @@ def increments_told(
     normals: Rows,
     correlation: float,
 ) -> tuple[Rows, Float[np.ndarray, "K 3 3"]]:
-    """Each motion between two true poses with an error, and the error's covariance.
+    """The measured motion between consecutive true poses, and the covariance of its error.
 
-    truth = told moved on by (f, l, φ) at constant twist, at the told motion's end. f, l and φ have
-    the standard deviations of the model's forward, lateral and turn; l and φ the correlation.
+        true motion = measured motion ∘ Exp(f, l, φ)
+
+    with a constant twist in the frame of the measured end. f, l and φ have the standard deviations
+    of the model's forward, lateral and turn; l and φ have the given correlation.
     """
     before, after = poses[:-1], poses[1:]
     true_turn = after[:, 2] - before[:, 2]
@@ -54,17 +57,19 @@ def increments_told(
     left = correlation * sigmas[:, 1] * normals[:, 2] + shares * left
     half = np.sinc(0.5 * turn / np.pi)
     moved = half[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
-    told_turn = true_turn - turn
-    told = there - _turned(moved, told_turn)
-    angle = np.mod(told_turn + np.pi, 2.0 * np.pi) - np.pi
+    measured_turn = true_turn - turn
+    measured = there - _turned(moved, measured_turn)
+    angle = np.mod(measured_turn + np.pi, 2.0 * np.pi) - np.pi
     C = np.zeros((len(turn), 3, 3))
     C[:, range(3), range(3)] = sigmas**2
     C[:, 1, 2] = C[:, 2, 1] = correlation * sigmas[:, 1] * sigmas[:, 2]
-    return np.column_stack([told, angle]), C
+    return np.column_stack([measured, angle]), C
 
 
-def steering_told(motion: MotionModel, forward: Column, yaw_rate: Column) -> tuple[Column, Column]:
-    """What a car's encoders read at these speeds: (wheel speed [m/s], steering angle [rad]).
+def measured_steering(
+    motion: MotionModel, forward: Column, yaw_rate: Column
+) -> tuple[Column, Column]:
+    """The encoder values of a car at these speeds: (wheel speed [m/s], steering angle [rad]).
 
     The base turns about a point forward/yaw_rate to its left, on the line of the rear axle.
     """
@@ -85,8 +90,8 @@ def claimed(
 ) -> Float[np.ndarray, "V 3"]:
     """Covariances of measurements, each of its own size and direction.
 
-    Its two standard deviations are factors between `sizes` of the sensor's: of range and bearing,
-    correlated at random; of points range_sigma along both of two axes of any direction.
+    The two standard deviations are the sensor's times factors between `sizes`: of range and bearing
+    with a random correlation; of points range_sigma along two orthogonal axes of random direction.
     """
     low, high = sizes
     first, second = (low + (high - low) * uniform[:, :2]).T
@@ -105,7 +110,9 @@ def with_errors(
     covariances: Float[np.ndarray, "V 3"],
     normals: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, "V 2"]:
-    """Pairs of numbers with errors of these covariances, by the rows of their Cholesky factors."""
+    """Pairs of numbers with errors of these covariances added, by the rows of their Cholesky
+    factors.
+    """
     xx, xy, yy = covariances.T
     first = np.sqrt(xx)
     across = xy / first

@@ -1,4 +1,4 @@
-"""Worlds without identities: they are hidden, detections are missed, and clutter is added.
+"""Worlds without identities: identities are hidden, detections are missed, and clutter is added.
 
 The stream keeps the true identities for the evaluation; they are not published.
 """
@@ -46,10 +46,10 @@ def _hidden(
 ) -> RobotStream:
     seen = stream.landmark_detections
     message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
-    kept = rng.random(len(seen.ids)) >= hiding.missed
+    detected = rng.random(len(seen.ids)) >= hiding.missed
     named = np.isin(seen.ids, tagged)
-    parts = [_rows(seen, message, kept & named, hidden=False)] if len(tagged) else []
-    untagged = _rows(seen, message, kept & ~named, hidden=True)
+    parts = [_rows(seen, message, detected & named, hidden=False)] if len(tagged) else []
+    untagged = _rows(seen, message, detected & ~named, hidden=True)
     if hiding.clutter:
         untagged = _with_clutter(untagged, hiding, rng)
     both = in_order([*parts, untagged])
@@ -64,7 +64,7 @@ def _rows(
     *,
     hidden: bool,
 ) -> Detections:
-    """Every message with the chosen of its rows."""
+    """Every message with the chosen of its rows only."""
     count = len(seen.stamps_ns)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(message[chosen], minlength=count))))
     was = seen.hidden
@@ -111,7 +111,7 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
 
 
 def in_order(parts: list[Detections]) -> Detections:
-    """The messages of all by time; at one time those with names first."""
+    """The messages of all parts by time; at equal times those with identities first."""
     if len(parts) == 1:
         return parts[0]
     stamps = np.concatenate([part.stamps_ns for part in parts])

@@ -1,4 +1,4 @@
-"""Landmarks that are hard to tell apart: twins, and rooms that are all alike."""
+"""Landmarks that are hard to distinguish: twins, and rooms with the same pattern."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,11 +6,13 @@ from jaxtyping import Float
 from sim.world.config import SimulatedWorld
 
 INNER = 0.1
-"""No landmark is nearer to a wall than this part of a room's side."""
+"""Least distance of a landmark from a wall, as a part of a room's side."""
 
 
 def laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
-    """landmark_count points of the square; in rooms, as many as are alike in all of them."""
+    """landmark_count points of the square; with rooms, the largest number below that gives each
+    room as many.
+    """
     if world.layout == "twins":
         return _twins(world, rng)
     side = world.size_m / world.rooms

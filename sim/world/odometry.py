@@ -1,6 +1,6 @@
 """Simulated odometry of a true step, and the slip that it does not measure.
 
-A step is a pair (distance [m], turn [rad]). The odometry is the true step with the noise of the
+A step is a pair (distance [m], rotation [rad]). The odometry is the true step with the noise of the
 robot's motion model, converted back through its calibration. The formulas are written from the
 sources, not taken from the filter.
 """
@@ -14,7 +14,7 @@ Column = Float[np.ndarray, " K"]
 
 
 def deviation(noise: MotionNoise, seconds: Column, steps: Float[np.ndarray, "K 2"]) -> Column:
-    """σ = √(per_s² t + per_m² |distance| + per_rad² |turn|) of one noise in each step."""
+    """σ = √(per_s² t + per_m² |distance| + per_rad² |rotation|) of one noise in each step."""
     distance, turn = np.abs(steps).T
     per_s, per_m, per_rad = noise.per_s, noise.per_m, noise.per_rad
     variance = per_s**2 * seconds + per_m**2 * distance + per_rad**2 * turn
@@ -22,20 +22,20 @@ def deviation(noise: MotionNoise, seconds: Column, steps: Float[np.ndarray, "K 2
     return sigma
 
 
-def told(
+def measured_speeds(
     motion: MotionModel,
     steps: Float[np.ndarray, "K 2"],
     seconds: Column,
     normals: Float[np.ndarray, "K 2"],
     wheel_normals: Float[np.ndarray, "K 2"],
 ) -> tuple[Column, Column]:
-    """Forward speed [m/s] and yaw rate [rad/s] that are logged for the true steps.
+    """Forward speed [m/s] and yaw rate [rad/s] that the odometry measures in the true steps.
 
-    The noises of forward and turn add to the way and the turn; those of the wheels to each wheel's
-    way, of which the two are made again. With the noisy d and φ, φ = ω t + veer·d and
-    |d| = (|v| − turn_drag·|ω|)·t give ω and v; the scales divide them.
+    The noises of forward and turn are added to translation d and rotation φ; those of the wheels to
+    the path of each wheel, from which d and φ are computed again. The noisy d and φ give ω and v by
+    φ = ω t + veer·d and |d| = (|v| − turn_drag·|ω|)·t; they are divided by the scales.
     """
-    of_way, of_turn, _ = _held(motion, steps, seconds)
+    of_way, of_turn, _ = _interval_deviations(motion, steps, seconds)
     forward = np.hypot(deviation(motion.forward, seconds, steps), of_way)
     turn = np.hypot(deviation(motion.turn, seconds, steps), of_turn)
     if motion.shares is not None:
@@ -56,9 +56,11 @@ def told(
 def slip(
     motion: MotionModel, step: tuple[float, float], seconds: float, normals: Float[np.ndarray, "2"]
 ) -> tuple[float, float]:
-    """The turn [rad] and the slip to the left [m] after a step, which odometry does not measure."""
+    """The final rotation [rad] and the slip to the left [m] of a step, which odometry does not
+    measure.
+    """
     steps, duration = np.array([step]), np.array([seconds])
-    _, _, of_turn = _held(motion, steps, duration)
+    _, _, of_turn = _interval_deviations(motion, steps, duration)
     turn = np.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
     left = deviation(motion.lateral, duration, steps) * normals[1]
     if motion.shares is not None:
@@ -69,13 +71,14 @@ def slip(
     return turn.item(), left.item()
 
 
-def _held(
+def _interval_deviations(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of way, turn and final turn by Ma & Ma's α: errors of v, ω, γ, each held for an interval T.
+    """σ of translation, rotation and final rotation by Ma & Ma's α: errors of v, ω, γ, each
+    constant over an interval T.
 
-    In T the way errs by ε T with var ε = α₁v² + α₂ω². A step of t has t/T such intervals, each with
-    an error of its own: var = (α₁v² + α₂ω²) T² t/T.
+    In T the translation errs by ε T with var ε = α₁v² + α₂ω². A step of t has t/T such intervals,
+    each with an error of its own: var = (α₁v² + α₂ω²) T² t/T.
     """
     if motion.alphas is None:
         return (np.zeros(len(steps)),) * 3
@@ -91,9 +94,10 @@ def _held(
 def _of_the_way(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of forward, lateral and heading that are shares of the way, each held for an interval T.
+    """σ of forward, lateral and heading errors that are shares of the path, each constant over an
+    interval T.
 
-    A step of t has t/T such intervals: σ² = (share · way in T)² t/T.
+    A step of t has t/T such intervals: σ² = (share · path in T)² t/T.
     """
     assert motion.shares is not None
     in_interval = np.abs(steps[:, 0]) / seconds * motion.shares_interval_s
@@ -108,7 +112,9 @@ def _wheel_errors(
     steps: Float[np.ndarray, "K 2"],
     normals: Float[np.ndarray, "K 2"],
 ) -> tuple[Column, Column]:
-    """What the left and the right wheel tell too much [m]: σ = noise √|way| of each wheel's way."""
+    """The errors [m] of the left and the right wheel's measured path: σ = noise √|path| of each
+    wheel.
+    """
     distance, turn = steps.T
     left, right = distance - 0.5 * base * turn, distance + 0.5 * base * turn
     return (

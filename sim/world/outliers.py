@@ -1,8 +1,7 @@
-"""Outliers of the simulated world: measurements that have nothing to do with their landmark.
+"""Outliers of the simulated world: measurements that do not depend on their landmark.
 
-Which measurements are spoilt is drawn for each of them, in the same way for every kind of outlier;
-so runs of different kinds, and the run in which the same measurements are left out, can be
-compared.
+Which measurements are outliers is drawn in the same way for every kind of outlier; so runs of
+different kinds, and the run in which the same measurements are left out, can be compared.
 """
 
 import numpy as np
@@ -21,18 +20,19 @@ def spoilt(
     landmarks: int,
     uniforms: Float[np.ndarray, "R 3"],
 ) -> Detections:
-    """The detections with a share of the measurements spoilt, from uniform numbers in [0, 1).
+    """The detections with a share of the measurements replaced by outliers, from uniform numbers in
+    [0, 1).
 
-    The first number of a row chooses it. "measurement": the other two are the range, uniform in
-    `span` [m], and the bearing, uniform in the field of view. "identity": the second is which other
-    of the landmarks 1 … `landmarks` it is taken for. "drop": it is left out.
+    The first number of a row decides whether it is one. "measurement": the other two are the range,
+    uniform in `span` [m], and the bearing, uniform in the field of view. "identity": the second
+    chooses another of the landmarks 1 … `landmarks`. "drop": the measurement is left out.
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":
-        kept = np.concatenate(([0], np.cumsum(~chosen)))
+        offsets_before = np.concatenate(([0], np.cumsum(~chosen)))
         return Detections(
             seen.stamps_ns,
-            kept[seen.offsets],
+            offsets_before[seen.offsets],
             seen.ids[~chosen],
             seen.ranges[~chosen],
             seen.bearings[~chosen],
@@ -57,7 +57,9 @@ def spoilt(
 def _others(
     ids: UInt32[np.ndarray, " R"], landmarks: int, uniform: Float[np.ndarray, " R"]
 ) -> UInt32[np.ndarray, " R"]:
-    """Any of the ids 1 … landmarks but the own one, each as probable; with only one, that."""
+    """Any of the ids 1 … landmarks but the given one, with equal probability; that one if it is the
+    only one.
+    """
     ahead = 1 + np.floor(uniform * max(landmarks - 1, 1)).astype(np.int64)
     others: UInt32[np.ndarray, " R"] = (ids - 1 + ahead) % landmarks + 1
     return others.astype(np.uint32)

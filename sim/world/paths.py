@@ -1,7 +1,7 @@
 """The true motion of the robots of a simulated world.
 
-A step is a pair (distance [m], turn [rad]); poses (x, y, θ) are in the world's frame. Two ways to
-make steps: `followed` cuts a polyline into equal ones, `driven` steers from way-point to way-point.
+A step is a pair (distance [m], rotation [rad]); poses (x, y, θ) are in the world's frame.
+`followed` cuts a polyline into equal steps, `driven` steers from way-point to way-point.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,12 +17,14 @@ Pose = tuple[float, float, float]
 Step = tuple[float, float]
 
 ALIGNED_RAD = 0.02
-"""Who turns before it drives drives when its way-point lies less than this to the side."""
+"""A robot that turns before it drives begins to drive when its way-point is less than this off its
+heading.
+"""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """K true steps and the K + 1 true poses that they lead through."""
+    """K true steps and the K + 1 true poses before, between and after them."""
 
     poses: Float[np.ndarray, "K_plus_1 3"]
     steps: Float[np.ndarray, "K 2"]
@@ -30,9 +32,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a robot can do in one step, and when a way-point counts as reached.
+    """The limits of one step's motion, and the distance at which a way-point counts as reached.
 
-    turn_first: a step that turns does not drive. radius: a car's least; 0 turns on the spot.
+    turn_first: a step with a rotation has no translation. radius: the smallest turning radius [m]
+    of a car; 0 turns on the spot.
     """
 
     distance: float
@@ -49,9 +52,9 @@ def wrapped(angle: float) -> float:
 
 
 def followed(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
-    """The polyline through the way-points in steps of equal arc length: turn, then drive.
+    """The polyline through the way-points in steps of equal arc length: rotate, then drive.
 
-    A step that takes in a corner is its chord. The first pose looks along the first step.
+    A step across a corner is its chord. The first pose points along the first step.
     """
     legs = np.hypot(*np.diff(way_points, axis=0).T)
     arc = np.concatenate(([0.0], np.cumsum(legs)))
@@ -77,9 +80,9 @@ def driven(
 ) -> Drive:
     """Steer to each way-point in turn; after the last one, stand.
 
-    A step turns towards the way-point as far as the limit lets it and drives the less, the more the
-    way-point lies to the side. slip(k, step): the final turn [rad] and the slip to the left [m] of
-    step k; they move the robot and are in no odometry.
+    A step rotates towards the way-point up to the limit, and drives the less, the more the
+    way-point lies to the side. slip(k, step): the final rotation [rad] and the slip to the left [m]
+    of step k; they move the robot, and no odometry measures them.
     """
     poses, taken = [start], []
     target = next(way_points, None)
@@ -96,10 +99,10 @@ def driven(
 def moved(
     pose: Pose, step: Step, kind: Kind, final_turn: float = 0.0, lateral: float = 0.0
 ) -> Pose:
-    """The pose after one step, a slip to the left at its end and a last turn.
+    """The pose after one step, a slip to the left at its end and a final rotation.
 
-    turn-then-drive: the whole turn first, then straight on. All others: the
-    circular arc, whose chord has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
+    turn-then-drive: the whole rotation first, then straight on. All others: the circular arc, whose
+    chord has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
     """
     x, y, heading = pose
     distance, turn = step

@@ -8,17 +8,15 @@ from jaxtyping import Float, Int64
 from team.config import Sensor
 
 SHORTEST_MEASUREMENT_M = 0.05
-"""A measurement that the noise would make shorter is given as this: a sensor has no negative
-range.
-"""
+"""Least range [m] that is given, since a sensor has no negative range."""
 
 SHORTEST_TIME_S = 1e-9
-"""A correlation time that is shorter is this: none from one measurement to the next."""
+"""A shorter correlation time [s] counts as this one: no correlation between measurements."""
 
 
 @dataclass(frozen=True)
 class Visible:
-    """V true range-bearing pairs, by step and then by point."""
+    """V true range-bearing pairs, ordered by step and then by point."""
 
     steps: Int64[np.ndarray, " V"]
     points: Int64[np.ndarray, " V"]
@@ -50,20 +48,19 @@ def visible(
 def persistent(
     seen: Visible, sensor: Sensor, step_s: float, normals: Float[np.ndarray, "V 4"]
 ) -> Float[np.ndarray, "V 2"]:
-    """Errors of unit variance, of which a share stays with each point from measurement to
-    measurement.
+    """Errors of unit variance, a share of which is correlated over time for each point.
 
     n = √white w + √(1 − white) g with white w and, for each point, g of a first-order Gauss-Markov
-    process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). All from standard
-    normal numbers: two columns of w, two of n'; range first.
+    process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: V × 4 standard
+    normal numbers, two columns of w and two of n', range first.
     """
     constant = normals[:, 2:].copy()
     times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
     order = np.lexsort((seen.steps, seen.points))
     again = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
     gaps = np.diff(seen.steps[order])[again - 1] * step_s
-    kept = np.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
-    for row, rho in zip(again.tolist(), kept, strict=True):
+    correlation = np.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
+    for row, rho in zip(again.tolist(), correlation, strict=True):
         before = constant[order[row - 1]]
         constant[order[row]] = rho * before + np.sqrt(1.0 - rho**2) * constant[order[row]]
     white = np.array([sensor.range_white, sensor.bearing_white])
@@ -73,13 +70,15 @@ def persistent(
 
 
 LENS_ROUNDS = 20
-"""Of the fixed point of a raw bearing: a lens bends by a few per cent, and each round has those."""
+"""Rounds of the fixed-point iteration for a raw bearing: a lens adds a few per cent, which each
+round multiplies.
+"""
 
 
 def measurements(
     seen: Visible, sensor: Sensor, errors: Float[np.ndarray, "V 2"]
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Ranges [m] and bearings [rad] as the sensor reads them, from errors n of unit variance.
+    """Ranges [m] and bearings [rad] as the sensor measures them, from errors n of unit variance.
 
     range = range_scale · (r + σ(r) n₁) + range_offset with σ(r)² = range_sigma² +
     (range_sigma_per_m r)²; bearing = raw + bearing_sigma n₂ with raw = b + bearing_offset +

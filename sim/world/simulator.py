@@ -1,9 +1,8 @@
-"""A simulated world: true paths, odometry with noise in it, measurements of landmarks and
-teammates.
+"""A simulated world: true paths, noisy odometry, measurements of landmarks and teammates.
 
 Nothing here comes from the estimator: the motion and the sensor are written again in `paths`,
-`odometry` and `sensing` beside this, so that an error in either half shows. Every stream of random
-numbers is named by (seed, robot, purpose): a further robot changes nobody else's noise.
+`odometry` and `sensing`, so that an error in either half shows. Every stream of random numbers is
+named by (seed, robot, purpose): a further robot changes nobody else's noise.
 """
 
 import hashlib
@@ -15,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from sim.world.config import SimulatedWorld, starts_unknown
-from sim.world.forms import claimed, increments_told, seen_from, steering_told, with_errors
+from sim.world.forms import claimed, measured_increments, measured_steering, seen_from, with_errors
 from sim.world.layouts import laid_out
-from sim.world.odometry import slip, told
+from sim.world.odometry import measured_speeds, slip
 from sim.world.outliers import spoilt
 from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
 from sim.world.sensing import (
@@ -41,16 +40,16 @@ from sim.world.streams import (
 from team.config import RobotConfig, Sensor
 
 LEAST_RADIUS = 1.5
-"""A simulated car turns on a circle of so many wheel bases."""
+"""Turning radius of a simulated car, in wheel bases."""
 
 
 def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
     """The streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
 
-    Robot i follows path i; without one, or if its motion slips or goes in arcs, it steers: to its
+    Robot i follows path i; without a path, or if its motion slips or goes in arcs, it steers to its
     path's way-points or to random ones. Each step ends with one message of the landmarks seen,
     perhaps empty, and one of the teammates seen, if any. Where an odometry's clock is late, team
-    time begins so much later than 0 that no stamp of it is negative.
+    time begins so much later than 0 that none of its stamps is negative.
     """
     landmarks = _landmarks(world, seed)
     ids = np.arange(1, len(landmarks) + 1, dtype=np.uint32)
@@ -71,7 +70,7 @@ def _clock_ns(robot: RobotConfig) -> int:
 
 
 def generator(seed: int, *names: str) -> np.random.Generator:
-    """The stream of random numbers of one purpose, e.g. (seed, robot, "odometry")."""
+    """The random generator of one purpose, e.g. (seed, robot, "odometry")."""
     digest = hashlib.sha256("/".join(names).encode()).digest()
     words = np.random.SeedSequence([seed, int.from_bytes(digest[:16], "little")])
     return np.random.Generator(np.random.Philox(words))
@@ -120,7 +119,7 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
 def _route(
     world: SimulatedWorld, robot: str, path: Float[np.ndarray, "W 2"] | None, seed: int
 ) -> tuple[Pose, Iterator[tuple[float, float]]]:
-    """Where a robot starts, looking to where it goes first, and the way-points that follow."""
+    """The initial pose, with the heading of the first step, and the way-points that follow."""
     way_points = _random_way_points(world, robot, seed) if path is None else _each(path)
     if path is None and world.radius_m is not None:
         return (0.0, 0.0, 0.0), way_points
@@ -155,7 +154,9 @@ def _random_way_points(
 
 
 def _until_all_stand(world: SimulatedWorld, drives: Sequence[Drive]) -> list[Drive]:
-    """With a number of way-points the world ends when the last robot has reached its last one."""
+    """The drives up to the step in which the last robot reaches its last way-point, if their number
+    is given.
+    """
     if not world.way_point_count:
         return list(drives)
     moving = [np.flatnonzero(drive.steps.any(axis=1)) for drive in drives]
@@ -202,14 +203,16 @@ def _odometry(
     normals = generator(seed, robot.id, "odometry").standard_normal((count, 2))
     of_wheels = generator(seed, robot.id, "wheels").standard_normal((count, 2))
     duration_ns = np.diff(stamps_ns)
-    forward, yaw_rate = told(robot.motion, drive.steps, duration_ns * 1e-9, normals, of_wheels)
+    forward, yaw_rate = measured_speeds(
+        robot.motion, drive.steps, duration_ns * 1e-9, normals, of_wheels
+    )
     if world.odometry == "steering":
         if robot.motion.kind != "ackermann":
             raise ValueError(
                 f'world.odometry = "steering" is a car\'s: {robot.id} needs '
                 f'motion.kind = "ackermann", not "{robot.motion.kind}"'
             )
-        forward, yaw_rate = steering_told(robot.motion, forward, yaw_rate)
+        forward, yaw_rate = measured_steering(robot.motion, forward, yaw_rate)
         return Intervals(stamps_ns[1:], duration_ns, forward, yaw_rate, steered=True)
     return Intervals(stamps_ns[1:], duration_ns, forward, yaw_rate)
 
@@ -224,7 +227,7 @@ def _increments(
     normals = generator(seed, robot.id, "increments").standard_normal((len(drive.steps), 3))
     duration_ns = np.diff(stamps_ns)
     correlation = world.odometry_correlation if world.odometry_claims else 0.0
-    increments, covariances = increments_told(
+    increments, covariances = measured_increments(
         robot.motion, drive.poses, drive.steps, duration_ns * 1e-9, normals, correlation
     )
     if not world.odometry_claims:
@@ -240,7 +243,7 @@ def _observations(
     stamps_ns: Int64[np.ndarray, " K_plus_1"],
     seed: int,
 ) -> Detections:
-    """One message a step, perhaps empty."""
+    """One message of landmarks for each step, perhaps empty."""
     first = 0 if world.observe_at_start else 1
     at_ns = stamps_ns[first:]
     seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
@@ -275,7 +278,9 @@ def _with_claims(
     ],
     seed: int,
 ) -> Detections:
-    """What is seen, each with a covariance of its own and an error of that size."""
+    """Measurements of what is visible, each with a covariance of its own and an error of that
+    covariance.
+    """
     assert world.landmark_claims is not None
     points = world.landmark_form == "points"
     random = generator(seed, robot.id, "claims")
@@ -284,26 +289,26 @@ def _with_claims(
         random.standard_normal((len(seen.steps), 2)),
     )
     covariances = claimed(seen, robot.sensor, world.landmark_claims, uniform, points=points)
-    told_of = covariances / world.claims_factor
+    claims = covariances / world.claims_factor
     if points:
         ahead = np.column_stack([np.cos(seen.bearings), np.sin(seen.bearings)])
         xy = with_errors(seen.ranges[:, np.newaxis] * ahead, covariances, normals)
         polar = np.hypot(xy[:, 0], xy[:, 1]), np.arctan2(xy[:, 1], xy[:, 0])
-        return Detections(*messages, *polar, xy, told_of)
+        return Detections(*messages, *polar, xy, claims)
     true = np.column_stack([seen.ranges, seen.bearings])
     ranges, bearings = with_errors(true, covariances, normals).T
     return Detections(
         *messages,
         np.maximum(ranges, SHORTEST_MEASUREMENT_M),
         on_circle(bearings),
-        covariances=told_of,
+        covariances=claims,
     )
 
 
 def _read(
     world: SimulatedWorld, sensor: Sensor, seen: Visible, seed: int, *names: str
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """What the sensor reads of what is seen, with the random numbers of this purpose."""
+    """Ranges and bearings as the sensor measures them, with the random numbers of this purpose."""
     errors = generator(seed, *names).standard_normal((len(seen.steps), 2))
     if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
         lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
@@ -346,7 +351,7 @@ def _visible(
     poses: Float[np.ndarray, "K 3"],
     points: Float[np.ndarray, "#K P 2"],
 ) -> Visible:
-    """What the robot truly sees from these poses."""
+    """The points that are truly visible from these poses."""
     sensor = robot.sensor
     nearest, farthest = _limits(world, sensor)
     if sensor.is_mounted:
@@ -355,7 +360,9 @@ def _visible(
 
 
 def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
-    """The world's true ranges of sight; where it has none, those of the sensor's measurements."""
+    """The world's true ranges of visibility; where it has none, the limits of the sensor's
+    measurements.
+    """
     nearest = sensor.min_range if world.visible_from_m is None else world.visible_from_m
     farthest = sensor.max_range if world.visible_to_m is None else world.visible_to_m
     return nearest, farthest

@@ -1,9 +1,10 @@
-"""What any world is, simulated or recorded: measurements of each robot in order, and the truth.
+"""The streams of any world, simulated or recorded: measurements of each robot in order, and the
+truth.
 
 One counter spans all measurements of a robot, in the order (stamp, kind); measurement 0 is the
-start pose. An odometry measurement is an interval that is stamped with its *end*, and the intervals
-of a robot are contiguous in time. So at equal stamps what was seen at the end of an interval comes
-before it. SI units, radians, bearings in (−π, π].
+initial pose. An odometry measurement is an interval that is stamped with its *end*, and the
+intervals of a robot are contiguous in time. So at equal stamps the measurements at the end of an
+interval come before it. SI units, radians, bearings in (−π, π].
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ OBSERVATIONS = 1
 SIGHTINGS = 2
 ODOMETRY = 3
 NO_LABEL = 2**32 - 1
-"""The identity of a detection that is clutter, or of which nobody knows the landmark."""
+"""The identity of a detection that is clutter, or whose landmark is not known."""
 
 KIND_NAMES = ("start pose", "observations", "sightings", "odometry")
 
@@ -35,10 +36,10 @@ class StartPose:
 class Intervals:
     """Odometry intervals: end stamp, length, and the mean forward speed [m/s] and yaw rate [rad/s].
 
-    Interval k ends where interval k + 1 begins. steered: a car's, of which forward is the speed of
-    the wheel [m/s] and yaw_rate the angle of the steering [rad]. increments: odometry that tells
+    Interval k ends where interval k + 1 begins. steered: of a car, whose forward is the speed of
+    the wheel [m/s] and yaw_rate the steering angle [rad]. increments: odometry that measures
     motions instead, each the pose (x, y, theta) of its end in the frame of its start; forward and
-    yaw_rate are then not told. covariances: what it claims of them, in the frame of the end.
+    yaw_rate are then zero. covariances: of the increments, in the frame of the end.
     """
 
     end_ns: Int64[np.ndarray, " I"]
@@ -50,7 +51,7 @@ class Intervals:
     covariances: Float[np.ndarray, "I 3 3"] | None = None
 
     def where(self, chosen: Bool[np.ndarray, " I"]) -> "Intervals":
-        """The chosen ones."""
+        """The chosen intervals."""
         return Intervals(
             self.end_ns[chosen],
             self.duration_ns[chosen],
@@ -66,11 +67,12 @@ class Intervals:
 class Detections:
     """M messages of range-bearing measurements: message m has the rows offsets[m] … offsets[m + 1].
 
-    ids are landmark identities, or indices into a tuple of teammates. points: what the sensor tells
-    are these (x, y) in its frame [m], and ranges and bearings are theirs. covariances: what it
-    claims of each, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points. hidden: messages
-    that are told without identities (None: none); their ids are for scoring, NO_LABEL of clutter.
-    signatures: a number of each that looks alike for the same landmark, of hidden ones only.
+    ids are landmark identities, or indices into a tuple of teammates. points: the sensor measures
+    these (x, y) in its frame [m], and ranges and bearings are computed from them. covariances: that
+    each measurement carries, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points. hidden:
+    messages that are published without identities (None: none); their ids are for scoring, NO_LABEL
+    of clutter. signatures: a number for each that is alike for the same landmark, of hidden ones
+    only.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -118,7 +120,7 @@ class OdometryMeasurement(NamedTuple):
 class ObservationMeasurement(NamedTuple):
     """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty.
 
-    points, covariances, signatures: as in `Detections`. hidden: it is told without the ids.
+    points, covariances, signatures: as in `Detections`. hidden: it is published without the ids.
     """
 
     stamp_ns: int
@@ -145,11 +147,11 @@ class RobotStream:
     """All measurements of one robot; the index into kinds, stamps_ns and rows is the measurement
     counter.
 
-    start: None when the start pose is not known. rows: the measurement's row in the arrays of its
+    start: None when the initial pose is not known. rows: the measurement's row in the arrays of its
     kind. truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can
-    not be given, in a user's words. clock_offset_ns: all stamps here are team time, and the
-    odometry's own clock, whose stamps go out, reads so much less. positions: where another sensor,
-    as a GPS, says that it was at positions_ns, in a frame of its own.
+    not be given, for users. clock_offset_ns: all stamps here are team time; the odometry's own
+    clock, whose stamps are published, reads this much less. positions: where another sensor, as a
+    GPS, measured the robot at positions_ns, in a frame of its own.
     """
 
     robot: str
@@ -169,7 +171,7 @@ class RobotStream:
     positions: Float[np.ndarray, "G 2"] | None = None
 
     def __len__(self) -> int:
-        """The number of measurements, the start pose included."""
+        """The number of measurements, the initial pose included."""
         return len(self.kinds)
 
     def odometry(self, counter: int) -> OdometryMeasurement:
@@ -222,7 +224,8 @@ class RobotStream:
 
 @dataclass(frozen=True)
 class WorldStreams:
-    """The streams of a team, the true landmark positions (None: not known), and where it is from.
+    """The streams of a team, the true landmark positions (None: not known), and the name of their
+    source.
 
     landmark_ids ascend; without positions they are empty.
     """
@@ -262,9 +265,9 @@ def robot_stream(
     positions_ns: Int64[np.ndarray, " G"] | None = None,
     positions: Float[np.ndarray, "G 2"] | None = None,
 ) -> RobotStream:
-    """Number the measurements of one robot by (stamp, kind), the start pose first.
+    """Number the measurements of one robot by (stamp, kind), the initial pose first.
 
-    Raises ValueError for a measurement before the start, or odometry that is not contiguous.
+    Raises ValueError for a measurement before the initial pose, or odometry that is not contiguous.
     """
     parts = (np.array([start_ns]), observations.stamps_ns, sightings.stamps_ns, intervals.end_ns)
     stamps = np.concatenate(parts)
@@ -336,6 +339,6 @@ def moved(
     increments: Float[np.ndarray, "I 3"],
     covariances: Float[np.ndarray, "I 3 3"] | None = None,
 ) -> Intervals:
-    """Odometry that tells motions on SE(2)."""
+    """Odometry intervals that measure motions on SE(2)."""
     untold = np.zeros(len(end_ns))
     return Intervals(end_ns, duration_ns, untold, untold, False, increments, covariances)

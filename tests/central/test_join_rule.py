@@ -203,7 +203,9 @@ def test_a_refused_submap_changes_no_bit_and_says_why():
 
 def sequences(found, robot):
     """The submaps that are kept for a robot which starts again."""
-    return [each.sequence for each in found.intake.kept(robot) if isinstance(each, m.Submap)]
+    return [
+        each.sequence for each in found.intake.stored_messages(robot) if isinstance(each, m.Submap)
+    ]
 
 
 def test_nobody_need_wait_for_what_was_refused_and_what_follows_it():

@@ -46,7 +46,7 @@ def test_one_robot_alone_withdraws_no_teammate_and_the_remedy_is_named(
     assert withdrawn(node, heard("r1"), heard("stranger"), heard("intruder")) == []
     (warning,) = node.status().warnings
     assert warning == (
-        "r1 heard that r2 is withdrawn, too few to be believed: if it is, order it again by "
+        "r1 report that r2 is withdrawn, too few to be believed: if it is, order it again by "
         "`teamslam withdraw r2`"
     )
     assert withdrawn(

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 import pytest_asyncio
 
-from central.kept import KeptSet
+from central.stored_set import StoredSet
 from team.keys.authority import make_keys
 from team.keys.roster import nodes_of
 from team.recording.reader import open_log
@@ -172,7 +172,7 @@ def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
 def keep_another_runs_set(launched: Launched, file: Path) -> None:
     """The set of a centre that has heard the same names of submaps with other numbers."""
     file.parent.mkdir()
-    kept = KeptSet(file)
+    kept = StoredSet(file)
     for sample in open_log(launched.log).samples((ch.SUBMAP,)):
         submap = opened(sample)[2]
         assert isinstance(submap, Submap)

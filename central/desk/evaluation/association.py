@@ -35,8 +35,8 @@ class Pairs:
     @property
     def precision(self) -> float | None:
         """Of the pairs that were associated, the share that is right."""
-        said = self.right + self.wrong
-        return self.right / said if said else None
+        associated = self.right + self.wrong
+        return self.right / associated if associated else None
 
     @property
     def recall(self) -> float | None:
@@ -148,7 +148,7 @@ def association_json(result: AssociationResult) -> dict[str, object]:
 
 def _robots(log: Collected, channel: ch.Channel) -> list[str]:
     """The robots with messages on a channel."""
-    return sorted(name for key in log.kept if (name := channel.owner(key)) is not None)
+    return sorted(name for key in log.samples if (name := channel.owner(key)) is not None)
 
 
 def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
@@ -228,7 +228,7 @@ def _pairs(
     window = np.zeros(len(label), np.int64) if window is None else window
     used = landmark >= 0
     real = _choose_two(np.column_stack((window, label)))
-    said = _choose_two(landmark[used][:, None])
+    associated = _choose_two(landmark[used][:, None])
     right = _choose_two(np.column_stack((window, label, landmark))[used])
     members, counts = np.unique(
         np.column_stack((landmark, label))[used], axis=0, return_counts=True
@@ -238,7 +238,7 @@ def _pairs(
         most[of] = max(most.get(of, 0), count)
     return Pairs(
         right=right,
-        wrong=said - right,
+        wrong=associated - right,
         missed=real - right,
         wrong_detections=int(used.sum()) - sum(most.values()),
         detections=len(label),

@@ -215,17 +215,17 @@ def _lost(fused: MapResult | None) -> list[str]:
 
 def _never_came(log: Collected) -> list[str]:
     """The robots whose driver lacks messages that were published, by the driver's last status."""
-    said = []
+    warnings = []
     for robot in log.robots:
         status = log.sound(log.latest.get(ch.STATUS.key(ch.source_node(robot))))
         figures = status.figures if isinstance(status, m.Status) else {}
         lost = figures.get("messages_lost", 0.0) + figures.get("messages_dropped", 0.0)
         if lost and math.isfinite(lost):
-            said.append(
+            warnings.append(
                 f"{robot}: {lost:,.0f} messages of its topics are not in its stream, beside "
                 f"{figures.get('messages', 0.0):,.0f} that are; its driver's warnings say why"
             )
-    return said
+    return warnings
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:

@@ -49,12 +49,12 @@ def _median(fixes: Mapping[str, Fixes], paths: Mapping[str, Path], shift_s: floa
     poses, there = [], []
     for robot, (at_ns, places) in fixes.items():
         path = paths[robot]
-        wanted = path.stamps_ns + round(shift_s * 1e9)
-        after = np.searchsorted(at_ns, wanted)
+        shifted_ns = path.stamps_ns + round(shift_s * 1e9)
+        after = np.searchsorted(at_ns, shifted_ns)
         inside = (after > 0) & (after < len(at_ns))
         after = np.clip(after, 1, len(at_ns) - 1)
         inside &= at_ns[after] - at_ns[after - 1] <= GAP_NS
-        columns = [np.interp(wanted[inside], at_ns, places[:, i]) for i in range(2)]
+        columns = [np.interp(shifted_ns[inside], at_ns, places[:, i]) for i in range(2)]
         there.append(np.column_stack(columns))
         poses.append(path.poses[inside])
     if sum(map(len, poses)) < LEAST:

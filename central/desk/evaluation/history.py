@@ -23,7 +23,7 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
 _NO_SPAN = (2**63 - 1, -(2**63))
-_LOOKED_AT = (
+_CHANNELS = (
     ch.START, ch.SUBMAP, ch.FUSED_MAP, ch.FINAL_MAP, ch.INNOVATION, ch.TRUTH_LANDMARKS, ch.STATUS,
     ch.ALIVE, ch.ROBOT_CONFIG, ch.ROBOT_DONE, ch.WITHDRAWAL, ch.END,
 )  # fmt: skip
@@ -179,7 +179,7 @@ class _Gathering:
 
     def hear(self, sample: Sample, channel: ch.Channel | None) -> None:
         """Take what a message contains, whatever its channel."""
-        if channel not in _LOOKED_AT:
+        if channel not in _CHANNELS:
             return
         try:
             _, name, message = opened(sample)
@@ -246,10 +246,10 @@ def history(samples: Iterable[Sample]) -> History:
             known = ch.channel_of(sample.key)
             rows[sample.key] = None if known is None else known[0]
         found.take(sample, rows[sample.key])
-        said = centre.of(sample)
-        if said is not None:
-            as_centre = ch.channel_of(said.key)
-            found.hear(said, None if as_centre is None else as_centre[0])
+        as_centre_sample = centre.of(sample)
+        if as_centre_sample is not None:
+            as_centre = ch.channel_of(as_centre_sample.key)
+            found.hear(as_centre_sample, None if as_centre is None else as_centre[0])
     stamps = [column.stamps for column in found.traffic.values()]
     span = found.span
     if span == _NO_SPAN:
@@ -273,11 +273,11 @@ def history(samples: Iterable[Sample]) -> History:
 def _innovations(of: list[m.Innovation]) -> Innovations:
     """The innovations by window, each once: a resumed robot repeats some of them."""
     once = {(each.incarnation, each.sequence): each for each in of}
-    kept = [once[name] for name in sorted(once)]
+    ordered = [once[name] for name in sorted(once)]
     return Innovations(
-        np.array([each.stamp_ns for each in kept], np.int64),
-        np.array([each.squared for each in kept]),
-        np.array([each.dof for each in kept], np.int64),
+        np.array([each.stamp_ns for each in ordered], np.int64),
+        np.array([each.squared for each in ordered]),
+        np.array([each.dof for each in ordered], np.int64),
     )
 
 

@@ -22,7 +22,7 @@ _NEWEST = (
     ch.CONCLUDED, ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS, ch.OWN_MAP,
 )  # fmt: skip
 _LATEST = frozenset(channel.name for channel in _NEWEST)
-_KEPT = frozenset(
+_COLLECTED = frozenset(
     channel.name
     for channel in (
         ch.FAULT,
@@ -82,7 +82,9 @@ class Measurements:
 
 @dataclass
 class Collected:
-    """The contents of a log, by channel and robot; `kept` as payloads that are decoded on demand.
+    """The contents of a log, by channel and robot.
+
+    samples: by key, as payloads that are decoded on demand.
 
     first_ns: the wall clock of the first sample that has one. unsound: samples
     that are no sound message of their channel; they count as traffic only.
@@ -91,7 +93,7 @@ class Collected:
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
     measurements: dict[str, Measurements] = field(default_factory=lambda: defaultdict(Measurements))
     latest: dict[str, Sample] = field(default_factory=dict)
-    kept: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
+    samples: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
     unsound: int = 0
     first_ns: int | None = None
 
@@ -112,7 +114,7 @@ class Collected:
     def messages(self, channel: Channel, robot: str) -> list[m.Message]:
         """The sound messages of one robot's channel, in the log's order."""
         found = []
-        for sample in self.kept.get(channel.key(robot), []):
+        for sample in self.samples.get(channel.key(robot), []):
             message = self.sound(sample)
             if message is not None:
                 found.append(message)
@@ -120,8 +122,8 @@ class Collected:
 
     def faults(self) -> list[m.Fault]:
         """The faults of all nodes, in the order of the nodes."""
-        keys = sorted(key for key in self.kept if ch.FAULT.owner(key) is not None)
-        found = (self.sound(sample) for key in keys for sample in self.kept[key])
+        keys = sorted(key for key in self.samples if ch.FAULT.owner(key) is not None)
+        found = (self.sound(sample) for key in keys for sample in self.samples[key])
         return [fault for fault in found if isinstance(fault, m.Fault)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
@@ -142,7 +144,7 @@ class Collected:
         traffic.messages += 1
         traffic.bytes += len(sample.payload)
         if channel == ch.START.name:
-            self.kept[sample.key].append(sample)
+            self.samples[sample.key].append(sample)
         if channel in _SENSORS:
             self._count(sample, robot, odometry=channel == ch.ODOMETRY.name)
         else:
@@ -159,8 +161,8 @@ class Collected:
     def _keep(self, sample: Sample, channel: str) -> None:
         if channel in _LATEST:
             self.latest[sample.key] = sample
-        elif channel in _KEPT:
-            self.kept[sample.key].append(sample)
+        elif channel in _COLLECTED:
+            self.samples[sample.key].append(sample)
 
     def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
         head = head_of(sample)
@@ -183,7 +185,7 @@ def collected(samples: Iterable[Sample]) -> Collected:
             known = channel_of(sample.key)
             channels[sample.key] = ("", "") if known is None else (known[0].name, known[1])
         found.take(sample, *channels[sample.key])
-        said = centre.of(sample)
-        if said is not None:
-            found.keep(said)
+        counterpart = centre.of(sample)
+        if counterpart is not None:
+            found.keep(counterpart)
     return found

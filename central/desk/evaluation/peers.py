@@ -39,8 +39,8 @@ def peer_results(log: Collected) -> dict[str, PeerResult]:
         if "set_submaps" not in figures:
             continue
         sample = log.latest.get(ch.CONCLUDED.key(robot))
-        said = log.sound(sample)
-        concluded = said if isinstance(said, m.Concluded) else None
+        message = log.sound(sample)
+        concluded = message if isinstance(message, m.Concluded) else None
         at_ns = 0 if sample is None else sample.wall_ns - (log.first_ns or sample.wall_ns)
         found[robot] = PeerResult(
             final_map_sha256=None if concluded is None else concluded.sha256.hex(),

@@ -56,7 +56,7 @@ def robot_log(log: Collected, robot: str) -> RobotLog:
         [floats(t.covariances, "covariances") for t in trajectories],
     )
     online_channel = next(
-        (c for c in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE) if log.kept.get(c.key(robot))),
+        (c for c in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE) if log.samples.get(c.key(robot))),
         None,
     )
     poses = [] if online_channel is None else log.messages(online_channel, robot)
@@ -122,6 +122,6 @@ def _stacked(
     poses = np.concatenate([np.empty((0, 3)), *(poses for _, poses in parts)])
     order = np.argsort(stamps, kind="stable")
     last = np.flatnonzero(np.append(np.diff(stamps[order]) != 0, [True] * (len(stamps) > 0)))
-    kept = order[last]
+    chosen = order[last]
     flat = np.concatenate([np.empty(0), *covariances]).reshape(-1, 3, 3)
-    return Path(stamps[kept], poses[kept]), flat[kept] if len(flat) else flat
+    return Path(stamps[chosen], poses[chosen]), flat[chosen] if len(flat) else flat

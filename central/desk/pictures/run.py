@@ -224,10 +224,10 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
         axis.set_axisbelow(True)
         shown, largest = [np.empty(0)], 0.0
         if robot.online is not None:
-            kept = thinning(len(robot.online.stamps_ns))
-            time_s = (robot.online.stamps_ns[kept] - start_ns) * 1e-9
-            bound = 3.0 * scale * robot.online.sigmas[kept, k]
-            error = scale * robot.online.errors[kept, k]
+            drawn = thinning(len(robot.online.stamps_ns))
+            time_s = (robot.online.stamps_ns[drawn] - start_ns) * 1e-9
+            bound = 3.0 * scale * robot.online.sigmas[drawn, k]
+            error = scale * robot.online.errors[drawn, k]
             label = f"online ({robot.online_channel})"
             axis.fill_between(
                 time_s, -bound, bound, color=colour, alpha=0.18, linewidth=0.0, label="±3σ online"
@@ -270,8 +270,8 @@ def _first_ns(robot: RobotResult) -> int:
 
 
 def _thinned(path: Path) -> Path:
-    kept = thinning(len(path.stamps_ns))
-    return Path(path.stamps_ns[kept], path.poses[kept])
+    drawn = thinning(len(path.stamps_ns))
+    return Path(path.stamps_ns[drawn], path.poses[drawn])
 
 
 def thinning(count: int) -> slice:

@@ -129,15 +129,19 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         centres, (squared, dof) = binned(
             history, of.stamps_ns, of.squared, of.dof.astype(np.float64)
         )
-        told: Bool[np.ndarray, " b"] = dof > 0
-        if not told.any():
+        measured: Bool[np.ndarray, " b"] = dof > 0
+        if not measured.any():
             continue
-        values = squared[told] / dof[told]
+        values = squared[measured] / dof[measured]
         axis.plot(
-            centres[told], values, color=colours.get(name, MAP_COLOUR), linewidth=1.2, label=name
+            centres[measured],
+            values,
+            color=colours.get(name, MAP_COLOUR),
+            linewidth=1.2,
+            label=name,
         )
         largest = max(largest, float(values.max()))
-        low, high = chi2_interval(int(np.median(dof[told])), BAND, 1)
+        low, high = chi2_interval(int(np.median(dof[measured])), BAND, 1)
         lows.append(low)
         highs.append(high)
     if lows:
@@ -283,15 +287,15 @@ def latency_picture(history: History, path: FilePath) -> bool:
     axis = axes[0][0]
     colours = robot_colours({*history.innovations, *history.latencies})
     for behind, (name, of) in enumerate(reversed(list(history.latencies.items()))):
-        kept = thinning(len(of.stamps_ns))
-        seconds = history.seconds(of.stamps_ns[kept])
+        drawn = thinning(len(of.stamps_ns))
+        seconds = history.seconds(of.stamps_ns[drawn])
         wider = 1.3 * min(behind, THICKEST)
         axis.plot(
-            seconds, of.last_s[kept], color=colours[name], linewidth=0.8 + wider, marker="o",
+            seconds, of.last_s[drawn], color=colours[name], linewidth=0.8 + wider, marker="o",
             markersize=3 + 1.5 * wider, label=name, zorder=2.9 - 0.01 * behind,
         )  # fmt: skip
         axis.plot(
-            seconds, of.first_s[kept], color=colours[name], linewidth=0.8 + wider, linestyle=":",
+            seconds, of.first_s[drawn], color=colours[name], linewidth=0.8 + wider, linestyle=":",
             zorder=2.9 - 0.01 * behind,
         )  # fmt: skip
     axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last measurement")

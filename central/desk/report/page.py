@@ -248,8 +248,8 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
                 shown(None if online is None else online.coverage, ".0%", ""),
             )
         )
-    told = [row for row in rows if any(cell != "–" for cell in row[1:])]
-    if not told and "consistency" not in pictures:
+    filled = [row for row in rows if any(cell != "–" for cell in row[1:])]
+    if not filled and "consistency" not in pictures:
         return []
     headings = (
         "robot",
@@ -260,7 +260,7 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "online\nNEES/dof",
         "in\n95 %",
     )
-    return [_table(headings, told), _note(NIS_NOTE), _image(pictures, "consistency")]
+    return [_table(headings, filled), _note(NIS_NOTE), _image(pictures, "consistency")]
 
 
 def _paths(run: Run) -> list[str]:
@@ -295,9 +295,9 @@ def _paths(run: Run) -> list[str]:
 def _measurements(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
-        told = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
-        said = [_dispositions(told)] if any(told.values()) else []
-        return [*said, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
+        ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
+        tables = [_dispositions(ledgers)] if any(ledgers.values()) else []
+        return [*tables, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
     robots = sorted({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
@@ -311,13 +311,13 @@ def _measurements(run: Run) -> list[str]:
     ]
 
 
-def _dispositions(told: Mapping[str, Mapping[str, int]]) -> str:
+def _dispositions(ledgers: Mapping[str, Mapping[str, int]]) -> str:
     """A row for each disposition, a column for each robot."""
     rows = []
-    for disposition in sorted(set().union(*told.values())):
-        counts = [of.get(disposition, 0) for of in told.values()]
+    for disposition in sorted(set().union(*ledgers.values())):
+        counts = [of.get(disposition, 0) for of in ledgers.values()]
         rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
-    return _table(("disposition", *told, "all"), rows)
+    return _table(("disposition", *ledgers, "all"), rows)
 
 
 def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:

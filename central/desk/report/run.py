@@ -48,8 +48,8 @@ class Run:
 
 def nis_line(run: Run) -> str | None:
     """NIS per degree of freedom of every robot in one line; None where nothing was predicted."""
-    told = {name: of.per_dof for name, of in run.history.innovations.items()}
-    parts = [f"{name} {value:.2f}" for name, value in told.items() if value is not None]
+    per_dof = {name: of.per_dof for name, of in run.history.innovations.items()}
+    parts = [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]
     return f"NIS per dof: {', '.join(parts)}" if parts else None
 
 

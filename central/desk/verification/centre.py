@@ -23,12 +23,12 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 
-def retold_centre(log: Recorded) -> dict[Identity, m.Message]:
+def recomputed_centre(log: Recorded) -> dict[Identity, m.Message]:
     """What the inputs that the recorded maps name give, under the names of these inputs."""
     finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
     maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
     found: dict[Identity, m.Message] = {}
-    for out in _retold(log, maps, finals):
+    for out in _recomputed(log, maps, finals):
         found.setdefault(identity(out.key, out.message), out.message)
     return found
 
@@ -41,23 +41,23 @@ _OF_A_PEER = {
 }
 
 
-def retold_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """As `retold_centre`, of a peer's own fold: by the same rule from the same submaps."""
+def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
+    """As `recomputed_centre`, of a peer's own fold: by the same rule from the same submaps."""
 
-    def said(channel: ch.Channel) -> list[m.FusedMap]:
+    def maps_on(channel: ch.Channel) -> list[m.FusedMap]:
         key = channel.key(robot)
-        own = (each.message for each in log.said if each.sample.key == key)
+        own = (each.message for each in log.outputs if each.sample.key == key)
         return [each for each in own if isinstance(each, m.FusedMap)]
 
     found: dict[Identity, m.Message] = {}
-    for out in _retold(log, said(ch.TEAM_MAP), said(ch.TEAM_FINAL)):
+    for out in _recomputed(log, maps_on(ch.TEAM_MAP), maps_on(ch.TEAM_FINAL)):
         if out.channel.name in _OF_A_PEER and out.name in ("", robot):
             key = _OF_A_PEER[out.channel.name].key(robot)
             found.setdefault(identity(key, out.message), out.message)
     return found
 
 
-def _retold(
+def _recomputed(
     log: Recorded, maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
 ) -> Iterator[Outgoing]:
     """What the inputs that maps name give, in the order of the inputs."""
@@ -67,7 +67,7 @@ def _retold(
     announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
     rule = rule_of(config, digest, sorted(announced.union(log.robots)))
     if RULES[config.fusion].consumes == "measurements":
-        yield from _heard_again(log, Scheduler(rule))
+        yield from _from_measurements(log, Scheduler(rule))
         return
     inputs = _LogInputs(log, RULES[config.fusion].consumes)
     lost = finals[-1].lost if finals else ()
@@ -92,16 +92,16 @@ def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule[Any]) -> m
     return message
 
 
-def _heard_again(log: Recorded, scheduler: Scheduler) -> Iterator[Outgoing]:
+def _from_measurements(log: Recorded, scheduler: Scheduler) -> Iterator[Outgoing]:
     """What a rule on raw measurements says: of the whole stream, as each map changes the next."""
-    for message in _heard(log):
+    for message in _inputs_in_order(log):
         scheduler.intake.take(message, 0)
     yield from scheduler.advance(TeamAttendance.of(scheduler.rule.team))
     if log.published:
         yield from scheduler.conclude(0)
 
 
-def _heard(log: Recorded) -> Iterator[m.Message]:
+def _inputs_in_order(log: Recorded) -> Iterator[m.Message]:
     """The robots' models, every measurement by stream and counter, the end of the streams."""
     for node in sorted(log.configured):
         if node.startswith("robot/"):
@@ -161,6 +161,6 @@ class _LogInputs:
             withdrawn=fused.withdrawn,
             verdicts={verdict_of(each) for each in fused.verdicts},
             missing=fused.missing,
-            heard=fused.heard,
+            arrived=fused.heard,
             now_ns=fused.stamp_ns,
         )

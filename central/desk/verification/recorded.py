@@ -27,7 +27,7 @@ class RerunError(ValueError):
 
 
 @dataclass(frozen=True)
-class Said:
+class RecordedOutput:
     """A recorded message that can be computed again, as its sample and decoded."""
 
     sample: Sample
@@ -49,7 +49,7 @@ class Recorded:
 
     measurements: dict[Stream, dict[int, m.Measurement]] = field(default_factory=dict)
     configured: dict[str, m.Configuration] = field(default_factory=dict)
-    said: list[Said] = field(default_factory=list)
+    outputs: list[RecordedOutput] = field(default_factory=list)
     contradicted: list[m.Measurement] = field(default_factory=list)
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
@@ -90,7 +90,7 @@ class Recorded:
                     (s.robot, s.incarnation): s.measurements for s in message.streams
                 }
             case _ if channel.recomputable:
-                self.said.append(Said(sample, channel, message))
+                self.outputs.append(RecordedOutput(sample, channel, message))
             case _:
                 pass
 
@@ -100,13 +100,13 @@ class Recorded:
 
     def of(self, channel: ch.Channel) -> list[m.Message]:
         """The recorded messages of a channel, in the order of the log."""
-        return [said.message for said in self.said if said.channel is channel]
+        return [outputs.message for outputs in self.outputs if outputs.channel is channel]
 
     @property
     def robots(self) -> list[str]:
         """Every robot that the log has measurements or messages of, by name."""
         names = {robot for robot, _ in self.measurements}
-        names |= {s.message.robot for s in self.said if isinstance(s.message, m.Submap | m.Done)}
+        names |= {s.message.robot for s in self.outputs if isinstance(s.message, m.Submap | m.Done)}
         return sorted(names)
 
     def incarnations(self, robot: str) -> list[int]:
@@ -159,9 +159,9 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
         raise RerunError(f"{what} is not one of this version: {error}") from None
 
 
-_TOLD = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
+_CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
          ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
-INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_TOLD))
+INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_CONFIGURING))
 """The channels whose samples are filed."""
 
 

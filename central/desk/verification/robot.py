@@ -87,18 +87,18 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
 
 def _priors_named(log: Recorded, robot: str) -> PriorsNamed:
-    heard = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
-    priors = {p.digest: p for p in heard if isinstance(p, m.Prior) and p.robot == robot}
-    said: dict[tuple[int, int], list[m.Prior | None]] = {}
+    received = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
+    priors = {p.digest: p for p in received if isinstance(p, m.Prior) and p.robot == robot}
+    used: dict[tuple[int, int], list[m.Prior | None]] = {}
     for channel in (ch.TEAM_POSE, ch.OWN_POSE):
         for pose in log.of(channel):
             if not isinstance(pose, m.PoseEstimate) or pose.robot != robot:
                 continue
-            wanted = said.setdefault((pose.incarnation, pose.stamp_ns), [])
+            names = used.setdefault((pose.incarnation, pose.stamp_ns), [])
             prior = priors.get(pose.map_digest)
-            if prior not in wanted if prior is not None else not wanted:
-                wanted.append(prior)
-    return said
+            if prior not in names if prior is not None else not names:
+                names.append(prior)
+    return used
 
 
 def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
@@ -121,8 +121,8 @@ def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
 
 
 def _dones(log: Recorded, robot: str, incarnation: int) -> list[m.Done]:
-    said = (d for d in log.of(ch.ROBOT_DONE) if isinstance(d, m.Done))
-    return [d for d in said if (d.robot, d.incarnation) == (robot, incarnation)]
+    messages = (d for d in log.of(ch.ROBOT_DONE) if isinstance(d, m.Done))
+    return [d for d in messages if (d.robot, d.incarnation) == (robot, incarnation)]
 
 
 def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
@@ -216,8 +216,8 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     Without a centre nothing holds it up.
     """
     config, digest = log.robot_config(robot)
-    said: dict[int, str] = {}
-    node = RecomputedRobot(config, digest, {}, said.__setitem__)
+    disposition_of: dict[int, str] = {}
+    node = RecomputedRobot(config, digest, {}, disposition_of.__setitem__)
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
@@ -230,4 +230,4 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     if consumed and done is not None:
         end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(consumed))
         node.given(m.End(stamp_ns=0, streams=(end,)))
-    return {counter: said.get(counter, "lost") for counter in consumed}
+    return {counter: disposition_of.get(counter, "lost") for counter in consumed}

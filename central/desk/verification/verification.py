@@ -11,9 +11,15 @@ itself, and what followed from it is right again.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from central.desk.verification.centre import retold_centre, retold_peer
+from central.desk.verification.centre import recomputed_centre, recomputed_peer
 from central.desk.verification.differences import first_difference
-from central.desk.verification.recorded import Identity, Recorded, Said, identity, recorded
+from central.desk.verification.recorded import (
+    Identity,
+    Recorded,
+    RecordedOutput,
+    identity,
+    recorded,
+)
 from central.desk.verification.robot import recomputed_robot
 from team.recording.own_log import OWN
 from team.recording.provenance import provenance
@@ -111,21 +117,21 @@ def verify(log: Log) -> Verification:
     here = provenance()
     other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
     found = recorded(log)
-    retold: dict[Identity, m.Message] = {}
+    recomputed: dict[Identity, m.Message] = {}
     others = _others(log, found)
     for robot in found.robots:
         if robot not in others:
-            retold |= recomputed_robot(found, robot)
-    retold |= retold_centre(found)
+            recomputed |= recomputed_robot(found, robot)
+    recomputed |= recomputed_centre(found)
     for robot in found.robots:
         if robot not in others:
-            retold |= retold_peer(found, robot)
+            recomputed |= recomputed_peer(found, robot)
     results = []
     for channel in CHECKED:
-        heard = (each for each in found.said if each.channel is channel)
-        said = [each for each in heard if getattr(each.message, "robot", "") not in others]
-        if said:
-            results.append(_compared(channel.name, said, retold, found, exact=not other))
+        of_channel = (each for each in found.outputs if each.channel is channel)
+        outputs = [each for each in of_channel if getattr(each.message, "robot", "") not in others]
+        if outputs:
+            results.append(_compared(channel.name, outputs, recomputed, found, exact=not other))
     stamps = [r.stamp_ns for stream in found.measurements.values() for r in stream.values()]
     span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
     return Verification(tuple(results), other, len(stamps), span_s, found.unsound)
@@ -141,16 +147,16 @@ def _others(log: Log, found: Recorded) -> frozenset[str]:
 
 def _compared(
     name: str,
-    said: list[Said],
-    retold: Mapping[Identity, m.Message],
+    outputs: list[RecordedOutput],
+    recomputed: Mapping[Identity, m.Message],
     log: Recorded,
     *,
     exact: bool,
 ) -> ChannelResult:
     equal = close = 0
     differences = []
-    for each in said:
-        again = retold.get(identity(each.sample.key, each.message))
+    for each in outputs:
+        again = recomputed.get(identity(each.sample.key, each.message))
         if again is not None and encoded(again) == each.sample.payload:
             equal += 1
             continue
@@ -161,26 +167,26 @@ def _compared(
             differences.append(difference)
     first = min(differences, key=lambda d: (d.lacks, d.stamp_ns, d.key), default=None)
     lacking = sum(d.lacks for d in differences)
-    return ChannelResult(name, len(said), equal, close, first, lacking)
+    return ChannelResult(name, len(outputs), equal, close, first, lacking)
 
 
 def _difference(
-    said: Said, again: m.Message | None, log: Recorded, *, exact: bool
+    output: RecordedOutput, again: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
-    lacks = None if again is not None else _lacking(said.message, log)
+    lacks = None if again is not None else _lacking(output.message, log)
     if again is None:
         none = "none" if lacks is None else f"{lacks}: none"
         field, there, here = "the message", "there", none
     else:
-        found = first_difference(said.message, again, exact=exact)
+        found = first_difference(output.message, again, exact=exact)
         if found is None:
             if not exact:
                 return None
             field, there, here = "the encoding", "another", "the program's"
         else:
             field, there, here = found.field, found.recorded, found.recomputed
-    sample = said.sample
-    names = _names(said.message)
+    sample = output.sample
+    names = _names(output.message)
     unknown = lacks is not None
     return Difference(
         key=sample.key,
@@ -209,8 +215,8 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
     """The input that is not in the log, in words; None where nothing that a message names lacks."""
     match message:
         case m.PoseEstimate() if any(message.map_digest):
-            heard = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
-            own = (p for p in heard if isinstance(p, m.Prior))
+            priors_of_all = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
+            own = (p for p in priors_of_all if isinstance(p, m.Prior))
             priors = {p.digest for p in own if p.robot == message.robot}
             digest = message.map_digest
             lost = None if digest in priors else f"no prior {digest.hex()} in the log"

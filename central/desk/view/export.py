@@ -12,13 +12,13 @@ from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
-_HEARD = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
+_CHANNELS = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
 
 
-def heard(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
+def for_viewer(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
     """What a viewer hears in a sample; None in what is not for it, or not sound."""
     found = ch.channel_of(sample.key)
-    if found is None or found[0].name not in _HEARD:
+    if found is None or found[0].name not in _CHANNELS:
         return None
     try:
         channel, _, message = opened(sample)
@@ -34,10 +34,10 @@ class Viewing:
         self.node = ViewerNode()
         self._counters: dict[str, int] = {}
 
-    def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
+    def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
         """The views that a sample and what was heard in it bring, with counters of their own."""
         out = []
-        for shown in [] if said is None else self.node.handle(*said):
+        for shown in [] if input_ is None else self.node.handle(*input_):
             counter = self._counters.get(shown.key, 0)
             self._counters[shown.key] = counter + 1
             out.append(Sample(shown.key, shown.payload, shown.stamp_ns, sample.wall_ns, counter))
@@ -50,8 +50,8 @@ def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
             yield sample
-            for said in with_centre_messages(centre, [sample]):
-                yield from viewing.take(said, heard(said))
+            for each in with_centre_messages(centre, [sample]):
+                yield from viewing.take(each, for_viewer(each))
 
 
 def export_views(log: Log, out: Path) -> int:

@@ -75,27 +75,32 @@ class Views:
         return f"team/{self._team}/{key}"
 
     def _made(self, key: str) -> Channel:
-        said = declaration_of(key)
-        assert said is not None
-        schema = Schema(name=said.schema, encoding=said.schema_encoding, data=said.text)
+        declaration = declaration_of(key)
+        assert declaration is not None
+        schema = Schema(
+            name=declaration.schema, encoding=declaration.schema_encoding, data=declaration.text
+        )
         return Channel(
-            self._topic(key), schema=schema, message_encoding=said.encoding, context=self.context
+            self._topic(key),
+            schema=schema,
+            message_encoding=declaration.encoding,
+            context=self.context,
         )
 
 
 class Player(ServerListener):
     """Plays views by their stamps, as whoever looks at them asks."""
 
-    def __init__(self, views: Views, kept: list[Sample]) -> None:
+    def __init__(self, views: Views, recorded: list[Sample]) -> None:
         self._views = views
-        self._kept = kept
-        self._stamps = [view.stamp_ns for view in kept]
+        self._recorded = recorded
+        self._stamps = [view.stamp_ns for view in recorded]
         self._lock = threading.Lock()
         self.playing = False
         self.speed = 1.0
         self.now_ns = 0
         self._sent = 0
-        for key in dict.fromkeys(view.key for view in kept):
+        for key in dict.fromkeys(view.key for view in recorded):
             views.introduce(key)
         self._jump(self.span_ns[0])
 
@@ -140,7 +145,7 @@ class Player(ServerListener):
             end_ns = self.span_ns[1]
             self.now_ns = min(self.now_ns + round(passed_s * self.speed * 1e9), end_ns)
             until = bisect_right(self._stamps, self.now_ns)
-            for view in self._kept[self._sent : until]:
+            for view in self._recorded[self._sent : until]:
                 self._views.say(view)
             self._sent = until
             self.playing = self.now_ns < end_ns
@@ -151,7 +156,7 @@ class Player(ServerListener):
         self.now_ns = min(max(to_ns, self.span_ns[0]), self.span_ns[1])
         self._sent = bisect_right(self._stamps, self.now_ns)
         newest: dict[str, Sample] = {}
-        for view in self._kept[: self._sent]:
+        for view in self._recorded[: self._sent]:
             newest[view.key] = view
         for view in newest.values():
             self._views.say(view)
@@ -174,7 +179,7 @@ class FoxgloveFeed:
     def __init__(self, host: str, port: int, *, live: bool) -> None:
         self._host, self._live = host, live
         self._views = Views()
-        self._kept: list[Sample] = []
+        self._recorded: list[Sample] = []
         self._bytes = 0
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -213,14 +218,14 @@ class FoxgloveFeed:
             if self._server is not None:
                 self._server.broadcast_time(max(view.stamp_ns, 0))
         elif self._bytes < MOST_BYTES:
-            self._kept.append(view)
+            self._recorded.append(view)
             self._bytes += len(view.payload)
 
     def end(self) -> None:
         """The log has been read: from now on it can be played."""
-        if self._live or not self._kept or self._stop.is_set():
+        if self._live or not self._recorded or self._stop.is_set():
             return
-        player = Player(self._views, sorted(self._kept, key=lambda view: view.stamp_ns))
+        player = Player(self._views, sorted(self._recorded, key=lambda view: view.stamp_ns))
         capabilities = [Capability.Time, Capability.PlaybackControl]
         server = self._started(capabilities, player, player.span_ns)
         self._server = server

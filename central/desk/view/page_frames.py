@@ -81,7 +81,7 @@ class PageFrames:
         title = title_of(team, metadata, name)
         self._say("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
-    def take(self, sample: Sample, said: tuple[ch.Channel, m.Message] | None) -> None:
+    def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> None:
         """Take one sample of the log, and what a viewer hears in it."""
         found = ch.channel_of(sample.key)
         channel = "" if found is None else found[0].name
@@ -91,8 +91,8 @@ class PageFrames:
         counted = self._traffic.setdefault(place, [0, 0])
         counted[0] += 1
         counted[1] += len(sample.payload)
-        if said is not None:
-            self._take(*said)
+        if input_ is not None:
+            self._take(*input_)
 
     def flush(self, now_ns: int | None = None) -> list[str]:
         """The frames since the last time; now_ns: how far the robots are."""
@@ -201,8 +201,8 @@ class PageFrames:
         sets = sets_of(message)
         unnamed: dict[str, object] = {}
         if sets:
-            told = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]
-            unnamed = {"n": [count for count, _ in told], "why": [words for _, words in told]}
+            support = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]
+            unnamed = {"n": [count for count, _ in support], "why": [words for _, words in support]}
         self._say(
             "map",
             t=self._t(message.stamp_ns),
@@ -217,10 +217,10 @@ class PageFrames:
 
     def _take_status(self, message: m.Status) -> None:
         second = int(self._t(message.stamp_ns))
-        told = message.node == "central" or message.node.startswith("robot/")
+        shown = message.node == "central" or message.node.startswith("robot/")
         whole, agrees = (message.figures.get(name, 0.0) for name in _OF_A_SET)
         news = second, whole, agrees  # behind the end of the streams peers still come to agree
-        if told and self._figures_s.get(message.node) != news:
+        if shown and self._figures_s.get(message.node) != news:
             self._figures_s[message.node] = news
             figures = {name: _short(value) for name, value in message.figures.items()}
             self._say("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)

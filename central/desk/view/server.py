@@ -20,7 +20,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from central.desk.view.export import Viewing, heard
+from central.desk.view.export import Viewing, for_viewer
 from central.desk.view.page_frames import PageFrames
 from team.recording.reader import LogError
 from team.recording.tail import Tail
@@ -98,9 +98,9 @@ class Feed:
             log = self.tail.log
             self._page.hello(log.team, log.metadata, self.tail.path.name, live=growing)
         for sample in samples:
-            said = heard(sample)
-            self._page.take(sample, said)
-            for view in self._viewing.take(sample, said):
+            input_ = for_viewer(sample)
+            self._page.take(sample, input_)
+            for view in self._viewing.take(sample, input_):
                 if self.audience is not None:
                     self.audience.say(view)
         if samples:

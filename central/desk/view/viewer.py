@@ -5,7 +5,7 @@ import time
 from dataclasses import replace
 
 from central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
-from central.desk.view.export import Viewing, heard
+from central.desk.view.export import Viewing, for_viewer
 from team.containment import Boundary
 from team.shell import STATUS_S, WAIT_S, judge
 from team.the_end import TheEnd
@@ -44,10 +44,10 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
             try:
-                said = heard(sample)
-                if said is not None and isinstance(said[1], FusedMap) and said[1].final:
-                    final = said[1]
-                views = viewing.take(sample, said)
+                input_ = for_viewer(sample)
+                if input_ is not None and isinstance(input_[1], FusedMap) and input_[1].final:
+                    final = input_[1]
+                views = viewing.take(sample, input_)
             except Exception as error:  # what it can not draw it leaves out
                 bus.publish(boundary.note(error, sample, ""))
                 continue

@@ -35,7 +35,7 @@ FORGOTTEN = 1e-3
 _ERRORS = 2**56
 _BIASES = 2**57
 _BASES = 2**58
-HELD_SIGMA = 1e-6
+PINNED_SIGMA = 1e-6
 """Of a base's pose where its sensor's is mounted [m, rad]: none, as far as GTSAM can take it."""
 
 
@@ -109,8 +109,8 @@ def profile_graph(
     for c, chain in enumerate(chains):
         biases = chain.config.front_end.biases
         if has_biases(chain):
-            held = [getattr(sigmas, b) if b in biases else 1e-6 for b in BIASES]
-            model = gtsam.noiseModel.Diagonal.Sigmas(np.array(held))
+            deviations = [getattr(sigmas, b) if b in biases else 1e-6 for b in BIASES]
+            model = gtsam.noiseModel.Diagonal.Sigmas(np.array(deviations))
             graph.push_back(gtsam.PriorFactorPoint3(bias_key(c), np.zeros(3), model))
     for look in detections_of(chains):
         sensor = chains[look.chain].config.sensor
@@ -232,7 +232,7 @@ def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -
     }
     factors = []
     for c, i in _bases(chains):
-        model = gtsam.noiseModel.Isotropic.Sigma(3, HELD_SIGMA)
+        model = gtsam.noiseModel.Isotropic.Sigma(3, PINNED_SIGMA)
         mount = gtsam.Pose2(*chains[c].mount)
         base, sensor = _base_key(chains[c], c, i), pose_key(c, i)
         factors.append(gtsam.BetweenFactorPose2(base, sensor, mount, model))

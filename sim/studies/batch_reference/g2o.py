@@ -31,13 +31,13 @@ def g2o_lines(samples: Iterable[Sample]) -> Iterator[str]:
 
     Raises BatchReferenceError for a log without a scenario or without a joined map.
     """
-    kept = list(samples)
-    run = evaluate(kept)
+    recorded = list(samples)
+    run = evaluate(recorded)
     if run.scenario is None or run.map is None:
         raise BatchReferenceError(
             "the log has no scenario or no final map: record a run to its end"
         )
-    chains, anchors, _ = placed(chains_of(kept, run.scenario), run)
+    chains, anchors, _ = placed(chains_of(recorded, run.scenario), run)
     paths = [anchored(chain, anchor)[2] for chain, anchor in zip(chains, anchors, strict=True)]
     landmarks = landmark_starts(chains, paths, run.map)
     vertex = {landmark: k for k, landmark in enumerate(sorted(landmarks))}

@@ -120,14 +120,14 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
     optimiser does not come to rest.
     """
     gtsam = _gtsam()
-    kept = list(samples)
-    run = evaluate(kept)
+    recorded = list(samples)
+    run = evaluate(recorded)
     if run.scenario is None or run.map is None:
         raise BatchReferenceError(
             "the log has no scenario or no final map: record a run to its end"
         )
     chains, anchors, left_out = placed(
-        chains_of(kept, run.scenario, sightings=noise == "profile"), run
+        chains_of(recorded, run.scenario, sightings=noise == "profile"), run
     )
     if not chains:
         raise BatchReferenceError(

@@ -36,7 +36,7 @@ SHOWN: Shown = (
     ("aligned_median", "median [m]", "{:.3f}"),
     ("shape_nees", "shape NEES", "{:.3g}"),
     ("joined", "joined", "{:.0%}"),
-    ("said", "said", "{:.0f}"),
+    ("warned", "warned", "{:.0f}"),
     ("wrong", "wrong", "{:.0f}"),
     ("silent", "silent", "{:.0f}"),
     ("excluded", "excluded", "{:.0f}"),
@@ -62,10 +62,11 @@ def outcome(options: Options, results: Results) -> Outcome:
         f"few landmarks, one start known, {len(options.seeds)} seeds",
         ("world, landmarks", *(heading for _, heading, _ in SHOWN)),
         tuple((name, *cells_of(of_case, SHOWN)) for name, of_case in figures.items()),
-        "said: maps with a doubt or a reason; wrong: in another minimum than the truth; silent: "
-        "wrong and nothing said; excluded: the submaps deny the truth (1 in 1000 by chance); "
-        "beyond: its own 99.9 % ellipsoid, untold: and nothing said; alarms: of a map that is none "
-        "of these more is said than that a robot is placed weakly or that an ellipsoid is bent",
+        "warned: maps with a warning; wrong: in another minimum than the truth; silent: wrong, and "
+        "without a warning; excluded: the submaps exclude the truth (1 in 1000 by chance); beyond: "
+        "the truth is outside the map's own 99.9 % ellipsoid, untold: and no warning; alarms: maps "
+        "that are none of these, with a warning of more than a weakly placed robot or a nonlinear "
+        "covariance",
     )
     goals = [
         Goal(
@@ -85,7 +86,7 @@ def few_figures(runs: list[Figures]) -> Figures:
     if not runs:
         return figures
     minima = [run["minimum"] for run in runs]
-    said = [bool(run["said"]) for run in runs]
+    warned = [bool(run["reasons"]) for run in runs]
     wrong = [of_run["wrong"] for of_run in minima]
     excluded = [of_run["excluded"] for of_run in minima]
     beyond = [is_beyond(run) for run in runs]
@@ -93,19 +94,23 @@ def few_figures(runs: list[Figures]) -> Figures:
     return figures | {
         "aligned_median": middle(run["rmse_aligned"] for run in runs),
         "joined": sum(not run["not_joined"] for run in runs) / len(runs),
-        "said": sum(said),
+        "warned": sum(warned),
         "wrong": sum(wrong),
-        "silent": sum(is_so and not told for is_so, told in zip(wrong, said, strict=True)),
+        "silent": sum(
+            is_so and not has_warned for is_so, has_warned in zip(wrong, warned, strict=True)
+        ),
         "excluded": sum(excluded),
         "beyond": sum(beyond),
-        "beyond_silent": sum(is_so and not told for is_so, told in zip(beyond, said, strict=True)),
+        "beyond_silent": sum(
+            is_so and not has_warned for is_so, has_warned in zip(beyond, warned, strict=True)
+        ),
         "alarms": sum(_alarmed(run) and not is_so for is_so, run in zip(bad, runs, strict=True)),
     }
 
 
 def _alarmed(run: Figures) -> bool:
-    """Whether more is said than what the covariances do not."""
-    return any(not any(words in text for words in WIDE) for text in run["said"])
+    """Whether a warning is about more than what the covariances do not show."""
+    return any(not any(words in text for words in WIDE) for text in run["reasons"])
 
 
 def is_beyond(run: Figures) -> bool:

@@ -25,7 +25,7 @@ FOLDER = "cases"
 """Of the results, in the folder of an experiment."""
 IDLE_S = 5
 """A worker without a case ends after this."""
-Kept = Callable[..., dict[str, Any]]
+Cached = Callable[..., dict[str, Any]]
 
 
 class SchedulerError(ValueError):
@@ -46,14 +46,14 @@ class Cases:
     """The results in a folder; one counts for a case of the same parameters and program."""
 
     def __init__(self, folder: Path) -> None:
-        self._kept = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
+        self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
 
     def found(self, task: Task) -> dict[str, Any] | None:
         """The result that is kept of a case; None where it is to be computed."""
         arguments = _arguments(task)
-        if not self._kept.check_call_in_cache(**arguments):
+        if not self._cached.check_call_in_cache(**arguments):
             return None
-        result: dict[str, Any] = self._kept(**arguments)
+        result: dict[str, Any] = self._cached(**arguments)
         return result
 
     def run(self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None) -> Iterator[Done]:
@@ -88,7 +88,7 @@ class Cases:
             workers, return_as="generator_unordered", pre_dispatch=at_once, batch_size=1
         )
         done: Generator[Done, None, None] = parallel(
-            delayed(_attempt)(self._kept, task) for task in tasks
+            delayed(_attempt)(self._cached, task) for task in tasks
         )
         return done
 
@@ -124,12 +124,12 @@ def _cancelling() -> Iterator[None]:
     Loky kills the workers first; its thread then stumbles over a case that was handed over at that
     moment, and ends with a KeyError instead of by itself (joblib/loky, pull request 663).
     """
-    told = threading.excepthook
+    previous = threading.excepthook
 
     def hook(error: threading.ExceptHookArgs) -> None:
         ours = isinstance(error.thread, _ExecutorManagerThread)
         if not (ours and error.exc_type is KeyError):
-            told(error)
+            previous(error)
 
     threading.excepthook = hook
     try:
@@ -137,12 +137,12 @@ def _cancelling() -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     finally:
-        threading.excepthook = told
+        threading.excepthook = previous
 
 
-def _attempt(kept: Kept, task: Task) -> Done:
+def _attempt(cached: Cached, task: Task) -> Done:
     try:
-        return Done(task, kept(**_arguments(task)))
+        return Done(task, cached(**_arguments(task)))
     except Exception as error:  # whatever a case raises is that case's result
         text = " ".join(str(error).split())
         return Done(task, None, f"{type(error).__name__}: {text}", traceback.format_exc())

@@ -35,21 +35,22 @@ DIGITS = 5
 
 def curves_task(
     scenario: Scenario,
-    told: Scenario | None = None,
+    team_scenario: Scenario | None = None,
     label: str = "",
     *,
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Task:
-    """The curves of a run. told: the scenario that the team is told, where the world's differs.
+    """A task that computes the curves of one run.
 
-    late: each step's measurements are those of the step before. shots: the steps at which maps and
-    paths are kept to be drawn.
+    team_scenario: the scenario that the team uses, where it differs from the world's. late: each
+    step's measurements are those of the step before. shots: the steps at which maps and paths are
+    stored for pictures.
     """
     return Task(
         "sim.studies.experiments.curves:curves_run",
         {"world": msgspec.to_builtins(scenario)}
-        | ({} if told is None else {"told": msgspec.to_builtins(told)})
+        | ({} if team_scenario is None else {"team_scenario": msgspec.to_builtins(team_scenario)})
         | ({"late": True} if late else {})
         | ({"shots": list(shots)} if shots else {}),
         f"{'maps of ' if shots else ''}{label or scenario.name}, "
@@ -60,13 +61,13 @@ def curves_task(
 
 def curves_run(
     world: Mapping[str, Any],
-    told: Mapping[str, Any] | None = None,
+    team_scenario: Mapping[str, Any] | None = None,
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
     """The curves of every robot's pose, of the first landmark, of the map; the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
-    team = scenario if told is None else loads(msgspec.json.encode(told).decode())
+    team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
     samples = list(TimedRun().samples(team, a_step_late(streams) if late else streams))
     evaluation = evaluate(samples)
@@ -74,7 +75,7 @@ def curves_run(
     truth = dict(zip(ids.tolist(), positions, strict=True))
     first = scenario.robots[0].id
     maps = _maps(samples, first)
-    paths = {name: said_poses(samples, pose_keys(team, name)) for name in evaluation.robots}
+    paths = {name: estimated_poses(samples, pose_keys(team, name)) for name in evaluation.robots}
     found: Figures = {
         "poses": {
             name: _pose_curve(errors)
@@ -133,17 +134,17 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
     return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
 
 
-def said_poses(
+def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
     """The poses and covariances of these keys; of one time that of the last key."""
-    said: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
+    by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
-        if sample.key in said:
+        if sample.key in by_stamp:
             message = opened(sample)[2]
             if isinstance(message, m.PoseEstimate):
-                said[sample.key][message.stamp_ns] = message
-    newest = {stamp_ns: pose for key in keys for stamp_ns, pose in said[key].items()}
+                by_stamp[sample.key][message.stamp_ns] = message
+    newest = {stamp_ns: pose for key in keys for stamp_ns, pose in by_stamp[key].items()}
     estimates = [newest[stamp_ns] for stamp_ns in sorted(newest)]
     return Path(
         np.array(sorted(newest), dtype=np.int64),
@@ -167,15 +168,17 @@ def _pose_curve(found: PoseErrors) -> Figures:
 def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
     """The team's maps with landmarks in them in their order; without any, those of the robot."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
-        said = messages(samples, key)
-        maps = [each for each in said if isinstance(each, m.FusedMap | m.MapEstimate) and each.ids]
+        published = messages(samples, key)
+        maps = [
+            each for each in published if isinstance(each, m.FusedMap | m.MapEstimate) and each.ids
+        ]
         if maps:
             return maps
     return []
 
 
-def _map_rmse(said: Map, truth: Mapping[int, Float[np.ndarray, "2"]]) -> float:
-    ids, means = translate.landmarks_of(said)
+def _map_rmse(estimate: Map, truth: Mapping[int, Float[np.ndarray, "2"]]) -> float:
+    ids, means = translate.landmarks_of(estimate)
     true = np.array([truth[int(landmark)] for landmark in ids])
     return float(np.sqrt(((means - true) ** 2).sum(axis=1).mean()))
 

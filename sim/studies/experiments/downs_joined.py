@@ -20,7 +20,7 @@ from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
-from sim.studies.experiments.curves import messages, said_poses, true_landmarks
+from sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
 from sim.studies.experiments.experiment import Dataset
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, expected_s
@@ -112,14 +112,14 @@ def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = 
 def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
     """The first robot's last map and its paths, to be drawn."""
     name, robot = next(iter(evaluation.robots.items()))
-    said = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
-    last = next((each for each in reversed(said) if isinstance(each, m.MapEstimate)), None)
+    maps = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
+    last = next((each for each in reversed(maps) if isinstance(each, m.MapEstimate)), None)
     return {
         "robot": name,
         "means": [] if last is None else translate.landmarks_of(last)[1].tolist(),
         "blocks": [] if last is None else translate.landmark_blocks_of(last).tolist(),
         "landmarks": true_landmarks(samples)[1].tolist(),
-        "online": _thinned(said_poses(samples, (ch.OWN_POSE.key(name),))[0]),
+        "online": _thinned(estimated_poses(samples, (ch.OWN_POSE.key(name),))[0]),
         "truth": _thinned(robot.truth),
     }
 
@@ -182,8 +182,8 @@ def _samples(scenario: Mapping[str, Any], path: str | None) -> list[Sample]:
 
 def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
     """A robot's submaps in their order."""
-    said = [opened(s)[2] for s in samples if s.key == ch.SUBMAP.key(robot)]
-    by_sequence = {each.sequence: each for each in said if isinstance(each, m.Submap)}
+    submaps = [opened(s)[2] for s in samples if s.key == ch.SUBMAP.key(robot)]
+    by_sequence = {each.sequence: each for each in submaps if isinstance(each, m.Submap)}
     return [by_sequence[sequence] for sequence in sorted(by_sequence)]
 
 

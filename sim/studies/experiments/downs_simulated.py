@@ -131,10 +131,10 @@ class SimulatedTable(NamedTuple):
         for world in WORLDS:
             count = world.partition("-")[2]
             for method in self.methods:
-                for name, said in self.figures:
+                for name, suffix in self.figures:
                     values = list(_by_seed(world, method, name, options, results).values())
                     if values:
-                        found[f"{count}, {method.name}{said}"] = values
+                        found[f"{count}, {method.name}{suffix}"] = values
         return found
 
     def _tests(self, options: Options, results: Results) -> dict[str, Figures]:

@@ -35,14 +35,14 @@ class Curves:
         times_s: Float[np.ndarray, " K"],
         runs: Sequence[Mapping[str, Any]],
         *,
-        held: bool,
+        stepwise: bool,
     ) -> Self:
         """The runs' curves at these times. held: a value stands until the next one comes."""
         nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
         return cls(
             times_s,
-            np.array([sampled(times_s, run, "error_m", held=held) for run in runs]),
-            np.array([sampled(times_s, run, "sigma_m", held=held) for run in runs]),
+            np.array([sampled(times_s, run, "error_m", stepwise=stepwise) for run in runs]),
+            np.array([sampled(times_s, run, "sigma_m", stepwise=stepwise) for run in runs]),
             np.array(nees) if nees else None,
         )
 
@@ -60,13 +60,13 @@ class Curves:
 
 
 def sampled(
-    times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, held: bool
+    times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
     """A curve of a run at these times; held: as `Curves.on` has it."""
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)
-    if not held:
+    if not stepwise:
         between: Float[np.ndarray, " K"] = np.interp(times_s, stamps, values)
         return between
     place = np.searchsorted(stamps, times_s + 1e-6, side="right") - 1

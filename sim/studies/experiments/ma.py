@@ -17,7 +17,13 @@ from central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION
 from central.desk.evaluation.errors import Path, pose_errors
 from central.desk.evaluation.evaluation import evaluate
 from sim.scenarios.scenario import Scenario, load, loads, with_options
-from sim.studies.experiments.curves import messages, pose_keys, said_poses, short, true_landmarks
+from sim.studies.experiments.curves import (
+    estimated_poses,
+    messages,
+    pose_keys,
+    short,
+    true_landmarks,
+)
 from sim.studies.experiments.experiment import Dataset
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, TimedRun, named
@@ -103,13 +109,15 @@ def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
     samples = list(TimedRun().samples(resolved))
     evaluation = evaluate(samples)
     paths = {
-        name: (*said_poses(samples, pose_keys(resolved, name)), robot.truth)
+        name: (*estimated_poses(samples, pose_keys(resolved, name)), robot.truth)
         for name, robot in evaluation.robots.items()
     }
-    start_ns = min(int(said.stamps_ns[0]) for said, _, _ in paths.values() if len(said.stamps_ns))
+    start_ns = min(
+        int(estimate.stamps_ns[0]) for estimate, _, _ in paths.values() if len(estimate.stamps_ns)
+    )
     ids, positions = true_landmarks(samples)
     truth = dict(zip(ids.tolist(), positions, strict=True))
-    robots = {name: _robot(*said, start_ns) for name, said in paths.items()}
+    robots = {name: _robot(*estimate, start_ns) for name, estimate in paths.items()}
     first = resolved.robots[0].id
     return {
         "robots": robots,
@@ -124,16 +132,16 @@ def _frames(stamps_ns: np.ndarray, start_ns: int) -> list[float]:
 
 
 def _robot(
-    said: Path, covariances: Float[np.ndarray, "K 3 3"], true: Path, start_ns: int
+    estimate: Path, covariances: Float[np.ndarray, "K 3 3"], true: Path, start_ns: int
 ) -> Figures:
     """The curve of a robot's position error over frames, and its lines."""
-    thinned = max(1, -(-len(said.poses) // _LINE_POINTS))
-    end_ns = int(said.stamps_ns[-1]) if len(said.stamps_ns) else 0
+    thinned = max(1, -(-len(estimate.poses) // _LINE_POINTS))
+    end_ns = int(estimate.stamps_ns[-1]) if len(estimate.stamps_ns) else 0
     there = (true.stamps_ns >= start_ns) & (true.stamps_ns <= end_ns)
     every = max(1, -(-int(there.sum()) // _LINE_POINTS))
-    found = pose_errors(said, covariances, true)
+    found = pose_errors(estimate, covariances, true)
     return {
-        "line": said.poses[::thinned, :2].round(3).tolist(),
+        "line": estimate.poses[::thinned, :2].round(3).tolist(),
         "truth": true.poses[there][::every, :2].round(3).tolist(),
         "end_block": covariances[-1, :2, :2].tolist() if len(covariances) else None,
         "curve": None

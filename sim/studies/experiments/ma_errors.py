@@ -105,7 +105,7 @@ class ErrorFigure(NamedTuple):
             runs = results.of_all(_runs(dataset, method, options))
             curves = [curve for run in runs if (curve := _curve(run, self.of)) is not None]
             if curves:
-                found[method.name] = Curves.on(frames, curves, held=True)
+                found[method.name] = Curves.on(frames, curves, stepwise=True)
         return found
 
 

@@ -58,8 +58,8 @@ def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, An
         "datasets": {each.name: each.sha256 for each in options.datasets},
         "runs": concluded.runs,
         "parameters": [
-            {"run": label, "count": count, "parameters": said}
-            for label, count, said in concluded.kinds
+            {"run": label, "count": count, "parameters": parameters}
+            for label, count, parameters in concluded.kinds
         ],
         **outcome.figures,
         "goals": [
@@ -203,8 +203,8 @@ def _kinds(concluded: Concluded) -> str:
     if not concluded.kinds:
         return ""
     rows = "".join(
-        f"<tr><td>{escape(label)}</td><td>{count}</td><td>{escape(said)}</td></tr>"
-        for label, count, said in concluded.kinds
+        f"<tr><td>{escape(label)}</td><td>{count}</td><td>{escape(parameters)}</td></tr>"
+        for label, count, parameters in concluded.kinds
     )
     head = "<tr><th>runs</th><th>seeds</th><th>where they differ from the scenario</th></tr>"
     return (

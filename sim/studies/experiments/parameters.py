@@ -19,12 +19,12 @@ def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
         label = task.label.rpartition(", seed ")[0] or task.label
-        kind = label, "; ".join(_said(task))
+        kind = label, "; ".join(_parameters(task))
         found[kind] = found.get(kind, 0) + 1
-    return [(label, count, said) for (label, said), count in found.items()]
+    return [(label, count, parameters) for (label, parameters), count in found.items()]
 
 
-def _said(task: Task) -> Iterator[str]:
+def _parameters(task: Task) -> Iterator[str]:
     """Its scenarios by their differences from the built-in ones, all else as it is."""
     yield task.work.rpartition(".")[2]
     for name, value in task.parameters.items():

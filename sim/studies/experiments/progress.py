@@ -15,10 +15,10 @@ LINE_S = 10.0
 
 
 @contextmanager
-def shown(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]:
+def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
     """A function that hears of every finished task; failures are told at once."""
     console = Console(stderr=True)
-    of = f"{len(tasks)} runs" + (f", {kept} more are kept from before" if kept else "")
+    of = f"{len(tasks)} runs" + (f", {found} more are kept from before" if found else "")
     # Runs cost very different times: the bar goes by what they are expected to cost.
     cost = sum(task.cost for task in tasks)
     bar = Progress(

@@ -69,8 +69,8 @@ def computed(
     folder.mkdir(parents=True, exist_ok=True)
     tasks = {task.name: task for plan in plans for task in plan.tasks}
     cases = Cases(folder)
-    kept = {name: cases.found(task) for name, task in tasks.items()}
-    results = {name: result for name, result in kept.items() if result is not None}
+    cached = {name: cases.found(task) for name, task in tasks.items()}
+    results = {name: result for name, result in cached.items() if result is not None}
     missing = [task for name, task in tasks.items() if name not in results]
     failures: dict[str, Done] = {}
     with progress(missing, len(results)) as tell:

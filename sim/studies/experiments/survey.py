@@ -163,14 +163,14 @@ def _fastslam(particles: int, options: Options) -> list[Task]:
 def _table_2_1(figures: dict[str, Figures]) -> Table:
     """Uncertainty and online, as printed and as measured."""
     rows = []
-    for said in SURVEYED:
-        found = _found(said, figures)
+    for surveyed in SURVEYED:
+        found = _found(surveyed, figures)
         measured = cells_of(
             found,
             (("nees", "", "{:.3g}"), ("online_pose_nees", "", "{:.3g}"),
              ("us_per_step", "", "{:.0f}")),
         )  # fmt: skip
-        rows.append((said.method, said.uncertainty, said.online, *measured))
+        rows.append((surveyed.method, surveyed.uncertainty, surveyed.online, *measured))
     return Table(
         "table 2.1 of the thesis, with what was measured on `thesis`",
         ("method", "uncertainty", "online", "map NEES/dof", "pose NEES/dof", "µs/step"),
@@ -188,8 +188,13 @@ def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Ta
         ("bytes_per_step", "B/step", "{:.0f}"),
     )
     rows = [
-        (said.method, said.pros, said.cons, *cells_of(_found(said, figures), columns))
-        for said in SURVEYED
+        (
+            surveyed.method,
+            surveyed.pros,
+            surveyed.cons,
+            *cells_of(_found(surveyed, figures), columns),
+        )
+        for surveyed in SURVEYED
     ]
     rows += [
         (f"… with {count} particles", "", "", *cells_of(found, columns))
@@ -202,7 +207,7 @@ def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Ta
     )
 
 
-def _found(said: SurveyedMethod, figures: dict[str, Figures]) -> Figures:
-    if said.method == BATCH:
+def _found(surveyed: SurveyedMethod, figures: dict[str, Figures]) -> Figures:
+    if surveyed.method == BATCH:
         return figures.get("batch", {})
-    return {} if said.pair is None else figures.get(named(*said.pair), {})
+    return {} if surveyed.pair is None else figures.get(named(*surveyed.pair), {})

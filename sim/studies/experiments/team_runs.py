@@ -106,8 +106,8 @@ def team_run(
     if minimum:
         found = true_minimum(samples, evaluation)
         if found is not None:
-            told = {"wrong": found.wrong, "excluded": found.excluded}
-            figures["minimum"] = found._asdict() | told
+            verdicts = {"wrong": found.wrong, "excluded": found.excluded}
+            figures["minimum"] = found._asdict() | verdicts
     if batch:
         try:
             figures["batch"] = reference_figures(batch_map(samples, noise))
@@ -210,7 +210,7 @@ def team_figures(evaluation: Evaluation) -> Figures:
         "final_map_sha256": None if evaluation.map is None else evaluation.map.payload_sha256,
         "not_joined": [] if fused is None else [r for r in fused.reasons if "not joined" in r],
         "withdrawn": [] if fused is None else list(fused.withdrawn),
-        "said": [] if fused is None else list(fused.reasons),
+        "reasons": [] if fused is None else list(fused.reasons),
         "robots": {name: _robot_figures(robot) for name, robot in evaluation.robots.items()},
     }
 

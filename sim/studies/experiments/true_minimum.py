@@ -39,22 +39,23 @@ Values = Float[np.ndarray, " _"]
 
 
 class TrueMinimum(NamedTuple):
-    """How the map's minimum lies to the truth.
+    """The map's minimum compared with the one that a solution from the truth reaches.
 
-    lower: by how much a solution from the truth has less cost. elsewhere: it ends in another place
-    that is likely. rise: of the cost with the landmarks and each robot's first end of a submap held
-    at the truth; dof: how many numbers that holds.
+    lower: how much less the cost of the solution from the truth is. other_minimum: that solution
+    ends outside the map's 99.9 % ellipsoid, at a cost that does not exclude it. rise: how much more
+    the cost is with the landmarks and the end of each robot's first submap fixed at the truth; dof:
+    number of coordinates that are fixed so.
     """
 
     lower: float
-    elsewhere: bool
+    other_minimum: bool
     rise: float
     dof: int
 
     @property
     def wrong(self) -> bool:
         """Whether the map is in another minimum than the truth."""
-        return self.lower > LOWER or self.elsewhere
+        return self.lower > LOWER or self.other_minimum
 
     @property
     def excluded(self) -> bool:
@@ -120,8 +121,8 @@ def judged(
     place = float(chi2_quantile(LIKELY, 3))
     other = ends.at_rest and whitened @ whitened > place and ends.cost - ours < place
     firsts = {nodes[1] for nodes in graph.streams.values()}
-    held = sorted(({*graph.landmarks.values()} | firsts) & known)
-    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in held]
+    pinned_nodes = sorted(({*graph.landmarks.values()} | firsts) & known)
+    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in pinned_nodes]
     pinned = fixed.copy()
     pinned[np.concatenate([np.zeros(0, np.int64), *spans])] = True
     given = PlainCost(graph, settings.covariance_factor, pinned)
@@ -150,8 +151,8 @@ def _at_truth(
         path = paths[contribution.robot]
         stamps = np.array([contribution.end_ns, *contribution.local.node_stamps.tolist()])
         poses, there = interpolated(path, stamps)
-        for node, pose, told in zip(nodes[1:], poses, there, strict=False):
-            if told:
+        for node, pose, is_known in zip(nodes[1:], poses, there, strict=False):
+            if is_known:
                 place(int(node), pose)
         if contribution.sequence == 0 and not graph.fixed[nodes[0]] and len(path.poses):
             place(int(nodes[0]), path.poses[0])

@@ -140,7 +140,7 @@ class ErrorFigure(NamedTuple):
             runs = results.of_all([task(panel, method, seed) for seed in options.seeds])
             curves = [curve for run in runs if (curve := _of(run, self.of)) is not None]
             if curves:
-                found[method.name] = Curves.on(steps, curves, held=self.of == "landmark")
+                found[method.name] = Curves.on(steps, curves, stepwise=self.of == "landmark")
         return found
 
 
@@ -162,9 +162,9 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
     label = f"thesis, {panel.name}" if panel.name else "thesis"
     if panel.reading == "stated":
         return curves_task(scenario, None, label, shots=shots)
-    told = as_coded(scenario) if panel.reading == "coded" else scenario
+    as_used = as_coded(scenario) if panel.reading == "coded" else scenario
     late = panel.reading == "coded"
-    return curves_task(with_noise(told, 0.0, 0.0), told, label, late=late, shots=shots)
+    return curves_task(with_noise(as_used, 0.0, 0.0), as_used, label, late=late, shots=shots)
 
 
 def _telling(scenario: Scenario) -> Scenario:

@@ -187,7 +187,7 @@ class _Run:
     truth: Mapping[int, np.ndarray]
 
 
-def _heard(world: Mapping[str, Any]) -> _Run:
+def _run_of(world: Mapping[str, Any]) -> _Run:
     scenario = loads(msgspec.json.encode(world).decode())
     config = scenario.robots[0]
     samples = list(run_team(scenario, streams_of(scenario)))
@@ -220,7 +220,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     """Predict over the whole stretch, weigh by one measurement, resample; a summary of each
     cloud.
     """
-    run = _heard(world)
+    run = _run_of(world)
     sensor = run.scenario.robots[0].sensor
     random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
     nothing = np.empty(0)
@@ -274,7 +274,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     """The filter from a uniform cloud over the place, by the farthest measurement of each step."""
-    run = _heard(world)
+    run = _run_of(world)
     config = run.scenario.robots[0]
     assert isinstance(run.scenario.world, SimulatedWorld)
     random = generator(run.scenario.seed, config.id, 0, 0)
@@ -283,7 +283,7 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         np.zeros(2), np.full(2, side), ANYWHERE_PARTICLES, run.ids, run.landmarks, random
     )
     found: Figures = {"0": _summary(state, run.start)}
-    kept = [_cloud(state.cloud, DRAWN)]
+    drawn = [_cloud(state.cloud, DRAWN)]
     poses = [run.start.tolist()]
     for k, each in enumerate(run.keyframes, 1):
         keyframe = each.keyframe
@@ -296,10 +296,10 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
             true = run.truth[each.stamp_ns]
             found[str(k)] = _summary(state, true)
             # What carries no weight is gone after the next resampling.
-            kept.append(_cloud(fastslam.resampled(state.cloud, random)[0], DRAWN))
+            drawn.append(_cloud(fastslam.resampled(state.cloud, random)[0], DRAWN))
             poses.append(true.tolist())
     if clouds:
-        found |= {"clouds": kept, "poses": poses, "landmarks": run.landmarks.tolist()}
+        found |= {"clouds": drawn, "poses": poses, "landmarks": run.landmarks.tolist()}
     return found
 
 

@@ -66,19 +66,19 @@ class MapFigure(NamedTuple):
             run = results.of(self._drawn(method, reading, options))
             if run is None:
                 continue
-            said = _named(method, reading)
-            pictures += self._pictures(said, run, options.seeds[0])
+            label = _named(method, reading)
+            pictures += self._pictures(label, run, options.seeds[0])
             runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
             curves = [each["map"] for each in runs if each["map"]["time_s"]]
             times = STEP_S * np.array(self.steps, dtype=np.float64)
-            errors = np.array([sampled(times, each, "error_m", held=True) for each in curves])
+            errors = np.array([sampled(times, each, "error_m", stepwise=True) for each in curves])
             errors = errors.reshape(-1, len(times))
-            figures[said] = {
+            figures[label] = {
                 str(shot["step"]): {"run_m": shot["rmse_m"]}
                 | (spread(errors[:, k]) if _known(errors[:, k : k + 1]) else {})
                 for k, shot in enumerate(run["shots"])
             }
-            rows.append((said, *(_cell(each) for each in figures[said].values())))
+            rows.append((label, *(_cell(each) for each in figures[label].values())))
         table = Table(
             f"{self.title}: landmark RMSE [m], {len(options.seeds)} seeds",
             ("method", *(f"step {step}" for step in self.steps)),
@@ -92,13 +92,13 @@ class MapFigure(NamedTuple):
     def _drawn(self, method: Method, reading: Reading, options: Options) -> Task:
         return _run(method, reading, options.seeds[0], self.steps)
 
-    def _pictures(self, said: str, run: Figures, seed: int) -> list[Picture]:
+    def _pictures(self, label: str, run: Figures, seed: int) -> list[Picture]:
         """One for each step, lettered as in the source where there are several."""
-        name = said.replace(" ", "-").replace(",", "").lower()
+        name = label.replace(" ", "-").replace(",", "").lower()
         pictures = []
         for k, shot in enumerate(run["shots"]):
             letter = chr(ord("a") + k) if len(self.steps) > 1 else ""
-            title = f"{self.title}{f' ({letter})' if letter else ''}: {said}"
+            title = f"{self.title}{f' ({letter})' if letter else ''}: {label}"
             caption = (
                 f"{title}, seed {seed}, step {shot['step']}. Ellipses hold 95 % of what the map "
                 "believes; crosses are the true landmarks, grey the true paths."

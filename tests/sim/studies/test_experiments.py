@@ -196,7 +196,7 @@ def few_run(
     robots = {"r1": {"first_pose_chi2": 1.0}, "r2": {"first_pose_chi2": first_chi2}}
     figures: Figures = {"rmse_aligned": 0.5, "shape_nees": shape_nees, "landmarks": 4.0}
     figures["minimum"] = {"wrong": wrong, "excluded": False}
-    return figures | {"robots": robots, "not_joined": [], "said": said}
+    return figures | {"robots": robots, "not_joined": [], "reasons": said}
 
 
 SURVEYED = ["another map fits about as well"]

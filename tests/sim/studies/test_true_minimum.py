@@ -70,7 +70,7 @@ def test_the_other_one_of_two_places_is_wrong(bearing_sigma: float, lower: bool)
     paths = {robot: Path(stamps, way) for robot, way in poses.items()}
     assert not judged(minimum(island).island, {}, paths).wrong
     found = judged(minimum(across).island, {}, paths)
-    assert found.elsewhere
+    assert found.other_minimum
     assert (found.lower > 1.0) == lower
 
 

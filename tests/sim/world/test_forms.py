@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim.world.config import SimulatedWorld
-from sim.world.forms import claimed, increments_told, seen_from, steering_told, with_errors
+from sim.world.forms import claimed, measured_increments, measured_steering, seen_from, with_errors
 from sim.world.sensing import Visible
 from sim.world.simulator import simulated
 from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
@@ -27,7 +27,7 @@ def test_told_increments_err_by_what_they_claim() -> None:
     poses = np.tile([[0.0, 0.0, 0.3], [0.8, 0.5, 0.9]], (count, 1))
     steps = np.tile([[0.9, 0.6]], (len(poses) - 1, 1))
     normals = rng.standard_normal((len(steps), 3))
-    told, C = increments_told(MOTION, poses, steps, np.ones(len(steps)), normals, 0.7)
+    told, C = measured_increments(MOTION, poses, steps, np.ones(len(steps)), normals, 0.7)
     errors = []
     for k in range(0, len(steps), 2):
         rest = (
@@ -42,7 +42,7 @@ def test_told_increments_err_by_what_they_claim() -> None:
 
 def test_a_car_that_circles_reads_the_angle_and_the_speed_of_its_circle() -> None:
     car = MotionModel("ackermann", wheel_base=2.0, wheel_offset=0.5, steering_offset=0.1)
-    wheel, angle = steering_told(car, np.array([2.0, 0.0]), np.array([0.2, 0.0]))
+    wheel, angle = measured_steering(car, np.array([2.0, 0.0]), np.array([0.2, 0.0]))
     radius = 10.0
     np.testing.assert_allclose(angle, [np.arctan(2.0 / radius) - 0.1, -0.1])
     np.testing.assert_allclose(wheel, [0.2 * (radius - 0.5), 0.0])

@@ -10,7 +10,7 @@ from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld
-from sim.world.odometry import told
+from sim.world.odometry import measured_speeds
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
@@ -88,7 +88,9 @@ def test_a_filter_with_another_model_is_found_out(name: str, wrong: dict[str, ob
 def test_wheels_that_differ_make_errors_of_way_and_turn_that_go_together() -> None:
     steps = np.tile([1.0, 0.0], (4000, 1))
     normals = np.random.default_rng(1).standard_normal((4000, 2))
-    forward, yaw_rate = told(MODELS["wheels"], steps, np.ones(4000), np.zeros((4000, 2)), normals)
+    forward, yaw_rate = measured_speeds(
+        MODELS["wheels"], steps, np.ones(4000), np.zeros((4000, 2)), normals
+    )
     expected = (0.012**2 - 0.004**2) / (0.012**2 + 0.004**2)
     assert np.corrcoef(forward, yaw_rate)[0, 1] == pytest.approx(expected, abs=0.03)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from central.kept import KeptSet
+from central.stored_set import StoredSet
 from team.peers.store import StoreError
 from team.wire import channels as ch
 from team.wire.bus import Sample
@@ -17,9 +17,9 @@ SENT = [Sample(ch.SUBMAP.key("alpha"), encoded(submap(i)), 0, 0, i) for i in ran
 
 
 @contextmanager
-def a_life(path: Path) -> Iterator[KeptSet]:
+def a_life(path: Path) -> Iterator[StoredSet]:
     """A centre's set from its start to its end."""
-    kept = KeptSet(path)
+    kept = StoredSet(path)
     yield kept
     kept.close()
 
@@ -72,4 +72,4 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "central.set"
     path.write_text("something else")
     with pytest.raises(StoreError, match="is no set of a peer: give --set another file"):
-        KeptSet(path)
+        StoredSet(path)

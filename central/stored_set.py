@@ -14,10 +14,10 @@ from team.wire import channels as ch
 from team.wire.bus import Sample
 from team.wire.codec import WireError
 
-_KEPT = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
+_STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
 
 
-class KeptSet:
+class StoredSet:
     """Keeps each member once. Raises StoreError where the file can not be used."""
 
     def __init__(self, path: Path) -> None:
@@ -37,7 +37,7 @@ class KeptSet:
         news = []
         for sample in samples:
             found = ch.channel_of(sample.key)
-            if found is None or found[0] not in _KEPT:
+            if found is None or found[0] not in _STORED:
                 continue
             try:
                 member = member_of(sample.key, sample.payload)
