@@ -1,1 +1,1 @@
-"""The batch MAP over all raw measurements, which no team can beat."""
+"""The batch MAP over all raw measurements: the accuracy that no team can exceed."""

@@ -31,19 +31,21 @@ from team.estimation.models import NEAREST_M, predicted
 BIASES = ("bearing", "range_offset", "range_scale")
 """The errors of a robot's sensor that the centre would estimate, in their order here."""
 FORGOTTEN = 1e-3
-"""A correlation below this is none: the process begins anew."""
+"""Below this correlation the errors count as independent, and the process begins anew."""
 _ERRORS = 2**56
 _BIASES = 2**57
 _BASES = 2**58
 PINNED_SIGMA = 1e-6
-"""Of a base's pose where its sensor's is mounted [m, rad]: none, as far as GTSAM can take it."""
+"""Standard deviation [m, rad] that fixes a base's pose to that of its mounted sensor, the least
+that GTSAM handles.
+"""
 
 
 class Look(NamedTuple):
     """A landmark seen from a pose of a chain, and the error state of this measurement.
 
-    before: the error state of the measurement of the same landmark that is gap_s older. number: of
-    the measurement in its scan.
+    before: the error state of the measurement of the same landmark that is gap_s older. number:
+    index of the measurement in its scan.
     """
 
     key: int
@@ -101,7 +103,7 @@ def profile_graph(
 ) -> Any:
     """All factors. The range noise is the sensor's at the range that the joined solution predicts.
 
-    The Cauchy loss of scale c is on √(χ²/2) of each measurement and inter-robot measurement, as the
+    The Cauchy loss of scale c is on √(χ²/2) of each measurement and inter-robot measurement; the
     centre's is on √(χ²/dim) of each submap.
     """
     graph = path_graph(gtsam, chains, poses)
@@ -138,12 +140,14 @@ def profile_graph(
 
 
 def has_biases(chain: Chain) -> bool:
-    """Whether the centre would estimate an error of this robot's sensor."""
+    """Whether the centre would estimate a bias of this robot's sensor."""
     return bool(set(BIASES) & set(chain.config.front_end.biases))
 
 
 def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
-    """The values with all error states and biases at zero, and the bases where the sensors say."""
+    """The values with all error states and biases at zero, and the bases at their sensors'
+    poses.
+    """
     for c, i in _bases(chains):
         pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
         values.insert(_base_key(chains[c], c, i), pose)
@@ -206,13 +210,15 @@ def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
 
 
 def _base_key(chain: Chain, number: int, pose: int) -> int:
-    """Of the base's pose: the sensor's, unless that is mounted elsewhere."""
+    """The key of the base's pose: the sensor's own unless the sensor is mounted away from
+    the base.
+    """
     own = pose_key(number, pose)
     return _BASES + own if chain.config.sensor.is_mounted else own
 
 
 def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
-    """(chain, pose) of the base's poses that are states: those at inter-robot measurements."""
+    """(chain, pose) of the base's poses that are states: those with inter-robot measurements."""
     times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
     return [
         (c, i)
@@ -224,7 +230,9 @@ def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
 
 
 def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -> list[Any]:
-    """Between the bases' poses of two robots at one time; none where the teammate has none then."""
+    """The factors between the base poses of two robots at one time, where the teammate has a pose
+    then.
+    """
     keys = {
         (chain.config.id, int(stamp)): _base_key(chain, c, i)
         for c, chain in enumerate(chains)

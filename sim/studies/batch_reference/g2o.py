@@ -1,10 +1,10 @@
-"""The batch problem of a log as a file of g2o, for other optimisers to start from and to beat.
+"""Writes the batch problem of a log as a g2o file, for other optimisers to start from.
 
 VERTEX_SE2 are the poses of the robots' sensors at their keyframes, VERTEX_XY the landmarks, both
-where the joined map and the odometry between have them; FIX holds the first pose of each robot
-whose initial pose is exactly known. EDGE_SE2 is the odometry, EDGE_SE2_XY a measurement as the
-point that it says, in the sensor's frame, with the first-order covariance of range and bearing at
-the joined map's range. So it is the problem of `factor_graph` but for that linearisation.
+from the joined map and the odometry between; FIX holds the first pose of each robot whose initial
+pose is exactly known. EDGE_SE2 is the odometry, EDGE_SE2_XY a measurement as a point in the
+sensor's frame, with the first-order covariance of range and bearing at the joined map's range. Up
+to that linearisation it is the problem of `factor_graph`.
 https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
 """
 

@@ -1,6 +1,7 @@
 """The factor graph of the batch MAP in GTSAM: keys, factors and values.
 
-GTSAM is handed in, since it is an optional extra. Its poses are perturbed on the right, like ours.
+GTSAM is a parameter, since it is an optional extra. Its poses are perturbed on the right, like
+ours.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,9 @@ def pose_key(chain: int, pose: int) -> int:
 def landmark_starts(
     chains: Sequence[Chain], poses: Sequence[Poses], joined: MapResult
 ) -> dict[int, Point]:
-    """Every landmark that a chain sees: where the join has it, else where it is first seen."""
+    """The initial position of every landmark in a chain: the joined map's, else that of its first
+    measurement.
+    """
     known = dict(zip(joined.ids.tolist(), joined.means, strict=True))
     found: dict[int, Point] = {}
     for chain, path in zip(chains, poses, strict=True):
@@ -48,7 +51,7 @@ def factor_graph(
 ) -> Any:
     """All factors. The range noise is the sensor's at the range that the joined solution predicts.
 
-    Where no start pose is known, the first chain's is held where the joined solution has it.
+    Where no initial pose is known, the first chain's is fixed to the joined solution's.
     """
     graph = path_graph(gtsam, chains, poses)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
@@ -71,7 +74,7 @@ def factor_graph(
 
 
 def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> Any:
-    """The factors of the start poses and of the odometry."""
+    """The factors of the initial poses and of the odometry."""
     graph = gtsam.NonlinearFactorGraph()
     floor = np.diag(FLOOR_SIGMAS) ** 2
     anyone = any(chain.start is not None for chain in chains)
@@ -88,14 +91,16 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
 
 
 def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
-    """The noise model under a Cauchy loss of this scale, or as it is."""
+    """The noise model with a Cauchy loss of this scale; None: without a loss."""
     if c is None:
         return model
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
 
 
 def _start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
-    """The start pose; its covariance in (x, y, θ) is turned into the tangent space of the pose."""
+    """The prior of the initial pose; its covariance in (x, y, θ) is rotated into the tangent space
+    of the pose.
+    """
     if covariance is None:
         model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
     else:
@@ -105,7 +110,7 @@ def _start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) 
 
 
 def values_of(gtsam: Any, poses: Sequence[Poses], landmarks: Mapping[int, Point]) -> Any:
-    """Poses and landmarks as GTSAM takes them."""
+    """Poses and landmarks as GTSAM values."""
     values = gtsam.Values()
     for c, path in enumerate(poses):
         for i, pose in enumerate(path):

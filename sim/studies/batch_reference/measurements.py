@@ -1,4 +1,4 @@
-"""From a log's raw measurements to chains of poses: what the batch optimiser takes."""
+"""Converts a log's raw measurements to chains of poses, the input of the batch optimiser."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -28,17 +28,17 @@ _TAKEN = frozenset(
     channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS, ch.SIGHTINGS)
 )
 _ENDLESS_S = 1e9
-"""The batch has one window."""
+"""Length [s] of the batch's only window."""
 
 
 class BatchReferenceError(RuntimeError):
-    """The limit can not be computed: what is missing and what to do."""
+    """The batch reference can not be computed; the text says what is missing and what to do."""
 
 
 class Scan(NamedTuple):
-    """What is seen from one pose: accepted and calibrated ranges [m] and bearings [rad].
+    """The measurements from one pose: accepted and calibrated ranges [m] and bearings [rad].
 
-    own: the noises that they claim (`team.estimation.scans`).
+    own: the covariances that they carry (`team.estimation.scans`).
     """
 
     ids: UInt32[np.ndarray, " n"]
@@ -49,7 +49,7 @@ class Scan(NamedTuple):
     def noise(self, k: int, sensor: Sensor, distance: float) -> Matrix:
         """The covariance of (range, bearing) of measurement k at this predicted range.
 
-        A point's is that of its range and bearing to first order, at what was measured.
+        Of a point it is the first-order covariance of its range and bearing at the measured point.
         """
         if not self.own.size:
             return np.diag(noise(sensor, distance))
@@ -59,13 +59,13 @@ class Scan(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """One incarnation of a robot's stream: N + 1 poses of its sensor, the first at the start.
+    """One incarnation of a robot's stream: N + 1 poses of its sensor, the first at the initial
+    pose.
 
-    The base is at pose ∘ mount⁻¹ (`of_base`, `of_sensor`).
-
-    increments[i] leads from pose i to pose i + 1, scans[i] is what is seen from pose i + 1. start:
-    the pose that measurement 0 gives (None: unknown), with its covariance (None: exact).
-    sightings: of teammates, from the base's poses at the team's grid times, if they were asked for.
+    The base is at pose ∘ mount⁻¹ (`of_base`, `of_sensor`). increments[i] leads from pose i to pose
+    i + 1, scans[i] is measured from pose i + 1. start: the initial pose (None: unknown), with its
+    covariance (None: exact). sightings: inter-robot measurements from the base's poses at the
+    team's grid times, if requested.
     """
 
     config: RobotConfig
@@ -83,11 +83,11 @@ class Chain:
         return np.array(self.config.sensor.mount)
 
     def of_sensor(self, base: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """The sensor's poses where the base is there."""
+        """The sensor's poses for these poses of the base."""
         return np.array([compose(pose, self.mount) for pose in base]).reshape(-1, 3)
 
     def of_base(self, poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """The base's poses where the sensor is there."""
+        """The base's poses for these poses of the sensor."""
         away = inverse(self.mount)
         return np.array([compose(pose, away) for pose in poses]).reshape(-1, 3)
 
@@ -103,11 +103,11 @@ class Chain:
 def chains_of(
     samples: Iterable[Sample], scenario: TeamConfig, *, sightings: bool = False
 ) -> list[Chain]:
-    """The chains of all robots by (robot, incarnation); measurements in the order of their counter,
-    once.
+    """The chains of all robots by (robot, incarnation), with each measurement once in the order of
+    its counter.
 
     With inter-robot measurements there is a pose at each time of the team's grid
-    (`front_end.node_s`) too. Raises WireError for a measurement that is not sound.
+    (`front_end.node_s`), too. Raises WireError for an invalid measurement.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
@@ -178,7 +178,9 @@ def _chain(
 def _of_sensor(
     pose: Pose | None, covariance: Matrix | None, mount: Pose
 ) -> tuple[Pose | None, Matrix | None]:
-    """The initial pose of a sensor that is mounted there on a base with this one."""
+    """The initial pose, with its covariance, of a sensor that is mounted on a base with this
+    initial pose.
+    """
     if pose is None or not mount.any():
         return pose, covariance
     found = moved_by(
@@ -195,11 +197,11 @@ def _grid(config: RobotConfig) -> PoseGrid | None:
 
 
 def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
-    """Three ways to fill a chain's poses between known ones (at least one), by its odometry.
+    """Three ways to fill a chain's poses between known poses (at least one) by its odometry.
 
-    Onward from the anchor before each pose; back from the anchor after it; and the mean of both,
-    weighted by the time to each. Odometry between a pose and an anchor is taken to the chain's last
-    pose that is not after the anchor.
+    Forward from the known pose before each; backward from the known pose after it; and the mean of
+    both, weighted by the time to each. Odometry between a pose and a known pose is taken to the
+    chain's last pose that is not after the known one.
     """
     odometry = chain.dead_reckoned
     at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1

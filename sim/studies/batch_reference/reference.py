@@ -1,16 +1,17 @@
-"""The batch reference: the MAP over all raw measurements of a log, by GTSAM (extra
+"""Computes the batch reference: the MAP over all raw measurements of a log, by GTSAM (extra
 `batch-reference`).
 
-One pose per keyframe of each robot: its sensor's, wherever that is mounted. Factors: the start
-poses; between consecutive poses the odometry, truth = mean ∘ Exp(ξ) with the tangent covariance of
-`increment_of`, which is GTSAM's `BetweenFactorPose2` with its logarithm; each accepted range and
-bearing, independent, with the sensor's noise or its own (under a Cauchy loss where the centre's
-`robust_c` asks for a robust join). Levenberg-Marquardt starts from the joined solution, so what it
-finds is never worse than that: from three ways to fill the paths between its poses (under the noise
-`profile` from the best of them). Under the noise `white` every measurement's error is its own and
-inter-robot measurements are not used; under `profile` the sensor's errors persist as
-the scenario says, biases are estimated and inter-robot measurements are factors (`errors`). Not
-modelled: an error of the odometry's scale at speeds that the profile has not seen.
+There is one pose per keyframe of each robot: its sensor's, wherever that is mounted. Factors: the
+initial poses; between consecutive poses the odometry, truth = mean ∘ Exp(ξ) with the tangent
+covariance of `increment_of`, which is GTSAM's `BetweenFactorPose2` with its logarithm; each
+accepted range and bearing, independent, with the sensor's noise or its own (under a Cauchy loss
+where the centre's `robust_c` asks for a robust join). Levenberg-Marquardt starts from the joined
+solution with the paths filled in three ways, so its result is never worse than the joined one (with
+the noise `profile` it starts from the best of the three). With the noise `white` every
+measurement's error is independent and inter-robot measurements are not used; with `profile` the
+sensor's errors persist according to the scenario, biases are estimated and inter-robot measurements
+are factors (`errors`). Not modelled: an error of the odometry's scale at speeds that the profile
+does not cover.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -38,9 +39,10 @@ from team.estimation.mount import moved_by
 from team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
-"""√(gᵀH⁻¹g) allowed at the optimum: how far the next Newton step goes, in standard deviations.
+"""√(gᵀH⁻¹g) allowed at the optimum: the length of the next Newton step in standard deviations.
 
-A robust loss is minimised by weighting again and again, which converges by a constant factor."""
+A robust loss is minimised by iterated reweighting, which converges by a constant factor.
+"""
 ITERATIONS = 1000
 NoiseKind = Literal["white", "profile"]
 NO_BIASES = (None, None, None)
@@ -48,13 +50,12 @@ NO_BIASES = (None, None, None)
 
 @dataclass(frozen=True)
 class BatchReference:
-    """The optimum. cost = Σ‖r‖² there, initial_cost at the best of the starts.
+    """The optimum. cost = Σ‖r‖² there, initial_cost at the best initial values.
 
-    gradient_norm: of the optimum's cost, in the units of the state; newton_decrement: √(gᵀH⁻¹g).
-    paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
-    left_out: robots whose place in the team's frame is not known, and why.
-    biases: (bearing [rad], range offset [m], range scale) of each robot.
-    team: the run's own final map.
+    gradient_norm: of the cost at the optimum, in the units of the state; newton_decrement:
+    √(gᵀH⁻¹g). paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
+    left_out: robots whose place in the team's frame is not known, and why. biases: (bearing [rad],
+    range offset [m], range scale) of each robot. team: the run's own final map.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -114,10 +115,10 @@ def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
 
 
 def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchReference:
-    """The batch MAP of a log of a run under the rule `join` or `batch`, from start to end.
+    """The batch MAP of a log of a run under the rule `join` or `batch`, over the whole run.
 
     Raises BatchReferenceError without GTSAM, without a scenario, without a joined map, or when the
-    optimiser does not come to rest.
+    optimiser does not converge.
     """
     gtsam = _gtsam()
     recorded = list(samples)
@@ -176,9 +177,8 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
 def _solved(
     gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, dict[str, float]]:
-    """The best optimum from all starts, and its figures.
-
-    Raises BatchReferenceError if it is none.
+    """The best optimum over all initial values, and its figures; raises BatchReferenceError if none
+    has converged.
     """
     optima = [descend(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
@@ -216,7 +216,9 @@ def _gtsam() -> Any:
 def placed(
     chains: Sequence[Chain], run: Evaluation
 ) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
-    """The chains whose place is known, with the joined poses (and the start) that say it."""
+    """The chains whose place in the team's frame is known, with the joined poses (and the initial
+    pose) that determine it.
+    """
     known, anchors, left_out = [], [], []
     for chain in chains:
         robot = chain.config.id
@@ -243,14 +245,14 @@ def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
 
 
 def _newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
-    """The step to the optimum of a linear graph, and how many standard deviations it goes."""
+    """The Newton step of a linear graph, and its length in standard deviations."""
     step = linear.optimize()
     gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
     return step, float(np.sqrt(max(2.0 * gain, 0.0)))
 
 
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
-    """Gauss-Newton; a step that does not lower the cost is halved.
+    """The values after Gauss-Newton; a step that does not lower the cost is halved.
 
     For factors in Python: GTSAM's Levenberg-Marquardt takes five times as long for one iteration.
     """
@@ -279,7 +281,7 @@ def _reference_figures(
     run: Evaluation,
     **figures: Any,
 ) -> BatchReference:
-    """The optimum's map, paths and covariances, against the truth."""
+    """The optimum's map, paths and covariances, compared with the truth."""
     assert run.map is not None
     marginals = gtsam.Marginals(graph, optimum)
     ids = np.array(landmarks, dtype=np.uint32)

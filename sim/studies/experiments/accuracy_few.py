@@ -1,11 +1,11 @@
-"""Few landmarks and unknown starts: where wrong minima live. None of them may be silent.
+"""Worlds with few landmarks and unknown initial poses, where wrong minima occur.
 
 A map is wrong where it lies in another minimum of the cost than the truth (`true_minimum`); its
-submaps exclude the truth where the cost rises beyond 99.9 % when the truth is held. It lies beyond
-its ellipsoid where its shape (without the rigid part), or the first pose of a robot that joined, is
-beyond the 99.9 % of its own covariance: in the minimum of a curved valley that happens more often,
-though nothing is wrong. A map says so, or not: silent is what is wrong and does not. Of a right map
-an alarm says more than that a covariance is wide or bent.
+submaps exclude the truth where the cost at the fixed truth exceeds the 99.9 % quantile. A map lies
+beyond its ellipsoid where its shape (without the rigid part), or the first pose of a robot that
+joined, is outside the 99.9 % region of its own covariance: with a curved valley of the cost that
+happens more often though the minimum is right. A wrong map without a warning is silent. An alarm is
+a warning of a right map that is about more than a large or nonlinear covariance.
 """
 
 import msgspec
@@ -28,9 +28,9 @@ from team.estimation.consistency import chi2_interval
 WORLDS = ("thesis", "thesis-b")
 COUNTS = (3, 4, 5)
 SEEN_EVERY_S = 5.0
-"""With sightings: the robots' poses are nodes so often."""
+"""Spacing [s] of the pose nodes where teammates are measured."""
 WIDE = ("is placed weakly", "farther off than its covariance")
-"""What a map says of its covariances, not of its minimum."""
+"""Parts of warnings that are about a map's covariances, not about its minimum."""
 SHOWN: Shown = (
     ("rmse_aligned", "aligned [m]", "{:.3f}"),
     ("aligned_median", "median [m]", "{:.3f}"),
@@ -52,7 +52,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """How often a map is wrong, and whether it says so."""
+    """How often a map is wrong, and how often without a warning."""
     figures: dict[str, Figures] = {}
     for name, case in _cases(options).items():
         figures[name] = few_figures(results.of_all(case))
@@ -81,7 +81,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def few_figures(runs: list[Figures]) -> Figures:
-    """The figures over the seeds of one case, with how many maps are wrong, and silently so."""
+    """The figures over the seeds of one case, with the numbers of wrong and of silent maps."""
     figures = over_seeds(runs)
     if not runs:
         return figures
@@ -141,7 +141,9 @@ def _cases(options: Options) -> dict[str, list[Task]]:
 
 
 def _few(scenario: Scenario, count: int, seen: bool) -> Scenario:
-    """So many landmarks at random, the first robot's start known, teammates seen or not."""
+    """The scenario with this many random landmarks and only the first robot's initial pose known;
+    `seen`: with inter-robot measurements.
+    """
     assert isinstance(scenario.world, SimulatedWorld)
     world = msgspec.structs.replace(scenario.world, landmarks=(), landmark_count=count)
     node_s = SEEN_EVERY_S if seen else 0.0

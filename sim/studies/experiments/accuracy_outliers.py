@@ -1,8 +1,7 @@
-"""Three measurements in ten are outliers: how much worse is the map than without them.
+"""Compares maps with three outliers in ten measurements with maps without them.
 
-The clean run of the same seed leaves out the very measurements that the others spoil, so it has as
-many good ones. A measurement is spoilt to a uniform range and bearing, or to the identity of
-another landmark.
+The clean run of the same seed leaves out the very measurements that become outliers, so it has as
+many inliers. An outlier has a uniform range and bearing, or the identity of another landmark.
 """
 
 import msgspec
@@ -16,9 +15,13 @@ from sim.world.config import OutlierKind, SimulatedWorld
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
 LANDMARK_SUBMAPS = 2
-"""Of the centre, in the clean runs too: what one submap alone has may be an outlier."""
+"""Least number of submaps of a landmark, in the clean runs, too: a landmark of one submap may be an
+outlier.
+"""
 ROBUST_C = 2.0
-"""Of the centre, in the clean runs too: outliers that agree by chance are left to it."""
+"""Scale of the centre's robust loss, in the clean runs, too: it down-weights outliers that agree by
+chance.
+"""
 KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
 NAMES = {"drop": "clean", "measurement": "random measurements", "identity": "random identities"}
 MOST_SEEDS = 30
@@ -40,7 +43,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Every kind of outlier beside the clean runs."""
+    """The figures of every kind of outlier beside the clean runs."""
     figures: dict[str, dict[str, Figures]] = {}
     goals = []
     for world in WORLDS:

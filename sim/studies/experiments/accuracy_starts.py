@@ -1,8 +1,8 @@
-"""Unknown start poses: all robots but the first have to find their place in the team's map.
+"""Unknown initial poses: all robots but the first have to find their place in the team's map.
 
-A merge is wrong where the first pose of a robot that joined lies beyond the 99.9 % ellipsoid of its
-own covariance. What is left of a right merge is the place of the map as a whole, so maps are
-compared after alignment.
+A merge is wrong where the first pose of a robot that joined lies outside the 99.9 % ellipsoid of
+its own covariance. After a right merge only the position of the map as a whole is undetermined, so
+maps are compared after alignment.
 """
 
 import msgspec
@@ -33,7 +33,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """The maps with and without known starts."""
+    """The maps with and without known initial poses."""
     figures: dict[str, dict[str, Figures]] = {}
     rows, goals = [], []
     for world in WORLDS:
@@ -75,7 +75,7 @@ def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
 
 
 def unknown_starts(scenario: Scenario) -> Scenario:
-    """Only the first robot's start pose is told."""
+    """The scenario in which the team knows only the first robot's initial pose."""
     names = tuple(robot.id for robot in scenario.robots[1:])
     world = msgspec.structs.replace(scenario.world, unknown_starts=names)
     return msgspec.structs.replace(scenario, world=world)

@@ -1,8 +1,9 @@
-"""Real data: every UTIAS set that is given, five robots, one fixed profile for all of them.
+"""Real data: every given UTIAS set, five robots, one fixed profile for all of them.
 
-The raw map lies where the start poses say; `shape` is what no rigid motion explains, and its NEES
-is per landmark: 2 where the covariance is right. Beside each set stands the batch optimiser over
-all its raw measurements under the same noise: the price of the submaps.
+The raw map lies according to the initial poses; `shape` is the part of the error that no rigid
+motion explains, and its NEES is per landmark: 2 where the covariance is right. The batch optimiser
+over all raw measurements under the same noise is computed beside each set; the difference is the
+cost of the submaps.
 """
 
 from collections.abc import Mapping
@@ -22,9 +23,11 @@ from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, Shown, cells_of, team_task
 
 NORMAL_SCALE = (0.8, 1.25)
-"""What the monitor says without the truth, in units of the profile's `normal_scale`."""
+"""Bounds of the monitor's covariance scale without truth, in units of the profile's
+`normal_scale`.
+"""
 MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
-"""By the data set's number; other sets have no goal of their own."""
+"""Largest aligned error [m] by the data set's number; other sets have no goal of their own."""
 MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}
 SHOWN: Shown = (
     ("aligned", "aligned [m]", "{:.4f}"),
@@ -126,7 +129,7 @@ def set_figures(run: Figures) -> Figures:
 
 
 def team_on(dataset: Dataset) -> Task:
-    """The team on a set, with the batch under the profile's noise beside it."""
+    """The team on a set, with the batch under the profile's noise."""
     return team_task(load("utias"), dataset=dataset, batch=True, noise="profile")
 
 

@@ -29,7 +29,7 @@ from team.pairs import PAIRS
 
 
 class World(NamedTuple):
-    """A kind of world: its scenario, how many seeds at most, and what the default pair must reach.
+    """A kind of world: its scenario, its most seeds, and what the default pair must reach.
 
     rules: every valid pair runs in it, not only the default one. batch: with the batch MAP.
     """
@@ -42,7 +42,7 @@ class World(NamedTuple):
 
 
 OTHERS_SEEDS = 10
-"""Of the pairs that are there to compare with: their figures differ from ours by factors."""
+"""Most seeds of pairs for comparison: their figures differ from the default pair's by factors."""
 _THESIS = {
     "nees": (0.93, 1.07),
     "in_band": (0.90, 1.0),
@@ -139,7 +139,7 @@ def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
 
 
 def _most(world: World, estimator: str, fusion: str) -> int:
-    """How many seeds of this pair at most."""
+    """The most seeds of this pair."""
     return world.most_seeds if (estimator, fusion) == OURS else OTHERS_SEEDS
 
 

@@ -1,8 +1,8 @@
-"""Landmarks without names: how far association holds, over spacing, clutter and missed detections.
+"""Landmarks without names: how well association works, over spacing, clutter and missed detections.
 
-One simulated place, four ways: ours without names, the same measurements with names, an EKF over
+One simulated place, four systems: ours without names, the same measurements with names, an EKF over
 the whole drive with nearest neighbour, and FastSLAM whose particles each associate by maximum
-likelihood. Sensors differ in nothing but their noise; each axis is turned alone.
+likelihood. The sensors differ only in their noise; one parameter is varied at a time.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ RATIO, FEW = 20.0, 2
 
 
 class System(NamedTuple):
-    """One way to do it: estimator, rule, and whether it hears the names."""
+    """An estimator and a rule, and whether landmarks have names."""
 
     name: str
     estimator: Estimator
@@ -65,7 +65,9 @@ FIGURES = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each axis, value, system and seed, each run once: the axes meet."""
+    """One run of each axis, value, system and seed; a run that two axes have in common is
+    run once.
+    """
     runs = [
         task
         for axis in AXES
@@ -113,7 +115,9 @@ def association_run(
     missed: float,
     seed: int,
 ) -> dict[str, Any]:
-    """One run; the baselines have one robot, since each of theirs has a map of its own."""
+    """The figures of one run; the baselines have one robot, since each robot of theirs has a map of
+    its own.
+    """
     alone = fusion == "alone"
     scenario = load("waypoints")
     error_m = SPACING_M / ratio

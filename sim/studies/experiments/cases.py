@@ -1,7 +1,7 @@
-"""Cases computed in parallel and kept on disk, by joblib: its workers, its memory.
+"""Computes cases in parallel and stores their results on disk, with joblib's workers and memory.
 
-A case that fails or whose process dies loses itself only. With a scheduler the cases go to Dask's
-workers, on a cluster too (decision 0058).
+A case that fails, or whose process dies, loses only itself. With a scheduler the cases run on
+Dask's workers, on a cluster, too (decision 0058).
 """
 
 import threading
@@ -22,9 +22,9 @@ from joblib.externals.loky.process_executor import (
 from sim.studies.experiments.task import Task
 
 FOLDER = "cases"
-"""Of the results, in the folder of an experiment."""
+"""Folder of the stored results, in the folder of an experiment."""
 IDLE_S = 5
-"""A worker without a case ends after this."""
+"""Time [s] after which a worker without a case ends."""
 Cached = Callable[..., dict[str, Any]]
 
 
@@ -43,13 +43,15 @@ class Done:
 
 
 class Cases:
-    """The results in a folder; one counts for a case of the same parameters and program."""
+    """The stored results of a folder; a result is valid for a case of the same parameters and
+    program.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
 
     def found(self, task: Task) -> dict[str, Any] | None:
-        """The result that is kept of a case; None where it is to be computed."""
+        """The stored result of a case; None where it is to be computed."""
         arguments = _arguments(task)
         if not self._cached.check_call_in_cache(**arguments):
             return None
@@ -57,10 +59,11 @@ class Cases:
         return result
 
     def run(self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None) -> Iterator[Done]:
-        """Compute the cases, `jobs` at a time; each as it is done, in no fixed order.
+        """Compute the cases, `jobs` at a time; yields each as it is done, in no fixed order.
 
         Long cases begin first. Leaving the iterator early ends the workers. scheduler: the address
-        of a Dask scheduler whose workers see the folder; then as many at a time as it has workers.
+        of a Dask scheduler whose workers can read the folder; then as many run at a time as it has
+        workers.
         """
         waiting = {task.name: task for task in sorted(tasks, key=lambda task: -task.cost)}
         with ExitStack() as stack:
@@ -119,10 +122,10 @@ def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
 
 @contextmanager
 def _cancelling() -> Iterator[None]:
-    """While this lasts, what the pool says of cases that are cancelled on request is not told.
+    """Suppress the pool's message about a case that is cancelled on request.
 
-    Loky kills the workers first; its thread then stumbles over a case that was handed over at that
-    moment, and ends with a KeyError instead of by itself (joblib/loky, pull request 663).
+    Loky kills the workers first; its thread then fails on a case that was being handed over at that
+    moment, and ends with a KeyError (joblib/loky, pull request 663).
     """
     previous = threading.excepthook
 
@@ -160,5 +163,7 @@ def _arguments(task: Task) -> dict[str, Any]:
 def _result(
     work: str, parameters: dict[str, Any], program: str, local: dict[str, str]
 ) -> dict[str, Any]:
-    """The result of a case. program: of the sources, so that those of another one do not count."""
+    """The result of a case. program: digest of the sources, so that results of other programs are
+    not used.
+    """
     return Task(work, parameters, "", local=local).run()

@@ -1,4 +1,4 @@
-"""A run's errors over team time, as a task: online poses, and one landmark of the map.
+"""A task that computes a run's errors over team time: online poses, and one landmark of the map.
 
 The landmark is the first that the first robot saw. Its error and its sigma are those of the newest
 map at each time: the fused one, or the robot's own where nothing is fused.
@@ -27,10 +27,10 @@ from team.wire.arrays import floats
 from team.wire.bus import Sample, opened
 
 STEP_S = 1.0
-"""Of the thesis' world."""
+"""Length [s] of a step of the thesis' world."""
 Map = m.FusedMap | m.MapEstimate
 DIGITS = 5
-"""Significant digits of a kept curve: a picture shows three."""
+"""Significant digits of a stored curve: a picture shows three."""
 
 
 def curves_task(
@@ -65,7 +65,9 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """The curves of every robot's pose, of the first landmark, of the map; the map at `shots`."""
+    """The curves of every robot's pose and of the first landmark, the map's error, and the map at
+    `shots`.
+    """
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
@@ -98,7 +100,7 @@ def curves_run(
 def true_landmarks(
     samples: Iterable[Sample],
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """The ids and positions [m] of the world's landmarks; none where nobody knows them."""
+    """The ids and positions [m] of the world's landmarks; empty where they are not known."""
     for message in messages(samples, ch.TRUTH_LANDMARKS.key()):
         if isinstance(message, m.TruthLandmarks):
             return translate.landmarks_of(message)
@@ -111,7 +113,7 @@ def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
 
 
 def a_step_late(streams: WorldStreams) -> WorldStreams:
-    """Each message of landmarks says what was seen one before; needs a look at the start."""
+    """The streams with each message of landmarks replaced by the one before it."""
     return replace(streams, streams=tuple(_a_step_late(stream) for stream in streams.streams))
 
 
@@ -126,8 +128,8 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
-    """Where a robot's online pose is said: by the centre if it is the one that estimates it; else
-    by the robot, with the team's map once it has one.
+    """The keys of a robot's online poses: the centre's where the centre estimates them; else the
+    robot's own, then those in the team's map.
     """
     if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)
@@ -137,7 +139,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
 def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """The poses and covariances of these keys; of one time that of the last key."""
+    """The poses and covariances on these keys; at equal times those of the last key."""
     by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in by_stamp:
@@ -166,7 +168,7 @@ def _pose_curve(found: PoseErrors) -> Figures:
 
 
 def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
-    """The team's maps with landmarks in them in their order; without any, those of the robot."""
+    """The team's maps with landmarks in them, in their order; without any, those of the robot."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
         published = messages(samples, key)
         maps = [
@@ -244,5 +246,5 @@ def _landmark_curve(
 
 
 def short(values: Float[np.ndarray, " K"]) -> list[float]:
-    """The values in so many digits, to be kept as JSON."""
+    """The values rounded to DIGITS digits, for JSON."""
     return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]

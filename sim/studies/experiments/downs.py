@@ -1,8 +1,8 @@
-"""Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every UTIAS set that is given.
+"""Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
 
-Each has what is printed, his protocol (`downs_joined`) and ours: the profile of `utias` as it is.
-The sensor's and the odometry's models are those of the profile in all of them. His paired t-tests
-are done again, on the printed figures and on the computed ones.
+Each has the printed figures, his protocol (`downs_joined`) and ours: the profile of `utias` as it
+is. All use the sensor and odometry models of the profile. His paired t-tests are computed again, on
+the printed figures and on the computed ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -151,7 +151,9 @@ class PrintedTable(NamedTuple):
         return rows | {m.name: m.row(options, dataset, results) for m in self.methods}
 
     def _tests(self, options: Options, results: Results) -> dict[str, Figures]:
-        """Two-sided, paired: robots of sets, or the sets' means where a table has a team's map."""
+        """The paired two-sided t-tests: over the robots of sets, or over the sets' means where a
+        table has a team's map.
+        """
         if self.compared is None:
             return {}
         one = len(self.columns) == 1
@@ -205,7 +207,7 @@ class PrintedTable(NamedTuple):
 
 
 def _profile(options: Options) -> Scenario:
-    """The profile, its first minutes only if quick."""
+    """The profile; with --quick only its first minutes."""
     scenario = load("utias")
     if not options.quick or not isinstance(scenario.world, UtiasWorld):
         return scenario
@@ -225,7 +227,7 @@ def _spherical(options: Options, dataset: Dataset) -> Task:
 
 
 def _team(options: Options, dataset: Dataset) -> Task:
-    """Whole sets as in `accuracy`: the same runs."""
+    """The whole sets as in `accuracy`: the same runs."""
     return team_task(_profile(options), dataset=dataset) if options.quick else team_on(dataset)
 
 
@@ -335,7 +337,7 @@ def _pair(
     names: Sequence[str],
     figures: Sequence[str],
 ) -> tuple[Method, ...]:
-    """Each of the two protocols with each figure."""
+    """The cross product of the two protocols and the figures."""
     found: list[Method] = []
     for k, name in enumerate(names):
         for source in figures:

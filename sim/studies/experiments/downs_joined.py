@@ -1,9 +1,10 @@
-"""Runs after J. Downs' thesis as tasks: whole-run maps of each robot, and submaps joined his way.
+"""Runs after J. Downs' thesis as tasks: whole-run maps of each robot, and submaps joined by his
+method.
 
-His protocol: measurements sampled to a second, a submap for every step, of which only the mean is
-kept: each robot's submaps are joined by least squares with the identity as covariance, and the
-robots' maps are tied by singular values (`svd-join-spherical`). A submap of ours is a window of the
-hybrid estimator of one step, his is a step of an EKF without landmarks before it.
+His protocol: measurements sampled to one second, a submap for every step, of which only the mean is
+used. Each robot's submaps are joined by least squares with the identity as covariance, and the
+robots' maps are aligned by singular values (`svd-join-spherical`). A submap here is a window of one
+step of the hybrid estimator; his is a step of an EKF without landmarks before it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,11 +47,13 @@ from team.wire.bus import Sample, opened
 STEP_S = 1.0
 NEVER_S = 1e6
 DRAWN_POINTS = 1000
-"""The centre joins once, when the run has ended."""
+"""Most points of a drawn path."""
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """Measurements and submaps of a second, exact starts, no loss, no factor, no error states."""
+    """The scenario with measurements and submaps of one second, exact initial poses, no loss, no
+    factor and no error states.
+    """
     change = msgspec.structs.replace
     robots = tuple(
         change(
@@ -78,7 +81,9 @@ def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str
 
 
 def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
-    """Every robot's submaps joined his way, and the robots' maps tied; of his protocol."""
+    """Every robot's submaps joined by his method, and the robots' maps aligned, under his
+    protocol.
+    """
     return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
 
 
@@ -96,7 +101,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """By robot: the errors of its last own map, and of its online path; one robot's map itself."""
+    """By robot, the errors of its last own map and of its online path; the map of one robot."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -133,9 +138,10 @@ def _thinned(path: Path) -> list[list[float]]:
 def spherical_run(
     scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
 ) -> Figures:
-    """By robot: the errors of its joined map and smoothed path, and the map; the team's errors.
+    """By robot, the errors of its joined map and smoothed path, and the map; the team's errors.
 
-    with_covariances: of the same submaps in one join with the covariances that he discards.
+    with_covariances: the figures of the same submaps in one join with the covariances that he
+    discards.
     """
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
@@ -188,7 +194,7 @@ def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
 
 
 def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
-    """What the robot is told of its start; the origin of a frame of its own where that is not."""
+    """The robot's known initial pose; the origin of its own frame where it is unknown."""
     for sample in samples:
         if sample.key == ch.START.key(robot):
             message = opened(sample)[2]
@@ -201,7 +207,7 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
 def _joined(
     robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
 ) -> SubmapJoining:
-    """All submaps at once: what taking them one by one converges to."""
+    """All submaps joined at once: the limit of joining them one by one."""
     initial_state = svd_joining.initial_state({robot: start})
     contributions = [
         Contribution(robot, 0, k, k, weighted(translate.local_map_of(s).without_nodes, "identity"))
@@ -213,7 +219,7 @@ def _joined(
 
 
 def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path:
-    """The ends of the submaps, which lie at their stamps."""
+    """The end poses of the submaps, at their stamps."""
     graph = state.fold.main.graph
     ends = graph.offset[np.array(graph.streams[robot, 0][1:])]
     poses = state.fold.main.state[ends[:, None] + np.arange(3)]
@@ -221,7 +227,7 @@ def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path
 
 
 def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
-    """Of a joined path [m]."""
+    """The error [m] of a joined path."""
     unit = np.broadcast_to(np.eye(3), (len(path.poses), 3, 3))
     errors = pose_errors(path, unit, evaluation.robots[robot].truth)
     return None if errors is None else errors.position_rmse_m
@@ -230,7 +236,9 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """Where two robots saw each other in the same step: both places in both maps, one a step."""
+    """The pairs of positions, one a step, at which two robots measured each other in the same step,
+    in both maps.
+    """
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
     found: dict[tuple[Stream, Stream], PointPairs] = {}
     for a in sorted(paths):
@@ -257,7 +265,7 @@ def _mutual(
 def _looks(
     samples: Sequence[Sample], robot: str, sensor: Sensor
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """By teammate and step the last (range [m], bearing [rad]) of that step, calibrated."""
+    """By teammate and step, the last (range [m], bearing [rad]) of that step, calibrated."""
     found: dict[str, dict[int, tuple[float, float]]] = {}
     for message in messages(samples, ch.SIGHTINGS.key(robot)):
         if isinstance(message, m.Sightings):
@@ -270,7 +278,7 @@ def _looks(
 
 
 def _at(path: Path, step: int) -> int | None:
-    """The pose at a step; None where the robot has none within half of one."""
+    """The index of the pose at a step; None where the robot has none within half a step."""
     stamp_ns = round(step * STEP_S * 1e9)
     nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
     near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S
@@ -280,7 +288,7 @@ def _at(path: Path, step: int) -> int | None:
 def _errors(
     found: LandmarkGaussian, truth: Mapping[int, Float[np.ndarray, "2"]]
 ) -> MapErrors | None:
-    """Of the landmarks with truth."""
+    """The errors of the landmarks with truth."""
     known = [k for k, id_ in enumerate(found.ids.tolist()) if id_ in truth]
     if not known:
         return None

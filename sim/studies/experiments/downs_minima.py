@@ -36,11 +36,11 @@ from team.estimation.geometry import wrapped
 from team.estimation.map_joining.alignment import procrustes
 
 STEPS = 600
-"""Of his simulator: most landmarks are seen by then."""
+"""Number of steps of his simulator: most landmarks are seen by then."""
 DURATION_S = 300.0
 GRID = 720
 SAME = 1e-3
-"""The optimiser's motion is the closed form's within this [m, rad]."""
+"""Largest difference [m, rad] of the optimiser's motion from the closed form's."""
 
 
 class Pair(NamedTuple):

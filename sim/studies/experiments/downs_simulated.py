@@ -1,8 +1,8 @@
-"""Tables 5.1 … 5.5 of J. Downs' thesis on his own simulator: 10 and 100 landmarks, a run a seed.
+"""Tables 5.1 … 5.5 of J. Downs' thesis on his own simulator: 10 and 100 landmarks, one run a seed.
 
 He ran it thirty times for each (section 4.2) and prints no figure of it, so there is nothing to
-stand beside; the methods and the t-tests are those of the tables. It has one robot; table 5.5 needs
-a team, two robots here that start at its centre together.
+compare with; the methods and the t-tests are those of the tables. It has one robot; table 5.5 needs
+a team, here two robots that start at its centre together.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,9 +31,9 @@ STARTED, ALIGNED = "rmse", "rmse_aligned"
 
 
 class Simulated(NamedTuple):
-    """A method on the simulator: its name, its run, where its figures are, its colour.
+    """A method on the simulator: its name, its run, the place of its figures, its colour.
 
-    robot: the figures are of robot 1 among those of the run; else of `part`, or of the run itself.
+    robot: the figures are those of robot 1 in the run; else of `part`, or of the run itself.
     """
 
     name: str
@@ -65,7 +65,7 @@ OUR_TEAM = Simulated("team, ours", team_task, TEAM, BLACK)
 
 
 class SimulatedTable(NamedTuple):
-    """What a table has of the simulator. figures: which, and what to call it.
+    """The simulator's part of a table. figures: their names and headings.
 
     compared: pairs of methods whose maps the paired t-test compares, before and after. sample: a
     map of the first method is drawn, as in figure 5.1.
@@ -77,7 +77,7 @@ class SimulatedTable(NamedTuple):
     sample: bool = False
 
     def tasks(self, options: Options) -> list[Task]:
-        """Every world, method and seed; what the t-tests need besides, too."""
+        """Every world, method and seed, with the runs that only the t-tests need."""
         found = [
             _task(world, method, options, seed)
             for world in WORLDS

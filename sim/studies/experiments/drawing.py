@@ -19,7 +19,7 @@ BAND = (0.1, 0.9)
 
 @dataclass(frozen=True)
 class Curves:
-    """Errors and sigmas of S runs at K common times; NaN where a run says nothing yet.
+    """Errors and sigmas of S runs at K common times; NaN where a run has no value yet.
 
     nees: the mean per degree of freedom of each run; None where the runs have none.
     """
@@ -37,7 +37,7 @@ class Curves:
         *,
         stepwise: bool,
     ) -> Self:
-        """The runs' curves at these times. held: a value stands until the next one comes."""
+        """The runs' curves at these times. stepwise: a value holds until the next one."""
         nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
         return cls(
             times_s,
@@ -47,14 +47,14 @@ class Curves:
         )
 
     def quantile(self, share: float) -> Float[np.ndarray, " K"]:
-        """Over the runs that say something, at each time; NaN where none does."""
+        """The quantile over the runs with a value, at each time; NaN where there is none."""
         values = np.full(len(self.times_s), np.nan)
         there = ~np.isnan(self.errors).all(axis=0)
         values[there] = np.nanquantile(self.errors[:, there], share, axis=0)
         return values
 
     def rms(self) -> Float[np.ndarray, " S"]:
-        """Over time, of each run."""
+        """The root mean square over time of each run."""
         means: Float[np.ndarray, " S"] = np.sqrt(np.nanmean(self.errors**2, axis=1))
         return means
 
@@ -62,7 +62,9 @@ class Curves:
 def sampled(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
-    """A curve of a run at these times; held: as `Curves.on` has it."""
+    """A curve of a run at these times; stepwise: a value holds until the next one, else linear
+    interpolation.
+    """
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)

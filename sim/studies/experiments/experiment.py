@@ -1,4 +1,4 @@
-"""What an experiment is asked, what it answers, and the protocol between the two."""
+"""The interface of an experiment: its options and tasks, their results, and its outcome."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for: the seeds, small or full, the data sets."""
+    """The options of the command line: the seeds, small or full, the data sets."""
 
     seeds: tuple[int, ...]
     quick: bool = False
@@ -34,7 +34,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Results:
-    """The results of the runs by the tasks' names; a run that failed is not among them."""
+    """The results of the runs by the tasks' names; a run that failed has none."""
 
     by_name: Mapping[str, dict[str, Any]]
 
@@ -43,13 +43,13 @@ class Results:
         return self.by_name.get(task.name)
 
     def of_all(self, tasks: Sequence[Task]) -> list[dict[str, Any]]:
-        """The results that there are, in the order of the tasks."""
+        """The existing results, in the order of the tasks."""
         return [self.by_name[task.name] for task in tasks if task.name in self.by_name]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column is the row's name. note: what a reader must know."""
+    """A table as text; the first column is the row's name. note: an explanation for the reader."""
 
     title: str
     columns: tuple[str, ...]
@@ -59,7 +59,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture: its file's name without suffix, what it shows, and what draws it as a PNG."""
+    """A picture: its file's name without suffix, its caption, and the function that draws it as a
+    PNG.
+    """
 
     name: str
     caption: str
@@ -68,7 +70,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Goal:
-    """What a figure must be; value None: it could not be computed."""
+    """The bound of a figure; value None: it could not be computed."""
 
     figure: str
     value: float | None
@@ -85,10 +87,10 @@ class Goal:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an experiment found.
+    """The result of an experiment.
 
-    figures: for machines, by name. remarks: what differs from the source and why. missing: what
-    could not be computed, and what to do about it.
+    figures: for machines, by name. remarks: differences from the source, with the reason. missing:
+    what could not be computed, and what to do about it.
     """
 
     title: str
@@ -102,13 +104,13 @@ class Outcome:
 
 @runtime_checkable
 class Experiment(Protocol):
-    """What a module of an experiment has."""
+    """The interface of an experiment's module."""
 
     def tasks(self, options: Options) -> list[Task]:
         """The runs, each once."""
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """What comes of them."""
+        """The outcome of the results."""
 
 
 def combined(title: str, parts: Sequence[Outcome]) -> Outcome:

@@ -1,9 +1,9 @@
-"""What the experiments after K.-C. Ma and Z. Ma's report have in common: runs on a UTIAS set.
+"""The common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
 
 The report prints no parameters and no data set's number. Both are in its program (the repository
-that its appendix names): the start pose of robot 1 is that of set 2, α₁ … α₆ are 0.1 for intervals
-of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad². It takes the logged
-odometry as it is, without calibration.
+that its appendix names): the initial pose of robot 1 is that of set 2, α₁ … α₆ are 0.1 for
+intervals of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad². It uses the
+logged odometry without calibration.
 """
 
 from collections.abc import Mapping
@@ -38,11 +38,11 @@ from team.wire.bus import Sample, opened
 
 FRAME_S = 0.2
 FRAMES = 1400
-"""Roughly five minutes, as the report says of its 1400 frames."""
+"""Number of frames of the report, roughly five minutes."""
 MOTION = MotionModel(alphas=(0.1,) * 6, alpha_interval_s=0.02)
 SENSOR = Sensor(range_sigma=0.0167**0.5, bearing_sigma=0.000736589**0.5)
 START_SIGMA = 1e-3
-"""Of the program's initial covariance [m, rad]."""
+"""Standard deviation of the program's initial covariance [m, rad]."""
 PARTICLES = 100
 """The program's default; the report does not say."""
 DEAD_RECKONING = Method("dead reckoning", "dead-reckoning", "alone", 1, VERMILION, PARTICLES)
@@ -50,7 +50,7 @@ SINGLE = Method("single FastSLAM", "fastslam1", "alone", 1, BLUE, PARTICLES)
 MULTI_3 = Method("multi, 3 robots", "dead-reckoning", "joint-fastslam", 3, ORANGE, PARTICLES)
 MULTI_5 = MULTI_3._replace(name="multi, 5 robots", robots=5, colour=GREEN)
 OURS = Method("hybrid + join, 5 robots", "hybrid", "join", 5, BLACK, None)
-"""With the models and figures of the scenario `utias`; all others with the program's."""
+"""Uses the models and figures of the scenario `utias`; all others use the program's."""
 _COST_S = 4.0
 _LINE_POINTS = 1400
 
@@ -92,7 +92,9 @@ def _scenario(method: Method, seed: int) -> Scenario:
 
 
 def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
-    """Its models; every measurement by itself, resampled at each step; a map said each second."""
+    """The program's models; every measurement is processed separately, with resampling at each step
+    and a map each second.
+    """
     replace = msgspec.structs.replace
     front_end = replace(
         robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()

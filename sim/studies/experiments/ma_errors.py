@@ -110,7 +110,9 @@ class ErrorFigure(NamedTuple):
 
 
 def _runs(dataset: Dataset, method: Method, options: Options) -> list[Task]:
-    """One run of each seed; of ours the first: it takes longest, and the data are the same."""
+    """One run of each seed; of our estimator the first only, since it takes longest on the same
+    data.
+    """
     seeds = options.seeds[:1] if method == OURS else options.seeds
     return [ma_task(dataset, method, seed) for seed in seeds]
 

@@ -83,7 +83,7 @@ class PathFigure(NamedTuple):
 
 
 def _mean_errors(run: Figures) -> dict[str, float]:
-    """Of each robot's path [m], over what is said of it."""
+    """The mean position error [m] of each robot's path, where it has poses."""
     return {
         name: float(np.mean(robot["curve"]["error_m"]))
         for name, robot in run["robots"].items()

@@ -1,4 +1,6 @@
-"""What an experiment leaves: tables in the terminal, JSON, pictures, one page that holds it all."""
+"""Writes an experiment's outcome: tables in the terminal, JSON, pictures, and one page with all of
+it.
+"""
 
 import base64
 import json
@@ -49,7 +51,7 @@ def printed(concluded: Concluded) -> list[RenderableType]:
 
 
 def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, Any]:
-    """The figures, with what made them; numbers that are none are null."""
+    """The figures with their provenance; NaN and infinity become null."""
     options, outcome = concluded.options, concluded.outcome
     content = {
         "experiment": concluded.entry.name,
@@ -84,7 +86,9 @@ def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, An
 def write(
     all_concluded: Sequence[Concluded], folder: Path, page: str, provenance: Mapping[str, str]
 ) -> Path:
-    """Write each experiment's JSON and pictures and one page of all of them; the page's path."""
+    """Write each experiment's JSON and pictures and one page of all of them; returns the page's
+    path.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     sections = []
     for concluded in all_concluded:
@@ -199,7 +203,7 @@ def _section(concluded: Concluded, figures: Sequence[str]) -> str:
 
 
 def _kinds(concluded: Concluded) -> str:
-    """The runs and their parameters, folded away."""
+    """The runs and their parameters, in a collapsed section."""
     if not concluded.kinds:
         return ""
     rows = "".join(

@@ -1,4 +1,4 @@
-"""The parameters of the runs in words: where they differ from a built-in scenario."""
+"""The parameters of the runs in words: their differences from a built-in scenario."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,12 +10,12 @@ from sim.scenarios.scenario import load, with_options
 from sim.studies.experiments.task import Task
 
 IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots.id"})
-"""Said by a run's label, or of every robot its own."""
+"""Parameters that the run's label has, or that differ for every robot."""
 COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central.fusion"})
 
 
 def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
-    """The runs that differ in their seed only: their label, how many, and their parameters."""
+    """The label, number and parameters of the runs that differ in their seed only."""
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
         label = task.label.rpartition(", seed ")[0] or task.label
@@ -25,7 +25,7 @@ def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
 
 
 def _parameters(task: Task) -> Iterator[str]:
-    """Its scenarios by their differences from the built-in ones, all else as it is."""
+    """The differences of a task's scenarios from the built-in ones, and its other parameters."""
     yield task.work.rpartition(".")[2]
     for name, value in task.parameters.items():
         if isinstance(value, Mapping) and "robots" in value:
@@ -36,7 +36,7 @@ def _parameters(task: Task) -> Iterator[str]:
 
 
 def _differences(scenario: Mapping[str, Any]) -> Iterator[str]:
-    """`path = value` for what is not as in the built-in scenario of the same name."""
+    """`path = value` of each field that differs from the built-in scenario of the same name."""
     built_in = msgspec.to_builtins(
         with_options(load(scenario["name"]), robots=len(scenario["robots"]))
     )

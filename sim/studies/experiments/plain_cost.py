@@ -1,13 +1,14 @@
-"""The cost of a joined map, written down once more: plain arrays, and a solver of SciPy's.
+"""An independent implementation of the joined map's cost: plain arrays, and a solver of SciPy's.
 
-It judges what the team's map joining has found, so it uses nothing of it: the same formulas
+It is a reference for the team's map joining and shares no code with it. The same formulas
 
     Σ ‖L_k⁻¹ (R(θ_s)ᵀ(p − p_s) …, θ_e − θ_s …; minus the submap's mean)‖², L_k L_kᵀ = f P_k
     + Σ ‖L⁻¹ (range, bearing of a teammate; minus the measurement)‖² + Σ ‖prior‖²
 
-stand here with complex numbers and a dense Jacobian, and MINPACK's Levenberg-Marquardt solves them
-(Moré 1978), where the map joining has kernels, a sparse factorisation and Gauss-Newton steps. From
-the graph come what was measured and which number of the state belongs to which pose or landmark.
+are implemented with complex numbers and a dense Jacobian, and solved by MINPACK's
+Levenberg-Marquardt (Moré 1978), where the map joining has kernels, a sparse factorisation and
+Gauss-Newton steps. The graph provides the measurements, and the indices in the state of each pose
+and landmark.
 """
 
 from collections.abc import Iterator
@@ -25,13 +26,13 @@ Rows = Float[np.ndarray, "r _"]
 Indices = Int64[np.ndarray, " _"]
 
 TOLERANCE = 1e-12
-"""Relative, of the cost and of the step: a solution is much nearer to a minimum than 1 in χ²."""
+"""Relative tolerance of cost and step: a solution is much nearer to a minimum than 1 in χ²."""
 SOLUTIONS = 6
-"""A long curved valley is gone along by so many solutions at the most, each from the last one."""
+"""Most restarts along a long curved valley, each from the last solution."""
 
 
 class Solution(NamedTuple):
-    """A state, its cost, and whether the solver came to rest there."""
+    """A state, its cost, and whether the solver converged there."""
 
     state: Values
     cost: float
@@ -39,7 +40,7 @@ class Solution(NamedTuple):
 
 
 class PlainCost:
-    """The cost of a graph's states. fixed: numbers of the state that are not solved for."""
+    """The cost of a graph's states. fixed: coordinates of the state that are not solved for."""
 
     def __init__(
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
@@ -55,16 +56,16 @@ class PlainCost:
         self._of_prior = [np.linalg.cholesky(each.information).T for each in graph.priors]
 
     def of(self, state: Values) -> float:
-        """χ² of a state."""
+        """The χ² of a state."""
         r = self.residuals(state)
         return float(r @ r)
 
     def residuals(self, state: Values) -> Values:
-        """Whitened, term by term; their squares are the cost."""
+        """The whitened residuals, term by term; the sum of their squares is the cost."""
         return np.concatenate([W @ r for W, r, _, _ in self._terms(state)])
 
     def jacobian(self, state: Values) -> Rows:
-        """Of the whitened residuals, over the free numbers."""
+        """The Jacobian of the whitened residuals with respect to the free coordinates."""
         blocks = []
         for W, _, at, J in self._terms(state):
             block = np.zeros((len(W), len(state)))
@@ -73,7 +74,7 @@ class PlainCost:
         return np.concatenate(blocks)
 
     def solved(self, state: Values) -> Solution:
-        """The minimum whose valley the state lies in."""
+        """The minimum that the solver reaches from a state."""
         found = Solution(state, self.of(state), at_rest=False)
         for _ in range(SOLUTIONS):
             if found.at_rest:
@@ -111,7 +112,9 @@ class PlainCost:
         return Solution(end, self.of(end), at_rest=result.status > 0)
 
     def _terms(self, state: Values) -> Iterator[tuple[Rows, Values, Indices, Rows]]:
-        """Term by term: what whitens it, its residual, and the Jacobian over these numbers."""
+        """For each term its whitening matrix, its residual, the indices of its coordinates and its
+        Jacobian.
+        """
         offset = self._graph.offset
         for W, (contribution, nodes, _) in zip(self._of_submap, self._graph.submaps, strict=True):
             poses = 1 + len(contribution.local.node_stamps)
@@ -135,9 +138,10 @@ class PlainCost:
 
 
 def _submap(state: Values, first: Indices, poses: int) -> tuple[Values, Indices, Rows]:
-    """What a submap should say, and its Jacobian over the numbers of its start, poses, points.
+    """The predicted submap, the indices of its coordinates (start, poses, points), and its
+    Jacobian.
 
-    first: of each of them the first number in the state.
+    first: the first index of each node in the state.
     """
     s, points = int(first[0]), first[1:]
     turn = np.exp(-1j * state[s + 2])
@@ -177,5 +181,5 @@ def _whitening(covariance: Rows) -> Rows:
 
 
 def _around(angles: Values) -> Values:
-    """In (−π, π]."""
+    """Angles in (−π, π]."""
     return np.asarray(np.angle(np.exp(1j * angles)))

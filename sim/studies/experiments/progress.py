@@ -1,4 +1,4 @@
-"""What a user sees while the runs go on: a bar with the time left, or plain lines elsewhere."""
+"""Shows the progress of the runs: a bar with the time left, or plain lines outside a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +16,7 @@ LINE_S = 10.0
 
 @contextmanager
 def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
-    """A function that hears of every finished task; failures are told at once."""
+    """A function to call with every finished task; failures are printed at once."""
     console = Console(stderr=True)
     of = f"{len(tasks)} runs" + (f", {found} more are kept from before" if found else "")
     # Runs cost very different times: the bar goes by what they are expected to cost.

@@ -1,4 +1,4 @@
-"""Runs an experiment: what is kept already is taken, the rest is computed, all is made known."""
+"""Runs an experiment: loads the stored results, computes the others, and concludes."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ from sim.studies.experiments.parameters import kinds_of
 from sim.studies.experiments.task import Task
 
 FAILURES = "failures.txt"
-"""Beside the results: the tracebacks of the last command's failed runs."""
+"""File beside the results with the tracebacks of the last command's failed runs."""
 _BLOCK = 1 << 20
 
 
@@ -38,7 +38,7 @@ class Concluded:
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment, what it is asked, and its tasks."""
+    """An experiment, its options, and its tasks."""
 
     entry: Entry
     options: Options
@@ -47,7 +47,9 @@ class Plan:
 
 
 Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[[Done], None]]]
-"""Given the tasks to compute and how many are kept: what hears of every finished task."""
+"""Given the tasks to compute and the number of stored results, returns the function to call with
+every finished task.
+"""
 
 
 def planned(entry: Entry, options: Options) -> Plan:

@@ -1,8 +1,8 @@
 """All estimators and rules on the same measurements, and the thesis' tables 2.1 and 2.2 in numbers.
 
-The thesis praises and blames the methods in words; here is what was measured for those that are
-implemented, on its own world and on the one with an accurate sensor. The methods that are not
-implemented are named.
+The thesis describes advantages and disadvantages of the methods in words; here are measurements of
+those that are implemented, on its own world and on the one with an accurate sensor. The methods
+that are not implemented are named.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,9 @@ from team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
 MOST_SEEDS = 12
-"""The methods differ by factors, and there are two dozen pairs of a second or two each."""
+"""Most seeds: the methods differ by factors, and there are two dozen pairs of a second or
+two each.
+"""
 PARTICLES = (50, 200, 1000)
 SHOWN: Shown = (
     ("rmse", "map [m]", "{:.3f}"),
@@ -44,7 +46,7 @@ SHOWN: Shown = (
 
 
 class SurveyedMethod(NamedTuple):
-    """A method of tables 2.1 and 2.2: what the thesis says, and the pair that stands for it."""
+    """A method of tables 2.1 and 2.2: the thesis' judgement, and the pair that implements it."""
 
     method: str
     uncertainty: str

@@ -1,4 +1,4 @@
-"""A run as a task: a function by name with JSON parameters, and what its result depends on."""
+"""A run as a task: a function by name with JSON parameters, and the digest of its program."""
 
 import hashlib
 import importlib
@@ -14,15 +14,16 @@ from team.sources import sources_of
 
 ROOTS = ("team", "central", "sim")
 LIBRARIES = ("numpy", "scipy", "numba", "gtsam")
-"""Beside our sources, results depend on these."""
+"""Libraries that results depend on, beside our sources."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One run. work: `module:function`; the function takes the parameters, gives a JSON object.
+    """One run. work: `module:function`; the function takes the parameters and returns a JSON
+    object.
 
-    local: further keyword arguments that the result does not depend on, such as the path of a data
-    set whose checksum is among the parameters. cost: about how many seconds it takes.
+    local: further keyword arguments that do not change the result, such as the path of a data set
+    whose checksum is among the parameters. cost: estimated run time [s].
     """
 
     work: str
@@ -39,11 +40,11 @@ class Task:
 
     @property
     def program(self) -> str:
-        """A digest of what the function is made of: our sources and the libraries' versions."""
+        """A digest of our sources that the function uses and of the libraries' versions."""
         return program_of(self.work.partition(":")[0])
 
     def run(self) -> dict[str, Any]:
-        """Compute it, here and now."""
+        """Compute it in this process; returns the result."""
         module, _, function = self.work.partition(":")
         work: Callable[..., dict[str, Any]] = getattr(importlib.import_module(module), function)
         return work(**self.parameters, **self.local)
@@ -51,7 +52,9 @@ class Task:
 
 @lru_cache
 def program_of(module: str) -> str:
-    """Digest of the versions and of every source of ours that a module imports, near or far."""
+    """Digest of the libraries' versions and of every source of ours that a module imports, directly
+    or not.
+    """
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:

@@ -1,4 +1,4 @@
-"""One run of a team in memory, judged against the truth and the batch optimiser, as a task."""
+"""A task that runs a team in memory and compares it with the truth and the batch optimiser."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -30,10 +30,10 @@ Shown = Sequence[tuple[str, str, str]]
 """Columns of a table: the figure's name, the heading, the format."""
 OURS: tuple[Estimator, FusionRule] = ("hybrid", "join")
 _HYBRID_STEP_S, _STEP_S = 2e-3, 5e-4
-"""Of a robot's step, about."""
+"""Estimated time [s] of a robot's step."""
 _STEPS_TO_A_WAY_POINT = 22
 _DOUBLING_LANDMARKS = 100
-"""With so many more a step takes once more its time."""
+"""Number of landmarks that doubles the time of a step."""
 _UTIAS_S, _UTIAS_BATCH_S = 40.0, 160.0
 
 
@@ -46,10 +46,9 @@ def team_task(
     note: str = "",
     noise: NoiseKind = "white",
 ) -> Task:
-    """A run of this scenario. batch: with the batch MAP of the same measurements beside it.
+    """A run of this scenario. batch: with the batch MAP of the same measurements.
 
-    minimum: with how the map's minimum lies to the truth. note: what the scenario's name does not
-    say. noise: the batch's.
+    minimum: with `true_minimum`. note: what the scenario's name does not tell. noise: the batch's.
     """
     pair = named(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
@@ -66,7 +65,7 @@ def team_task(
 
 
 def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False) -> float:
-    """About how many seconds of a processor a run takes: long ones begin first."""
+    """Estimated CPU time [s] of a run: long ones begin first."""
     world = scenario.world
     if not isinstance(world, SimulatedWorld):
         return _UTIAS_S + batch * _UTIAS_BATCH_S
@@ -80,7 +79,7 @@ def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False
 
 
 def named(estimator: str, fusion: str) -> str:
-    """A pair as users write it."""
+    """The name of a pair as users write it."""
     return f"{estimator} + {fusion}"
 
 
@@ -92,7 +91,8 @@ def team_run(
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """The figures of one run; `batch` and `minimum`, if asked for, hold those of their own.
+    """The figures of one run; `batch` and `minimum`, if requested, contain those of the batch MAP
+    and of `true_minimum`.
 
     sha256: of the data set at `path`; it stands for it in the task's name.
     """
@@ -126,7 +126,9 @@ class TimedRun:
         self._fusions = 0
 
     def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
-        """Run the team; its log. streams: what the world says; None: as the scenario has it."""
+        """Run the team; yields the samples of its log. streams: of the world; None: those of the
+        scenario.
+        """
         measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
         for sample in run_team(scenario, measurements, *self._nodes()):
@@ -135,7 +137,7 @@ class TimedRun:
             yield sample
 
     def figures(self) -> Figures:
-        """The times in all, per odometry interval and per fused map."""
+        """The total times, and the times per odometry interval and per fused map."""
         return {
             "robot_seconds": self._robots.seconds,
             "centre_seconds": self._centre.seconds,
@@ -144,7 +146,7 @@ class TimedRun:
         }
 
     def _nodes(self) -> tuple[type[RobotNode], type[CentralNode]]:
-        """The nodes with a watch on what they do with a message."""
+        """The node classes that measure the time of handling a message."""
         robots, centre = self._robots, self._centre
 
         class TimedRobot(RobotNode):
@@ -174,9 +176,9 @@ class _Watch:
 
 
 def team_figures(evaluation: Evaluation) -> Figures:
-    """The figures of a run; None where there is nothing to judge. Means are over the robots.
+    """The figures of a run; None where there is no truth. Means are over the robots.
 
-    Without a fused map those of a map are over the robots' own.
+    Without a fused map the figures of a map are those of the robots' own maps.
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map
@@ -216,8 +218,8 @@ def team_figures(evaluation: Evaluation) -> Figures:
 
 
 def _robot_figures(robot: RobotResult) -> Figures:
-    """One robot's errors [m]; first_pose_chi2: of the motion of
-    the frame that its first smoothed pose is off by, 3 degrees of freedom.
+    """One robot's errors [m]; first_pose_chi2: of the motion by which its first smoothed pose
+    differs from the truth, 3 degrees of freedom.
     """
     smoothed, online = robot.smoothed, robot.online
     return {
@@ -247,7 +249,9 @@ def reference_figures(reference: BatchReference) -> Figures:
 
 
 class Figure(NamedTuple):
-    """A figure over seeds: its name, the run's figure that it is made of, and how."""
+    """A figure over seeds: its name, the run's figure that it is computed from, and the
+    function.
+    """
 
     name: str
     source: str
@@ -255,19 +259,19 @@ class Figure(NamedTuple):
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """The mean of the values that there are."""
+    """The mean of the values that are not None."""
     known = [value for value in values if value is not None]
     return fmean(known) if known else None
 
 
 def middle(values: Iterable[float | None]) -> float | None:
-    """The median of the values that there are."""
+    """The median of the values that are not None."""
     known = [value for value in values if value is not None]
     return median(known) if known else None
 
 
 def rms(values: Iterable[float | None]) -> float | None:
-    """The root of the mean square of the values that there are."""
+    """The root mean square of the values that are not None."""
     square = mean(None if value is None else value * value for value in values)
     return None if square is None else square**0.5
 
@@ -296,11 +300,11 @@ OVER_SEEDS = (
     Figure("seconds_per_step", "seconds_per_step", mean),
     Figure("seconds_per_fusion", "seconds_per_fusion", mean),
 )
-"""Errors as the root of the mean square over the seeds, all else as the mean."""
+"""Errors as the root mean square over the seeds, all else as the mean."""
 
 
 def over_seeds(runs: Sequence[Figures]) -> Figures:
-    """The figures of several runs, under the runs' names, with how many there are."""
+    """The figures over several runs, under the runs' names, with the number of runs."""
     return {"seeds": len(runs)} | {
         figure.name: figure.over_seeds(run.get(figure.source) for run in runs)
         for figure in OVER_SEEDS

@@ -1,12 +1,12 @@
-"""Is a map in the minimum that the truth lies in? Asked of the cost, not of the covariance.
+"""Decides whether a map is in the minimum that the truth lies in, by the cost and not by the
+covariance.
 
 An ellipsoid is exceeded wherever the valley of the cost is curved, though the minimum is the right
-one. So the final map's own cost is asked three things: whether a solution that starts at the truth
-ends lower, whether it ends in another place that is about as likely, and by how much the cost rises
-where the truth is held fixed (the likelihood ratio: χ² of the numbers held, however they are
-written down). The cost and its minima are those of `plain_cost`, which shares nothing with the map
-joining that it judges: the map's state is taken as it is, and is wrong too where it has not come
-to rest.
+one. So three tests use the final map's own cost: whether a solution that starts at the truth has
+less cost, whether it ends in another place that is about as likely, and by how much the cost rises
+where the truth is fixed (the likelihood ratio: χ² of the fixed coordinates, whatever their
+parametrisation). The cost and its minima are those of `plain_cost`, which shares no code with the
+map joining: a map whose state has not converged is wrong, too.
 """
 
 from collections.abc import Iterable, Mapping
@@ -32,9 +32,9 @@ LOWER = 1.0
 LIKELY = 0.999
 """Quantile of χ² beyond which a place, or the truth, is excluded."""
 NEARBY = 3
-"""Starts about the truth, beside the truth itself."""
+"""Number of initial states near the truth, beside the truth itself."""
 NEARBY_RAD = 0.1
-"""… whose headings are off by about so much."""
+"""Standard deviation [rad] of these states' headings about the true ones."""
 Values = Float[np.ndarray, " _"]
 
 
@@ -64,7 +64,7 @@ class TrueMinimum(NamedTuple):
 
 
 def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | None:
-    """Of the final map of a run under `join`; None without a start that is known."""
+    """The figures of the final map of a run under `join`; None where no initial pose is known."""
     fold = final_fold(samples)
     if run.map is None or not fold.starts:
         return None
@@ -75,7 +75,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 
 
 def final_fold(samples: Iterable[Sample]) -> Fold:
-    """The centre's final fold, from the submaps and inter-robot measurements that a log has."""
+    """The centre's final fold, computed from the submaps and inter-robot measurements of a log."""
     log = Recorded()
     for sample in samples:
         log.take(sample)
@@ -97,7 +97,7 @@ def judged(
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     paths: Mapping[str, Path],
 ) -> TrueMinimum:
-    """Of an island in the frame of the truth, as it is; plain squares without biases."""
+    """The figures of an island in the frame of the truth, with plain squares and without biases."""
     graph, settings = island.graph, island.settings
     if settings.robust_c is not None:
         raise NotImplementedError("the judge has plain squares: central.robust_c must be left out")
@@ -136,7 +136,7 @@ def judged(
 def _at_truth(
     island: Island, landmarks: Mapping[int, Float[np.ndarray, "2"]], paths: Mapping[str, Path]
 ) -> tuple[Values, set[int]]:
-    """The state with every node at its true value, and the nodes of which that is known."""
+    """The state with every known node at its true value, and the set of these nodes."""
     graph, state = island.graph, island.state.copy()
     known: set[int] = set()
 

@@ -1,8 +1,8 @@
-"""What the experiments after W. Xu's thesis have in common: its world, its methods, its curves.
+"""The common part of the experiments after W. Xu's thesis: its world, its methods, its curves.
 
 Its world is the built-in scenario `thesis`, with the 50 particles of its section 4.4.2. A figure of
-the thesis is one run; ours is the median of many seeds with the band that holds four fifths of
-them, and one run picked out with its 3σ bound.
+the thesis is one run; ours is the median of many seeds with the band of four fifths of them, and
+one single run with its 3σ bound.
 """
 
 import math
@@ -33,9 +33,9 @@ CODED_BEARING_SIGMA = math.sqrt(math.pi / 18.0**2)
 
 
 class Method(NamedTuple):
-    """A curve of a figure: its name, the pair that makes it, how many robots, its colour.
+    """A curve of a figure: its name, its pair, its number of robots, its colour.
 
-    particles: 50, as in the thesis; None: what our scenario has.
+    particles: 50, as in the thesis; None: our scenario's number.
     """
 
     name: str
