@@ -16,9 +16,9 @@ Dealt = Callable[[m.Done], bool]
 
 @dataclass
 class Attendance:
-    """What the centre knows of one robot.
+    """The progress and presence of one robot, as the centre knows them.
 
-    done: of the last words the one that is believed; dones: all that were heard. began: the latest
+    done: the believed one of the `Done` messages; dones: all that have arrived. began: the latest
     incarnation that has begun; 0: none. head: the newest head of its driver, in a live team.
     driver: whether its driver is present; None: unknown.
     """
@@ -61,13 +61,12 @@ class Attendance:
 
 @dataclass
 class TeamAttendance:
-    """What the centre knows of each robot of the team.
+    """The progress and presence of each robot of the team.
 
-    now_ns: the newest team time in any message. withdrawn: the robots that the team goes on
-    without; nobody waits for one that has left. world_end: the last counters that the world has
-    announced. ends: all ends that were announced, those refused included: one that the robots'
-    `Done` messages confirm becomes world_end. ordered: an operator has ordered the live team to
-    end.
+    now_ns: the newest team time in any message. withdrawn: the robots that were withdrawn; the map
+    waits for them only while they are present. world_end: the last counters that the world has
+    announced. ends: all announced ends, refused ones included; one that the robots' `Done`
+    messages confirm becomes world_end. ordered: an operator has ordered the live team to end.
     """
 
     robots: dict[str, Attendance]
@@ -88,7 +87,7 @@ class TeamAttendance:
         self.robots = dict(sorted({**self.robots, robot: Attendance()}.items()))
 
     def take(self, message: m.Message) -> None:
-        """Take what a message says of its sender; messages of strangers are ignored."""
+        """Take a message's information on its sender; messages of strangers are ignored."""
         match message:
             case m.Submap() | m.MapEstimate():
                 self.now_ns = max(self.now_ns, message.stamp_ns)

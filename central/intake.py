@@ -126,7 +126,7 @@ class Intake(ABC, Generic[I]):
         return []
 
     def stored_messages(self, robot: str) -> Sequence[m.Message]:
-        """What the robot's next process takes over; nothing: it begins its stream again.
+        """The messages that the robot's next process takes over; empty: it begins its stream again.
 
         Of each incarnation, the latest first: its initial pose, the submaps without a gap and the
         inter-robot factors from them.
@@ -134,7 +134,7 @@ class Intake(ABC, Generic[I]):
         return ()
 
     def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
-        """What robots say that they have sent and is not here."""
+        """Requests for submaps that robots have announced and that are not here."""
         return []
 
     def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:

@@ -21,11 +21,11 @@ Tail = Literal["final", "closed", "provisional"]
 
 
 class FusionRule(ABC, Generic[I]):
-    """Inputs in, the team's map out; inputs that grow are cheap.
+    """A function from inputs to the team's map; inputs that only grow are folded incrementally.
 
-    intake: who files its inputs. unnamed: fields of its maps that rest on what it knew beyond the
-    inputs that a map names. landmarks: in its newest map. not_folded: inputs of that which it
-    refused. warnings: what went wrong, the newest last.
+    intake: the class that collects its inputs. unnamed: fields of its maps that depend on more than
+    the inputs that a map names. landmarks: number in its newest map. not_folded: number of that
+    map's inputs that it refused. warnings: failures in words, the newest last.
     """
 
     intake: ClassVar[type[Intake[Any]]]
@@ -45,15 +45,15 @@ class FusionRule(ABC, Generic[I]):
 
     @abstractmethod
     def fuse(self, inputs: I, tail: Tail) -> list[Outgoing]:
-        """The map of these inputs, behind what goes out with it."""
+        """The map of these inputs, after the messages that accompany it."""
 
     def take(self, inputs: I) -> list[Outgoing]:
-        """Fold what is closed, no map being due yet; what goes out at once."""
+        """Fold the closed inputs without making a map; returns messages to publish at once."""
         return []
 
     @property
     def convicted(self) -> Mapping[str, str]:
-        """Whom the fold has found to be wrong beyond doubt, with the reason in words."""
+        """The robots that the fold has withdrawn, with the reason in words."""
         return {}
 
     @property

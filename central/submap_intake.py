@@ -163,9 +163,9 @@ class SubmapIntake(Intake[SubmapInputs]):
             self._verdicts.add(judged)
 
     def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
-        """Who joins later hears of every order from the centre: an operator does not stay.
+        """Repeat an order for robots that join later, since the operator's command has ended.
 
-        What the centre itself has ordered, before it was started again, its fold finds again.
+        An order that this centre itself gave in an earlier process is found again by its fold.
         """
         if order.by == "central":
             return []
@@ -175,20 +175,22 @@ class SubmapIntake(Intake[SubmapInputs]):
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """Orders that are not believed."""
+        """Warnings of orders that are not believed."""
         return self._withdrawal_witnesses.unconfirmed(self.withdrawn)
 
     # What is refused.
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
-        """Nobody need wait for a submap, or an inter-robot measurement from it, that raised."""
+        """Mark a submap as refused if its handling, or that of an inter-robot factor from it, has
+        raised, so that nothing waits for it.
+        """
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
         self._judge(message, why)
         return _credit(message, self.count((message.robot, message.incarnation)), now_ns)
 
     def _judge(self, of: m.Submap | m.SightingFactor, reason: str | None) -> None:
-        """A refused submap, or one with a refused inter-robot measurement, may never be in the
+        """Mark a refused submap, or one with a refused inter-robot factor: it may never be in the
         map.
         """
         if reason is not None:
@@ -197,9 +199,8 @@ class SubmapIntake(Intake[SubmapInputs]):
             self._refusals.setdefault((of.robot, of.incarnation), set()).add(of.sequence)
 
     def _dealt_with(self, stream: Stream, count: int) -> int:
-        """`count`, unless the next one was refused: then nobody need wait for it.
-
-        What follows the refused one can not enter the map; it counts as far as it has come.
+        """`count`, unless the next submap was refused: then those after it count, too, since
+        nothing waits for them.
         """
         refused = self._refusals.get(stream, set())
         if count not in refused:
@@ -214,17 +215,18 @@ class SubmapIntake(Intake[SubmapInputs]):
 
     @property
     def submaps(self) -> int:
-        """In the map's reach, or refused."""
+        """Number of submaps in the map's reach, or refused."""
         return sum(self.count(stream) for stream in self._set.streams)
 
     def dealt(self, done: m.Done) -> bool:
-        """Every submap that the robot has sent is in the map's reach."""
+        """True once every submap that the robot has sent is in the map's reach."""
         return self.count((done.robot, done.incarnation)) >= done.submaps
 
     def stored_messages(self, robot: str) -> list[m.Message]:
-        """What the robot's next process takes over, of each incarnation, the latest first.
+        """The messages that the robot's next process takes over, of each incarnation, the latest
+        first.
 
-        It is the initial pose, the submaps without a gap and the inter-robot factors from them.
+        These are the initial pose, the submaps without a gap and the inter-robot factors from them.
         """
         found: list[m.Message] = []
         for stream in sorted((s for s in self._set.streams if s[0] == robot), reverse=True):
@@ -235,7 +237,7 @@ class SubmapIntake(Intake[SubmapInputs]):
         return found
 
     def lacking(self, attendance: TeamAttendance) -> list[m.SubmapsRequest]:
-        """What robots say that they have sent, and what is not in the map's reach."""
+        """Requests for submaps that robots have announced and that are not in the map's reach."""
         announced = (
             s for robot in attendance.robots.values() for s in (robot.progress, robot.done)
         )

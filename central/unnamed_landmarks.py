@@ -1,4 +1,6 @@
-"""What the centre says of landmarks without names, and what an operator says of them."""
+"""Converts the associations of landmarks without names, and an operator's verdicts, to messages and
+back.
+"""
 
 import numpy as np
 
@@ -7,14 +9,14 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 
 STEPS = ("", "track", "near", "sweep", "closure", "merge", "verdict")
-"""Why an unnamed landmark went into another set than its own, by its number on the wire."""
+"""The step that associated an unnamed landmark with a set, by its number on the wire."""
 DECISIONS = 100
-"""So many of the newest decisions go with a map, and so many that wait."""
+"""Most decisions in a map, and most that wait."""
 LARGEST = 1e300
 
 
 def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
-    """The table of unnamed landmarks: member, identity, why."""
+    """The table of unnamed landmarks: member, identity, step."""
     streams: dict[tuple[str, int], list[Member]] = {}
     for member in sorted(landmarks.number):
         streams.setdefault((member.robot, member.incarnation), []).append(member)
@@ -39,7 +41,7 @@ def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
 
 
 def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
-    """The newest closures and merges, then what waits, by whom it is about."""
+    """The newest closures and merges, then those that wait, by their streams."""
     waits = [landmarks.waits[of] for of in sorted(landmarks.waits)][-DECISIONS:]
     return tuple(
         m.AssociationDecision(**each._asdict())
@@ -48,7 +50,7 @@ def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
 
 
 def verdict_of(judgement: m.Judgement) -> Verdict:
-    """A judgement as the fold takes it."""
+    """An operator's judgement as the fold's verdict."""
     first, second = (
         Member(each.robot, each.incarnation, each.sequence, each.local)
         for each in sorted(
@@ -60,6 +62,6 @@ def verdict_of(judgement: m.Judgement) -> Verdict:
 
 
 def judgement_of(verdict: Verdict) -> m.Judgement:
-    """A verdict as maps name it."""
+    """The fold's verdict as maps name it."""
     first, second = (m.LocalLandmark(**each._asdict()) for each in verdict[:2])
     return m.Judgement(first=first, second=second, same=verdict.same)

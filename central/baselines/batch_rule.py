@@ -1,4 +1,6 @@
-"""The rule `batch`: the batch MAP over all robots' raw measurements, while they come."""
+"""The rule `batch`: the batch MAP over all robots' raw measurements, solved again as they
+arrive.
+"""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -23,16 +25,18 @@ from team.wire import channels as ch
 from team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
-"""Of a broadcast's map: from the last solution few are needed, to a Newton step of so many σ."""
+"""Most iterations of a broadcast's map, which starts from the last solution, and the Newton step in
+σ that ends them.
+"""
 FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
-"""Of the final map; what is not there by then is said."""
+"""The same for the final map, which has a warning if the iterations do not suffice."""
 
 
 class BatchRule(MeasurementRule):
     """Every pose of every robot at its keyframes and all landmarks, solved anew at each broadcast.
 
-    Poses are said with the map, each robot's newest; with the final map the whole paths. Errors of
-    sensors that persist and biases are taken as white, and that is said.
+    Each robot's newest pose is published with the map, and the whole paths with the final map.
+    Sensor errors that persist, and biases, are taken as white noise, with a warning.
     """
 
     _batch: Batch
@@ -46,7 +50,7 @@ class BatchRule(MeasurementRule):
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """The poses, and the joint cost of the last map."""
+        """The number of poses, and the joint cost of the last map."""
         if not self.models:
             return {}
         figures = {"poses": float(len(self._batch.poses))}
@@ -56,7 +60,9 @@ class BatchRule(MeasurementRule):
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What is taken as white though it persists, and whether the final map has converged."""
+        """The errors that are taken as white though they persist, and whether the final map has
+        converged.
+        """
         return tuple(self._findings)
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
@@ -86,7 +92,9 @@ class BatchRule(MeasurementRule):
         return MapContent(landmarks, self._batch.cost, self._batch.dof, outgoing)
 
     def _grow(self) -> None:
-        """Take the turns that wait; without what they saw, or not at all, where none is solved."""
+        """Add the waiting steps; without their measurements, or not at all, where there is no
+        solution.
+        """
         turns, self._waiting = self._waiting, []
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):
@@ -102,7 +110,7 @@ class BatchRule(MeasurementRule):
             )
 
     def _solved(self, grown: Batch, iterations: int, decrement: float) -> Batch:
-        """The solution; where there is none, what the steps before have left."""
+        """The solution; where there is none, the estimate before it."""
         with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
             solution = batch.solved(grown, iterations, decrement)
             if np.isfinite(solution.poses).all() and np.isfinite(solution.posterior.panels).all():
@@ -145,7 +153,7 @@ class BatchRule(MeasurementRule):
 
 
 def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
-    """The errors that are declared to persist, by the robots that declare the same."""
+    """The errors that are configured to persist, each with the robots that have the same."""
     declared = defaultdict(list)
     for name, config in sorted(robots.items()):
         sensor, biases = config.sensor, config.front_end.biases

@@ -1,8 +1,8 @@
 """The rules that fuse whole maps which the robots absorb again, in lockstep.
 
-Each round takes the map that every robot sent for it. What comes back replaces the robots' own
-landmarks, so the next round's maps hold this round's: under `kalman` and `kalman-per-axis` the same
-measurements are counted again and again, and the covariance that they give is worth nothing.
+Each round takes the map that every robot sent for it. The fused map replaces the robots' own
+landmarks, so the next round's maps contain this round's: under `kalman` and `kalman-per-axis` the
+same measurements are counted again and again, and the covariance has no meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ _NOT_VALID = "this rule counts measurements more than once: its covariance is no
 
 
 class Rounds(Intake[MapInputs]):
-    """Every robot's map of a round, and the submaps beside it, for the robots' next lives."""
+    """Every robot's map of a round, and its submaps, for the robots' next processes."""
 
     listens = (ch.START, ch.SUBMAP, ch.OWN_MAP)
     due = "now"
@@ -51,7 +51,7 @@ class Rounds(Intake[MapInputs]):
         self._starts: dict[Stream, m.InitialPose] = {}
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """File a map for the round that it names."""
+        """File a map under the round that it names."""
         match message:
             case m.InitialPose():
                 self._starts.setdefault((message.robot, message.incarnation), message)
@@ -64,13 +64,13 @@ class Rounds(Intake[MapInputs]):
         return []
 
     def inputs(self, closed_ns: float, now_ns: int) -> MapInputs:
-        """No maps: a round's go into its own."""
+        """No maps: those of a round are in its own instant."""
         return MapInputs(now_ns=now_ns)
 
     def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MapInputs]]:
-        """Every round that no robot is missing from which may still send a map.
+        """Every round that has the maps of all robots that may still send one.
 
-        A centre that was started again goes on with the round that everybody is in.
+        A centre that was started again continues with the present round.
         """
 
         def complete(number: int) -> bool:
@@ -91,7 +91,7 @@ class Rounds(Intake[MapInputs]):
             yield Instant(attendance.now_ns, inputs)
 
     def stored_messages(self, robot: str) -> Sequence[m.Message]:
-        """The start of the robot's latest incarnation and its submaps without a gap."""
+        """The initial pose of the robot's latest incarnation and its submaps without a gap."""
         incarnations = [incarnation for name, incarnation in self._set.streams if name == robot]
         submaps = self._set.chain((robot, max(incarnations))) if incarnations else []
         start = self._starts.get((robot, submaps[0].incarnation)) if submaps else None

@@ -19,9 +19,11 @@ from team.estimation.randomness import generator
 from team.wire.bus import Outgoing
 
 RESAMPLE_BELOW = 1.0
-"""Algorithm 1 resamples at every step."""
+"""Resamples at every step, as algorithm 1 does."""
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a pose's covariance [m², m², rad²]: fewer than four particles may differ."""
+"""Added to a pose's covariance [m², m², rad²], which is singular where fewer than four particles
+differ.
+"""
 
 
 class JointFastSlamRule(MeasurementRule):
@@ -38,7 +40,7 @@ class JointFastSlamRule(MeasurementRule):
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """The particles."""
+        """The number of particles."""
         return {"particles": float(self.config.particles)}
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
@@ -79,7 +81,7 @@ class JointFastSlamRule(MeasurementRule):
 
 
 def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> RobotStep:
-    """A start with this covariance in (x, y, θ): a motion by nothing with its noise."""
+    """An initial pose with this covariance in (x, y, θ): a motion by nothing with its noise."""
     G = tangent(pose[2])
     own = G.T @ covariance @ G
     nothing = np.empty(0)

@@ -1,9 +1,9 @@
-"""Rules that fuse whole maps which the robots then absorb: kept because users compare them.
+"""Rules that fuse whole maps which the robots then absorb, for comparison.
 
 `kalman_per_axis` and `kalman` treat the maps as independent. They are not once a robot has absorbed
 a fused map and sends its own again: every measurement is then counted again with each exchange, and
 the covariance loses its meaning. Covariance intersection stays consistent for any correlation of
-the landmarks that it fuses, at the price of what the maps truly have in addition.
+the landmarks that it fuses; the price is that it gives away independent information.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ SEARCH_STEPS = 60
 
 
 SMALLEST_VARIANCE = 1e-12
-"""m²: re-absorbing halves the variance with every round; it must stay a number."""
+"""Least variance [m²]: absorbing halves the variance in every round, and it must stay positive."""
 
 
 def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
@@ -52,11 +52,12 @@ def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 def covariance_intersection(
     maps: Sequence[LandmarkGaussian], criterion: Literal["trace", "det"] = "det"
 ) -> LandmarkGaussian:
-    """Fusion that holds for any correlation between the maps (Julier & Uhlmann 1997).
+    """Fusion that is consistent for any correlation between the maps (Julier & Uhlmann 1997).
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
     of the least trace or determinant of C. The landmarks of one map alone follow by regression on
-    the common ones in that map; what the regression leaves is taken as that map's own.
+    the common ones in that map; the residual of the regression counts as that map's own
+    information.
     """
 
     def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
@@ -82,10 +83,10 @@ def fused_totally(
     maps: Mapping[str, LandmarkGaussian],
     coordinate_m: float,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """The fusion of the robots' maps, and why a map is left out of it.
+    """The fusion of the robots' maps, and the maps that were left out, with reasons.
 
-    A map beyond the bounds is, and one with which the rule has no result: they are then taken one
-    by one in the given order.
+    A map is left out if it exceeds the bounds, or if the rule has no result with it: then the maps
+    are fused one by one in the given order.
     """
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []
@@ -122,7 +123,7 @@ def _tried(
 
 
 def _shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
-    """Places of the common landmarks' coordinates in a and in b."""
+    """Indices of the common landmarks' coordinates in a and in b."""
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     return _points(in_a), _points(in_b)
 
@@ -132,7 +133,7 @@ def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
 
 
 def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
-    """`fused` with those landmarks of `a` that it does not know, by regression on the others."""
+    """`fused` with those landmarks of `a` that it lacks, by regression on the others."""
     in_a, in_fused = _shared(a, fused)
     mean, covariance = carried_along(
         a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused

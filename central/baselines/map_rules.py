@@ -1,4 +1,4 @@
-"""The rules on robots' whole maps that nobody absorbs: fused once as they are, or left alone."""
+"""The rules on robots' whole maps that no robot absorbs: fused once, or not at all."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -18,7 +18,7 @@ from team.wire.digest import digest_of
 
 
 class NewestMaps(Intake[MapInputs]):
-    """The newest map of every robot, and where the streams start."""
+    """The newest map of every robot, and the initial poses of the streams."""
 
     listens = (ch.START, ch.OWN_MAP)
 
@@ -28,7 +28,7 @@ class NewestMaps(Intake[MapInputs]):
         self._starts: dict[Stream, m.InitialPose] = {}
 
     def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Keep a start, and a map that is newer than the robot's last one."""
+        """Store an initial pose, or a map that is newer than the robot's last one."""
         match message:
             case m.InitialPose():
                 self._starts[message.robot, message.incarnation] = message
@@ -46,7 +46,7 @@ class NewestMaps(Intake[MapInputs]):
         return MapInputs(now_ns=now_ns, maps=maps, starts=self._starts)
 
     def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MapInputs]]:
-        """Now."""
+        """One instant, now."""
         yield Instant(attendance.now_ns, self.inputs(float("inf"), attendance.now_ns))
 
     def members(self, until_ns: float) -> Mapping[Stream, int]:
@@ -55,7 +55,7 @@ class NewestMaps(Intake[MapInputs]):
         return {(each.robot, each.incarnation): each.sequence for each in placed}
 
     def dealt(self, done: m.Done) -> bool:
-        """The robot's last map is here, and the start of its stream."""
+        """True once the robot's last map and the initial pose of its stream have arrived."""
         found = self._maps.get(done.robot)
         last = (done.incarnation, done.last_map)
         return done.last_map < 0 or (
@@ -83,7 +83,7 @@ class LatestRule(FusionRule[MapInputs]):
     unnamed = ("reasons",)
 
     def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
-        """These maps as one."""
+        """The fusion of these maps."""
         maps = [each for each in inputs.maps if is_placed(each, inputs.starts)]
         values = {x.robot: _value(x) for x in maps}
         value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
@@ -109,7 +109,7 @@ class AloneRule(FusionRule[MapInputs]):
     intake = NewestMaps
 
     def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
-        """The map of the one robot; of several robots a map without landmarks that says so."""
+        """The map of the one robot; of several robots a map without landmarks, with the reason."""
         if tail != "final":
             return []
         maps, reason = inputs.maps, ""

@@ -1,4 +1,4 @@
-"""What rules on raw measurements share: the team's keyframes in, poses and the map out."""
+"""The common part of rules on raw measurements: the team's keyframes in, poses and the map out."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ from team.wire.digest import NO_MAP, digest_of
 
 @dataclass(frozen=True)
 class MapContent:
-    """What a map is made of: the landmarks and, where the rule has one, the joint cost.
+    """The contents of a map: the landmarks and, where the rule has one, the joint cost.
 
     before: messages that go out before it.
     """
@@ -43,8 +43,8 @@ class MapContent:
 class MeasurementInputs(Inputs):
     """The team's keyframes, those of one team time as one step; they grow.
 
-    starts: the models and the start of each robot, once all are here. broken: robots whose stream
-    began anew.
+    starts: the models and the initial pose of each robot, once all are here. broken: robots whose
+    stream began anew.
     """
 
     starts: Mapping[str, tuple[RobotConfig, m.InitialPose]] = field(default_factory=dict)
@@ -53,7 +53,9 @@ class MeasurementInputs(Inputs):
 
 
 class MeasurementIntake(Intake[MeasurementInputs]):
-    """Raw measurements and the models that the robots announce; the keyframes are the clock."""
+    """Collects raw measurements and the models that the robots announce; the keyframes are the
+    clock.
+    """
 
     listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
     due = "period"
@@ -87,11 +89,11 @@ class MeasurementIntake(Intake[MeasurementInputs]):
 
     @property
     def complete(self) -> bool:
-        """Every measurement of every stream has been used."""
+        """True once every measurement of every stream has been used."""
         return self._keyframes.complete
 
     def inputs(self, closed_ns: float, now_ns: int) -> MeasurementInputs:
-        """All steps whose turn has come."""
+        """All steps that are complete."""
         return MeasurementInputs(
             now_ns=now_ns,
             starts=self._starts,
@@ -100,7 +102,7 @@ class MeasurementIntake(Intake[MeasurementInputs]):
         )
 
     def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MeasurementInputs]]:
-        """Before every step whose turn has come, when a map may be due, and behind it."""
+        """An instant before every complete step, when a map may be due, and one after the last."""
         self._starts = self._starts or self._keyframes.starts or {}
         if not self._starts:
             return
@@ -112,16 +114,16 @@ class MeasurementIntake(Intake[MeasurementInputs]):
             yield Instant(now_ns, self.inputs(now_ns, now_ns), since_ns)
 
     def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
-        """Measurements that the link has lost."""
+        """Requests for measurements that the link has lost."""
         return self._keyframes.requests(now_ns)
 
 
 class MeasurementRule(FusionRule[MeasurementInputs]):
     """An estimate over all robots' raw measurements at the centre.
 
-    The keyframes of one team time are one step. The robots' models come with what they announce. A
-    robot whose start pose is not known is left out; where no start is known the first robot's is
-    the frame. A map's members name each robot's last measurement in it.
+    The keyframes of one team time are one step. The robots announce their models. A robot with an
+    unknown initial pose is left out; where no initial pose is known the first robot's is the frame.
+    A map's members name each robot's last measurement in it.
     """
 
     intake = MeasurementIntake
@@ -138,22 +140,24 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
 
     @abstractmethod
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        """The robots' start poses; covariances in (x, y, θ), None: exactly known."""
+        """Begin with the robots' initial poses; covariances in (x, y, θ), None: exactly known."""
 
     @abstractmethod
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
-        """One step of the team, which the members already name; the poses that it gives."""
+        """Process one step of the team, which the members already name; returns the poses to
+        publish.
+        """
 
     @abstractmethod
     def _content(self, *, final: bool) -> MapContent:
         """The map of all steps so far."""
 
     def fuse(self, inputs: MeasurementInputs, tail: Tail) -> list[Outgoing]:
-        """The map of all steps, behind the poses that they give."""
+        """The map of all steps, after their poses."""
         return [*self.take(inputs), *self._map_messages(inputs.broken, final=tail == "final")]
 
     def take(self, inputs: MeasurementInputs) -> list[Outgoing]:
-        """The steps that are new; the poses that they give."""
+        """Process the new steps; returns the poses to publish."""
         if not self.models and inputs.starts:
             self._begin(inputs.starts)
         out: list[Outgoing] = []
@@ -163,7 +167,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
         return out
 
     def _begin(self, starts: Mapping[str, tuple[RobotConfig, m.InitialPose]]) -> None:
-        """Where the robots start, in one frame."""
+        """Place the robots' initial poses in one frame."""
         placed = {name: start for name, (_, start) in starts.items() if self._is_placed(start)}
         if not placed:
             name = min(starts)
@@ -190,7 +194,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
     def _sensors_start(
         self, robot: str, pose: Pose, covariance: Matrix | None
     ) -> tuple[Pose, Matrix | None]:
-        """Where the robot's sensor begins: keyframes are of it."""
+        """The initial pose of the robot's sensor, of which the keyframes are."""
         sensor = self.models[robot].sensor
         if not sensor.is_mounted:
             return pose, covariance
@@ -227,7 +231,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
         return self._take(step, turns)
 
     def pose_is_due(self, each: RobotKeyframe) -> bool:
-        """Whether the robot's `pose_s` have gone by since its last pose."""
+        """Whether the robot's `pose_s` have passed since its last pose."""
         last_ns = self._pose_ns.get(each.robot)
         pose_ns = self.models[each.robot].pose_s * 1e9
         return last_ns is None or each.stamp_ns - last_ns >= pose_ns
@@ -246,7 +250,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
 
     @property
     def digest(self) -> bytes:
-        """The name of the measurements so far."""
+        """The name of the set of measurements so far."""
         members = (self.members[robot] for robot in sorted(self.members))
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return digest_of(self.config_digest, named)

@@ -1,9 +1,9 @@
-"""Map joining as in Downs' thesis: each robot joins its own submaps, the maps are tied by SVD.
+"""Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
 
-Every robot's submaps make one map by least squares in the frame of its own start (section 4.1). A
-robot's map is then turned into the frame of the others' by a singular value decomposition over the
-landmarks that both have, and the landmarks are joined (section 4.3). The start pose of the first
-robot fixes the frame; what the others are told of theirs has no influence.
+Every robot's submaps make one map by least squares in the frame of its own initial pose (section
+4.1). A robot's map is then moved into the frame of the others' by a singular value decomposition
+over the common landmarks, and the landmarks are joined (section 4.3). The initial pose of the first
+robot fixes the frame; those of the others have no influence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,9 +42,9 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """The submaps of a stream so far: how many, their map, and the digest of what is in it.
+    """The submaps of a stream so far: their number, their map, and the digest of its inputs.
 
-    refused: the submap with which the chain has ended and why, if there is one.
+    refused: the submap at which the chain has ended and why, if there is one.
     """
 
     count: int
@@ -56,8 +56,8 @@ class _Joined:
 class SvdJoinRule(FusionRule[SubmapInputs]):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
-    A later incarnation of a robot is a stream of its own, in a frame of its own. A running map has
-    whatever is here: a later one may put any of it elsewhere.
+    A later incarnation of a robot is a stream of its own, in a frame of its own. A running map
+    contains everything that has arrived; a later one may place any of it elsewhere.
     """
 
     intake = SubmapIntake
@@ -68,7 +68,7 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
         self._joined: dict[Stream, _Joined] = {}
 
     def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
-        """The map of these submaps: a function of them and of the starts alone."""
+        """The map of these submaps: a function of them and of the initial poses alone."""
         channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
         return [Outgoing(channel, "", self._fused(inputs, final=tail == "final"))]
 
@@ -116,8 +116,8 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
     ) -> _Joined:
         """The map of a stream's chain, from the longest one that was made before.
 
-        Running maps have the solution that each submap has moved on; the final one is solved to the
-        end, wrong minima looked for.
+        Running maps continue from the last solution with each submap; the final one is solved until
+        it converges, including a search for other minima.
         """
         begin = svd_joining.initial_state(
             {stream[0]: np.zeros(3) if initial_pose is None else initial_pose}, self._weighting
@@ -155,7 +155,7 @@ def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoi
 
 
 def _solution(state: SubmapJoining) -> SubmapJoining:
-    """The full solution; where there is none, the map that the submaps have grown to."""
+    """The full solution; where there is none, the state before it."""
     try:
         with np.errstate(all="ignore"):
             return svd_joining.solved(state)
@@ -172,9 +172,9 @@ def tied(
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """Greedily aligns the map that has the most landmarks in common with those that are aligned.
 
-    sightings: by two streams in their order, the robots' own places in both maps where they saw
-    each other (`mutual_sighting`); they tie beside the common landmarks, not with `full`. Who
-    shares too few points stays out, with the reason.
+    sightings: by two streams in their order, the robots' own positions in both maps where they
+    measured each other (`mutual_sighting`); they are aligned like common landmarks, but not with
+    `full`. A map with too few common points is left out, with the reason.
     """
     fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}

@@ -17,7 +17,7 @@ from team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):
-    """One robot's motion and what it saw at its end; `number`: that of the measurement that closed
+    """One robot's motion and its measurements at the end; `number`: of the measurement that closed
     it.
     """
 
@@ -29,7 +29,7 @@ class RobotKeyframe(NamedTuple):
 
 @dataclass
 class _Stream:
-    """The measurements of one robot, from its start pose on.
+    """The measurements of one robot, from its initial pose on.
 
     covered_ns: no keyframe before this team time can still come. start: measurement 0.
     """
@@ -47,12 +47,12 @@ class _Stream:
 
     @property
     def complete(self) -> bool:
-        """Every measurement of it has been taken."""
+        """True once every measurement of it has been taken."""
         end = self.end
         return self.broken or (end is not None and self.inbox.complete(end))
 
     def take(self) -> None:
-        """Cut the measurements whose turn has come into keyframes."""
+        """Cut the measurements that are complete into keyframes."""
         if self.config is None:
             return
         for measurement in self.inbox.taken():
@@ -108,7 +108,7 @@ class TeamKeyframes:
         self._streams = {robot: _Stream(robot) for robot in sorted(robots)}
 
     def configure(self, robot: str, config: RobotConfig) -> None:
-        """The models of a robot; its measurements wait for them."""
+        """Set the models of a robot; its measurements wait for them."""
         if robot in self._streams and self._streams[robot].config is None:
             self._streams[robot].config = config
 
@@ -129,7 +129,7 @@ class TeamKeyframes:
 
     @property
     def starts(self) -> dict[str, tuple[RobotConfig, m.InitialPose]] | None:
-        """Every robot's models and start; None until all are here."""
+        """Every robot's models and initial pose; None until all are here."""
         found = {}
         for name, stream in self._streams.items():
             stream.take()
@@ -150,7 +150,7 @@ class TeamKeyframes:
         return all(stream.complete for stream in self._streams.values())
 
     def steps(self) -> Iterator[list[RobotKeyframe]]:
-        """The keyframes whose turn has come, those of one team time together."""
+        """The keyframes that are complete, those of one team time together."""
         for stream in self._streams.values():
             stream.take()
         horizon = min(stream.covered_ns for stream in self._streams.values())
@@ -164,7 +164,7 @@ class TeamKeyframes:
             yield list(step)
 
     def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
-        """The measurements that are missing and must be asked for at their source."""
+        """Requests to the source for measurements that are missing."""
         found = []
         for name, stream in self._streams.items():
             missing = stream.inbox.missing(stream.end)

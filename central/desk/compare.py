@@ -69,7 +69,7 @@ def _aligned(robot: RobotResult | None) -> float:
 
 
 def _errors(run: Evaluation, name: str, form: str) -> str:
-    """A figure of the map's errors; of one in an arbitrary frame only what alignment leaves."""
+    """A figure of the map's errors; of a map in an arbitrary frame only the aligned ones."""
     errors = None if run.map is None else run.map.errors
     if errors is None or (run.arbitrary_frame and name != "aligned_rmse_m"):
         return "–"

@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 )  # fmt: skip
-"""Okabe and Ito's colours, told apart by the colour-blind: of methods and kinds of events."""
+"""Okabe and Ito's colours for methods and kinds of events, distinguishable by the colour-blind."""
 RED, BLACK, GREY = "#C00000", "#111111", "#7a7a7a"
 MAP_COLOUR, TRUTH_COLOUR, TRUE_LANDMARK_COLOUR = BLACK, GREY, RED
 ROBOT_COLOURS = (
     "#3b9dff", "#ff7a33", "#19c37d", "#e667b3", "#f2c230", "#9a7bff", "#33c7d9", "#ff5d6c",
     "#a3c644", "#c79a6b",
 )  # fmt: skip
-"""Robots' colours in the order of their names; told apart on dark and on light ground."""
+"""Robots' colours in the order of their names, distinguishable on dark and on light ground."""
 ELLIPSE_SCALE = float(np.sqrt(5.991))
 """95 % of a Gaussian in the plane lie within this Mahalanobis distance."""
 _DIGITS = re.compile("([0-9]+)")

@@ -1,9 +1,9 @@
-"""The ledger of a log: every measurement has exactly one disposition (law 1), every submap its
-maps.
+"""The ledger of a log: the one disposition of every measurement (law 1), and the maps of every
+submap.
 
 A submap names its interval of measurements, a map its version vector. Which measurements of an
-interval a robot rejected, and why, is found by its node, which consumes the recorded measurements
-again. Of measurements behind a robot's last submap those that it had consumed are open, the others
+interval a robot rejected, and why, is computed by its node, which consumes the recorded
+measurements again. Measurements behind a robot's last submap are open if it had consumed them, else
 lost.
 """
 
@@ -22,8 +22,9 @@ IN_SUBMAP = "in a submap"
 OPEN = "open"
 LOST = "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
-"""Limits on missing measurements, which need memory, too: this many, or this many times those
-that are there."""
+"""Limits on the number of missing measurements that are listed: this many, or this many times the
+existing ones.
+"""
 SubmapName = tuple[str, int, int]
 """(robot, incarnation, sequence)."""
 
@@ -43,7 +44,7 @@ class Ledger:
     """Every measurement's entry by stream and counter, every submap's maps, and the violations.
 
     maps: the digests of the maps that used a submap, in the order of the log. withdrawn: the robots
-    that the last map goes without; what is in their submaps is in no map any more.
+    that the last map leaves out; the measurements in their submaps are in no map any more.
     """
 
     entries: Mapping[Stream, tuple[Entry, ...]]
@@ -149,7 +150,7 @@ def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]
 def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
-    """The entry of every measurement that is there or should be, and the violations among them."""
+    """The entry of every measurement that exists or should, and the violations among them."""
     robot, incarnation = stream
     measurements = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)

@@ -109,7 +109,7 @@ def _between_ends(
 
 
 def _joined(parts: list[SmoothedPath]) -> SmoothedPath:
-    """The incarnations of a robot one behind the other."""
+    """The paths of a robot's incarnations in sequence."""
     return SmoothedPath(
         np.concatenate([part.stamps_ns for part in parts]),
         np.concatenate([part.poses for part in parts]),

@@ -28,12 +28,13 @@ LISTENS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL, ch.TEAM_PRIOR, ch.TEAM_TR
 """The peers' channels that are presented in this way."""
 _FOLD = "fold."
 _LAST = (ch.TEAM_FINAL, ch.TEAM_TRAJECTORY)
-"""Messages that count for the team unless a centre has published them; one that comes back late
-may not."""
+"""Messages that stand for the team's unless a centre has published them; a centre that comes back
+late may not.
+"""
 
 
 class PeersAsCentre:
-    """Renames samples of peers to a centre's keys, one after the other."""
+    """Renames samples of peers to a centre's keys."""
 
     def __init__(self) -> None:
         self._centre = self._concluded = False

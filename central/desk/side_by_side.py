@@ -1,4 +1,6 @@
-"""A recorded run beside the same measurements under other conditions: figures, and one picture."""
+"""Compares a recorded run with one of the same measurements under other conditions: figures, and
+one picture.
+"""
 
 from collections.abc import Callable
 from math import degrees

@@ -89,11 +89,9 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
-    """A word about CSV files that no table is called as, and about folders that have tables, but
-    none that makes them a robot's.
-    """
+    """Notes on CSV files without a table's name, and on folders with tables but none of a robot."""
     known = {*tables, "detections", "labels"}
-    said = []
+    notes = []
     for place in dict.fromkeys([root, *folders.values()]):
         strays = sorted(
             each.name
@@ -102,12 +100,12 @@ def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -
         )
         if strays:
             inside = f"{place.name}: " if place != root else ""
-            said.append(
+            notes.append(
                 f"{inside}{', '.join(strays)} not read: tables are called "
                 f"{', '.join(f'{each}.csv' for each in tables)}"
             )
     if root in folders.values():
-        return said
+        return notes
     entries: list[File] = sorted(root.iterdir(), key=lambda each: each.name)
     lacking = [
         entry
@@ -116,6 +114,6 @@ def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -
         and entry.name not in folders
         and any(each.name.endswith(".csv") for each in entry.iterdir())
     ]
-    return said + [
+    return notes + [
         f"{entry.name}: neither {' nor '.join(STREAM_FILES)} in it: left out" for entry in lacking
     ]

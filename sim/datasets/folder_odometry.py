@@ -72,17 +72,17 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
 
 def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray, "N 3 3"] | None:
-    """The motions' own covariances, of the rows that tell one; None where they claim none."""
+    """The covariances of the motions in these rows; None where the table has none."""
     table = rows.table
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return None
-    told = pose_covariances(table)
+    matrices = pose_covariances(table)
     if form == STEERED:
         raise table.fault(
             f"covariances come with {','.join(SPEEDS)} or {','.join(POSES)} or "
             f"{','.join(INCREMENTS)}; a car's noise stands in the scenario"
         )
-    covariances = told[used]
+    covariances = matrices[used]
     for row in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0.0)[:1].tolist():
         raise table.error(row + (used.start or 0), "c_xx", NOT_A_COVARIANCE)
     return covariances

@@ -24,7 +24,9 @@ UNKNOWN = int(m.NO_LABEL)
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """Pairwise precision and recall over labelled detections, and how many went to a wrong one."""
+    """Pairwise precision and recall over labelled detections, and the number of wrong
+    detections.
+    """
 
     right: int
     wrong: int
@@ -60,12 +62,12 @@ class Pairs:
 class AssociationResult:
     """The scores of a run: between all its detections, inside windows, and of the map.
 
-    label_of: of each of the map's unnamed landmarks, its label; UNKNOWN where nobody knows.
-    duplicates: landmarks beyond the first of a label; confirmed: among those of two submaps or
-    more, and all of an estimator without submaps. merges_right, merges_wrong: pairs of robots that
-    share landmarks in the map, by whether at least half of those that both have labels for are one;
-    merges_refused: attempts that wait.
-    left_out: labelled detections that are in no submap. clutter_in_map: others that are in one.
+    label_of: the label of each of the map's unnamed landmarks; UNKNOWN where there is none.
+    duplicates: landmarks beyond the first of a label; confirmed: those of them with at least two
+    submaps, and all of an estimator without submaps. merges_right, merges_wrong: pairs of robots
+    that share landmarks in the map, by whether at least half of those that have labels from both
+    are one; merges_refused: attempts that wait. left_out: labelled detections that are in no
+    submap. clutter_in_map: others that are in one.
     """
 
     pairs: Pairs
@@ -152,7 +154,7 @@ def _robots(log: Collected, channel: ch.Channel) -> list[str]:
 
 
 def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
-    """By robot, stamp of the scan and row in it."""
+    """The labels by robot, stamp of the scan and row in it."""
     found: dict[tuple[str, int, int], int] = {}
     for robot in _robots(log, ch.TRUTH_LABELS):
         for message in log.messages(ch.TRUTH_LABELS, robot):
@@ -169,7 +171,7 @@ def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
 def _detections(
     log: Collected, labels: Mapping[tuple[str, int, int], int]
 ) -> Iterable[tuple[int, Place | None, tuple[str, int, int]]]:
-    """Of each detection its label, its place in a submap (None: in none) and its window."""
+    """Each detection's label, its place in a submap (None: in none) and its window."""
     for robot in _robots(log, ch.ASSOCIATION):
         seen: set[tuple[int, int]] = set()
         for message in log.messages(ch.ASSOCIATION, robot):
@@ -203,7 +205,7 @@ def _identities(log: Collected) -> dict[Place, int]:
 
 
 def _own_numbers(places: Iterable[Place | None]) -> dict[Place, int]:
-    """Of an estimator without submaps the numbers are those of its map."""
+    """The numbers of local landmarks in the map of an estimator without submaps."""
     return {place: place[3] for place in places if place is not None}
 
 
@@ -224,7 +226,7 @@ def _pairs(
     landmark: Int64[np.ndarray, " n"],
     window: Int64[np.ndarray, " n"] | None = None,
 ) -> Pairs:
-    """Of labelled detections; with windows, of the pairs inside one."""
+    """The pairs of labelled detections; with windows, those inside one."""
     window = np.zeros(len(label), np.int64) if window is None else window
     used = landmark >= 0
     real = _choose_two(np.column_stack((window, label)))
@@ -246,7 +248,7 @@ def _pairs(
 
 
 def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
-    """How many pairs of equal rows there are."""
+    """The number of pairs of equal rows."""
     if not len(rows):
         return 0
     _, counts = np.unique(rows, axis=0, return_counts=True)
@@ -277,7 +279,7 @@ def _majorities(
 def _merges(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[int, int]:
-    """Pairs of robots that share landmarks, rightly and wrongly."""
+    """The numbers of pairs of robots that share landmarks, rightly and wrongly."""
     votes: dict[int, dict[str, dict[int, int]]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
         number = None if place is None else identity.get(place)

@@ -65,13 +65,14 @@ class PoseErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class MapErrors:
-    """A map against the true positions of the same landmarks.
+    """A map's errors against the true positions of the same landmarks.
 
     rmse_m, aligned_rmse_m: 2-D distances, as the map lies and after truth_from_map, the rigid
     motion of least squares (None below two landmarks). nees_per_dof: of the joint covariance, in
-    the frame as the map lies; `band` is where a single run of 2L degrees of freedom lies in 95 %.
-    shape: of what no rigid motion explains, so whatever the start poses were (None where
-    aligned_rmse_m is). coverage: the share of landmarks in their own 95 % ellipse, as the map lies.
+    the frame as the map lies; `band` is the 95 % interval of a single run with 2L degrees of
+    freedom. shape: the part of the error that no rigid motion explains, which does not depend on
+    the initial poses (None where aligned_rmse_m is). coverage: the share of landmarks in their own
+    95 % ellipse, as the map lies.
     """
 
     count: int
@@ -91,10 +92,10 @@ class MapErrors:
 
 @dataclass(frozen=True)
 class ShapeErrors:
-    """A map's errors without their rigid part, against the covariance of the same.
+    """A map's errors without their rigid part, with the covariance of that part removed, too.
 
-    nees_per_landmark: NEES of the 2L − 3 numbers that are left, scaled to 2 per landmark: 2 is
-    right. coverage: the share of landmarks in their 95 % ellipse of these.
+    nees_per_landmark: NEES of the remaining 2L − 3 degrees of freedom, scaled to 2 per landmark: 2
+    is right. coverage: the share of landmarks whose remaining error lies in its 95 % ellipse.
     """
 
     nees_per_landmark: float
@@ -141,10 +142,10 @@ def _shape_errors(
     truth: Float[np.ndarray, "L 2"],
     truth_from_map: Float[np.ndarray, "3"],
 ) -> ShapeErrors:
-    """Of the errors after alignment, in the map's frame.
+    """The errors after alignment, in the map's frame.
 
-    With G = ∂(positions moved by x, y, θ)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g);
-    the covariance of what is left is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
+    With G = ∂(positions moved by x, y, θ)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g); the
+    covariance of the remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
     """
     count = len(means)
     error = (means - moved(between(truth_from_map, np.zeros(3)), truth)).ravel()
@@ -251,9 +252,9 @@ def pose_errors(
 def _motion_nees(
     poses: Float[np.ndarray, "K 3"], truth: Float[np.ndarray, "K 3"], P: Float[np.ndarray, "K 3 3"]
 ) -> Float[np.ndarray, " K"]:
-    """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, so that a turn about a far point is no excess.
+    """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, which allows for a rotation about a far point.
 
-    Where a map may be turned about its origin by δ, a pose d away errs by d δ²/2 along its radius,
+    If the map rotates about its origin by δ, a pose at distance d errs by d δ²/2 along its radius,
     which an ellipse in (x, y, θ) does not allow for. ξ = (V⁻¹ (p' − R p), δ) with the V of the
     exponential on SE(2); to first order (dx, dy, dθ) → ξ is A = [1 0 y; 0 1 −x; 0 0 1].
     """

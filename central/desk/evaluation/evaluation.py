@@ -119,12 +119,12 @@ class RobotResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """A run: its scenario (None: the log does not say), its map, its robots and its traffic.
+    """A run: its scenario (None: it is not in the log), its map, its robots and its traffic.
 
     true_landmarks: all of them, measured or not. notes: the world's remarks on its data, and
     messages set aside. faults: number of messages set aside. unsound: number of invalid samples.
     arbitrary_frame: no robot knew its initial pose, so the map's frame is not the truth's, and only
-    aligned errors mean something. decisions: closures and merges by landmarks without identities,
+    aligned errors are meaningful. decisions: closures and merges by landmarks without identities,
     from the final map.
     """
 
@@ -196,7 +196,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
 
 
 def _decisions(log: Collected) -> tuple[m.AssociationDecision, ...]:
-    """Closures and merges of landmarks without names, taken, undone and waiting."""
+    """Closures and merges of landmarks without names: accepted, undone and waiting."""
     final = log.sound(log.last(ch.FINAL_MAP))
     return final.decisions if isinstance(final, m.FusedMap) else ()
 
@@ -255,7 +255,7 @@ def with_holes(evaluation: Evaluation, log: Log) -> Evaluation:
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The figures under the names that machines read; `extra` is laid over them."""
+    """The figures under the names that machines read; `extra` replaces or adds figures."""
     scenario, fused = evaluation.scenario, evaluation.map
     errors = None if fused is None else fused.errors
     shape = None if errors is None else errors.shape
@@ -430,7 +430,7 @@ def _truth_of(
     true_ids: UInt32[np.ndarray, " T"],
     positions: Float[np.ndarray, "T 2"],
 ) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
-    """The true positions of these landmarks, zero where there is none; where there is one."""
+    """The true positions of these landmarks (zero where unknown), and which are known."""
     truth = np.zeros((len(ids), 2))
     known = np.isin(ids, true_ids)
     truth[known] = positions[np.searchsorted(true_ids, ids[known])]

@@ -15,7 +15,9 @@ from scipy.optimize import linear_sum_assignment
 
 @dataclass(frozen=True)
 class Gospa:
-    """The distance, its cut-off c, and its parts: RMS of the assigned, and how many are not."""
+    """The distance, its cut-off c, and its parts: RMS of the assigned pairs, and the numbers of
+    missed and false points.
+    """
 
     distance_m: float
     cut_off_m: float
@@ -27,7 +29,7 @@ class Gospa:
 def gospa(
     found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], cut_off_m: float
 ) -> Gospa:
-    """Of the points found, in the frame of the true ones."""
+    """GOSPA of the found points, in the frame of the true ones."""
     squared = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), cut_off_m**2)
     rows, columns = linear_sum_assignment(squared)
     near = squared[rows, columns] < cut_off_m**2

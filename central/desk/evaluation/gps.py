@@ -1,4 +1,6 @@
-"""A path against the positions of another sensor, such as a GPS, whose frame and clock differ."""
+"""Compares a path with the positions of another sensor, such as a GPS, whose frame and clock
+differ.
+"""
 
 from collections.abc import Mapping
 
@@ -12,13 +14,13 @@ from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 
 LEAST = 10
-"""Positions that a comparison needs."""
+"""Least number of positions for a comparison."""
 GAP_NS = 1_500_000_000
-"""Between two fixes that are farther apart nothing is interpolated."""
+"""Positions are interpolated between fixes that are at most this far apart."""
 SHIFTS_S = np.arange(-1.0, 1.01, 0.25)
 ROUNDS = 20
 NEAREST_M = 0.1
-"""A distance that is smaller counts as this where weights are taken from distances."""
+"""Least distance [m] in the weights 1/d."""
 
 Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
 
@@ -27,7 +29,7 @@ def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
     """The median distance [m] of the smoothed poses from the other sensor's positions.
 
     One rigid motion, lever arm and time shift are fitted for the team, by least absolute distances
-    (weights 1/d again and again), since fixes may be wrong by metres. None without such positions.
+    (iterated weights 1/d), since fixes may be wrong by metres. None without such positions.
     """
     fixes = {robot: found for robot in paths if (found := _fixes(log, robot)) is not None}
     if not fixes:
@@ -67,8 +69,8 @@ def distances(
 ) -> Float[np.ndarray, " n"]:
     """‖there − (A (t + R(θ) lever) + b)‖ after the rigid motion (A, b) and the lever that fit best.
 
-    With A = [[u, −v], [v, u]] the model is linear in (u, v, b, A lever); Gauss-Newton is not needed
-    beyond u² + v² = 1, which is put right after each solution.
+    With A = [[u, −v], [v, u]] the model is linear in (u, v, b, A lever); u² + v² = 1 is restored
+    after each solution.
     """
     n = len(poses)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -48,14 +48,15 @@ class Innovations:
 
     @property
     def per_dof(self) -> float | None:
-        """Over the whole run; None where nothing was predicted."""
+        """NIS per degree of freedom over the whole run; None where nothing was predicted."""
         total = int(self.dof.sum())
         return float(self.squared.sum()) / total if total else None
 
 
 @dataclass(frozen=True)
 class Latencies:
-    """Of one robot's submaps that some map used: wall time [s] from a measurement to the first map.
+    """Latencies of one robot's submaps that some map used: wall time [s] from a measurement to the
+    first map.
 
     stamps_ns: team time of the submap's end. first, last: from its first and its last measurement's
     publication to the map's. A measurement waits for its window to close, so `first` is the longer.
@@ -94,7 +95,7 @@ class History:
     events: tuple[Event, ...]
 
     def seconds(self, stamps_ns: Int64[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Team time since the first measurement [s]; what was before is at its beginning."""
+        """Team time since the first measurement [s]; 0 for earlier times."""
         elapsed: Float[np.ndarray, " n"] = np.maximum(stamps_ns - self.start_ns, 0) * 1e-9
         return elapsed
 
@@ -118,8 +119,8 @@ class _Column:
 
 
 class _Clocks:
-    """The wall clocks [ns] of a stream's measurements, 16 bytes each; one out of order is left
-    out.
+    """The wall clocks [ns] of a stream's measurements, 16 bytes each; one out of order is
+    left out.
     """
 
     def __init__(self) -> None:
@@ -127,7 +128,7 @@ class _Clocks:
         self._clocks = array("q")
 
     def take(self, measurement: int, wall_ns: int) -> None:
-        """Of one measurement."""
+        """Note the wall clock of one measurement."""
         if abs(measurement) < 2**63 and (
             not self._measurements or measurement > self._measurements[-1]
         ):
@@ -135,7 +136,7 @@ class _Clocks:
             self._clocks.append(min(wall_ns, 2**63 - 1))
 
     def of(self, measurement: int) -> int | None:
-        """None where it is not known."""
+        """The wall clock of a measurement; None where it is not known."""
         k = bisect_left(self._measurements, measurement)
         known = k < len(self._measurements) and self._measurements[k] == measurement
         return self._clocks[k] if known else None
@@ -178,7 +179,7 @@ class _Gathering:
         self.hear(sample, channel)
 
     def hear(self, sample: Sample, channel: ch.Channel | None) -> None:
-        """Take what a message contains, whatever its channel."""
+        """Take a message's contents, whatever its channel."""
         if channel not in _CHANNELS:
             return
         try:

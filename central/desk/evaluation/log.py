@@ -1,7 +1,7 @@
-"""One pass over a log's samples: what an evaluation needs of them, and no more.
+"""Collects from a log's samples, in one pass, what an evaluation needs.
 
-Most of a log is sensor measurements; of those only the head (robot, incarnation, measurement) is
-decoded, to be counted. All other messages are decoded and checked by `opened`.
+Most of a log is sensor measurements; only their head (robot, incarnation, measurement) is decoded,
+to count them. All other messages are decoded and checked by `opened`.
 """
 
 from collections import defaultdict
@@ -55,7 +55,7 @@ _HEAD = msgspec.msgpack.Decoder(Head)
 
 
 def head_of(sample: Sample) -> Head | None:
-    """The head of a measurement; None of what is none."""
+    """The head of a measurement; None for anything else."""
     try:
         return _HEAD.decode(sample.payload)
     except (msgspec.DecodeError, UnicodeDecodeError):
@@ -84,10 +84,9 @@ class Measurements:
 class Collected:
     """The contents of a log, by channel and robot.
 
-    samples: by key, as payloads that are decoded on demand.
-
-    first_ns: the wall clock of the first sample that has one. unsound: samples
-    that are no sound message of their channel; they count as traffic only.
+    samples: by key, as payloads that are decoded on demand. first_ns: the wall clock of the first
+    sample that has one. unsound: samples that are no valid message of their channel; they count as
+    traffic only.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
@@ -99,7 +98,7 @@ class Collected:
 
     @property
     def robots(self) -> list[str]:
-        """The robots that any measurement or truth is of, by name."""
+        """The robots with measurements or truth, by name."""
         names = set(self.measurements)
         for key in self.traffic:
             found = channel_of(key)
@@ -112,7 +111,7 @@ class Collected:
         return self.latest.get(channel.key())
 
     def messages(self, channel: Channel, robot: str) -> list[m.Message]:
-        """The sound messages of one robot's channel, in the log's order."""
+        """The valid messages of one robot's channel, in the log's order."""
         found = []
         for sample in self.samples.get(channel.key(robot), []):
             message = self.sound(sample)
@@ -137,7 +136,7 @@ class Collected:
             return None
 
     def take(self, sample: Sample, channel: str, robot: str) -> None:
-        """Count a sample, and keep what its channel asks for."""
+        """Count a sample, and store it if its channel is collected."""
         if self.first_ns is None and sample.wall_ns:
             self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
@@ -151,7 +150,7 @@ class Collected:
             self._keep(sample, channel)
 
     def keep(self, sample: Sample) -> None:
-        """Keep a message that a peer has published in the centre's place; the traffic is the
+        """Store a message that a peer has published in the centre's place; the traffic is the
         peer's.
         """
         found = channel_of(sample.key)

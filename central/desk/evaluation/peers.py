@@ -1,4 +1,4 @@
-"""The peers of a log: each one's final map, when it was there, and the traffic of the set."""
+"""The peers of a log: each one's final map, the time of it, and the traffic of the set."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -21,7 +21,7 @@ from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 
 SPACING_NS = 100_000_000
-"""Of the estimates that are compared."""
+"""Least spacing of the estimates that are compared."""
 WAITING = 4_096
 """Most poses of a robot that wait for their truth; the oldest are dropped first."""
 BATCHES = 20_000
@@ -141,7 +141,7 @@ class RunningErrors:
         self._poses.append((message.stamp_ns, pose, P))
 
     def known(self) -> PoseErrors | None:
-        """The errors of the poses that the truth has reached since the last call."""
+        """The errors of the poses for which truth has arrived since the last call."""
         until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
         due = []
         while until is not None and self._poses and self._poses[0][0] <= until:
@@ -158,14 +158,14 @@ class RunningErrors:
         return poses[0] if known[0] else None
 
     def forget(self, before_ns: int) -> None:
-        """Forget what is older, but for the last batch of truth before it."""
+        """Forget older truth and poses, but for the last batch of truth before this time."""
         while len(self._truth) > 1 and int(self._truth[1].stamps_ns[0]) < before_ns:
             self._truth.popleft()
         while self._poses and self._poses[0][0] < before_ns:
             self._poses.popleft()
 
     def forget_poses(self) -> None:
-        """Forget the poses that wait for their truth: others take their place."""
+        """Forget the poses that wait for their truth, to replace them by others."""
         self._poses.clear()
         self.last_ns = None
 

@@ -1,8 +1,8 @@
-"""What a user takes home from a run: the map and the paths as tables that anything reads.
+"""Writes the results of a run, the map and the paths, as tables in common formats.
 
 `map.csv` and `map.json` have a landmark a row, `paths/<robot>.csv` and `.tum` a pose a row. Metres,
-seconds, radians, all in the frame that the map names; numbers in full, so that they can be read
-back to the last bit.
+seconds, radians, all in the frame that the map names; numbers with all digits, so that they are
+read back to the last bit.
 """
 
 import csv
@@ -33,14 +33,14 @@ PATH_COLUMNS = (
 
 @dataclass(frozen=True)
 class TakenHome:
-    """The robots' smoothed paths, and how many measurements of each landmark the log has."""
+    """The robots' smoothed paths, and the number of measurements of each landmark in the log."""
 
     paths: Mapping[str, SmoothedPath]
     measurements: Mapping[int, int]
 
 
 def taken_home(found: Recorded) -> TakenHome:
-    """Paths at keyframe rate and counts, of a log."""
+    """The paths at keyframe rate and the counts of a log."""
     counts = Counter[int]()
     for stream in found.measurements.values():
         for message in stream.values():
@@ -52,9 +52,10 @@ def taken_home(found: Recorded) -> TakenHome:
 def write_map(
     fused: MapResult, measurements: Mapping[int, int], folder: FilePath
 ) -> list[FilePath]:
-    """Write map.csv and map.json; what was written.
+    """Write map.csv and map.json; returns the files.
 
-    A landmark's covariance is its own 2 × 2 block; how landmarks go together is in the log.
+    A landmark's covariance is its own 2 × 2 block; the correlations between landmarks are in the
+    log.
     """
     rows: list[dict[str, Any]] = []
     blocks = landmark_blocks(fused.covariance)
@@ -81,7 +82,7 @@ def write_map(
 
 
 def write_paths(paths: Mapping[str, SmoothedPath], folder: FilePath) -> list[FilePath]:
-    """Write <robot>.csv and <robot>.tum into the folder; what was written."""
+    """Write <robot>.csv and <robot>.tum into the folder; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for robot, path in paths.items():

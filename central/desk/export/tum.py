@@ -17,7 +17,9 @@ KINDS = ("smoothed", "online")
 
 
 def write_tum(path: Path, file: FilePath) -> None:
-    """A planar path: z = 0, rotations about z; stamps to the nanosecond, poses in full."""
+    """Write a planar path: z = 0, rotations about z; stamps to the nanosecond, poses with all
+    digits.
+    """
     half = 0.5 * path.poses[:, 2]
     with file.open("w", encoding="ascii", newline="\n") as lines:
         lines.write("# timestamp tx ty tz qx qy qz qw\n")
@@ -34,7 +36,7 @@ def seconds(stamp_ns: int) -> str:
 
 
 def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:
-    """Every robot's paths that are there, in the folder; what was written.
+    """Write every robot's existing paths into the folder; returns the files.
 
     r1.smoothed.tum, r1.online.tum, r1.truth.tum; where there is truth, r1.smoothed.truth.tum and
     r1.online.truth.tum are the true poses at the stamps of the path, for tools that compare pose
@@ -55,9 +57,9 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
 
 
 def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
-    """Write every robot's paths in the TUM format; what was written.
+    """Write every robot's paths in the TUM format; returns the files.
 
-    Raises `LogError` for a log that has no path, as one of sensor measurements alone.
+    Raises `LogError` for a log without a path, such as one of sensor measurements alone.
     """
     written = write_trajectories(evaluate(log.samples()), folder)
     if not written:

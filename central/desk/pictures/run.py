@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DRAWN_ROBOTS = 12
-"""Rows of the error picture at the most."""
+"""Most rows of the error picture."""
 DRAWN_POINTS = 4000
-"""Of one line; longer paths are thinned."""
+"""Most points of one line; longer paths are thinned."""
 DRAWN_BARS = 60
-"""Smoothed poses with a bar, evenly among all; more would hide the online ones."""
+"""Most smoothed poses with an error bar, evenly spaced; more would hide the online poses."""
 LABELLED_LANDMARKS = 60
 
 
@@ -96,8 +96,8 @@ def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
 def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     """Errors of x, y and heading over team time with ±3σ.
 
-    False where no robot has truth, or where the map's frame is arbitrary: errors as the paths lie
-    would say nothing.
+    False where no robot has truth, or where the map's frame is arbitrary, so that errors have no
+    meaning without alignment.
     """
     if evaluation.arbitrary_frame:
         return False
@@ -202,9 +202,10 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
 
 
 def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
-    """Where each point's label goes [points of type]: away from its neighbours.
+    """The offset of each point's label [typographic points], away from its neighbours.
 
-    Neighbours are the points within a twentieth of the map's extent; alone, to the upper right.
+    Neighbours are the points within a twentieth of the map's extent; without any the offset is to
+    the upper right.
     """
     reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
     offsets = np.empty_like(points)
@@ -250,7 +251,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
 
 
 def _fit(axis: "Axes", errors: Float[np.ndarray, " n"], bound: float) -> None:
-    """The axis ends where all but one error in 500 lie within; it says how many do not."""
+    """Limit the axis so that all but one error in 500 are inside, and write how many are not."""
     most = float(errors.max(initial=0.0))
     limit = 1.1 * max(bound, float(np.quantile(errors, 0.998)) if len(errors) else 0.0)
     if most <= 1.5 * limit:
@@ -275,7 +276,7 @@ def _thinned(path: Path) -> Path:
 
 
 def thinning(count: int) -> slice:
-    """Every so many of a line's points, so that about DRAWN_POINTS are drawn at the most."""
+    """The slice of a line's points that leaves about DRAWN_POINTS of them at most."""
     return slice(None, None, max(1, count // DRAWN_POINTS))
 
 

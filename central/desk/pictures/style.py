@@ -1,4 +1,4 @@
-"""How pictures look and what they are written as: for a screen, or for a paper."""
+"""The look and the file format of pictures: for a screen, or for a paper."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ DPI = 120
 
 
 class Form(StrEnum):
-    """What a picture is written as."""
+    """The file format of a picture."""
 
     PNG = "png"
     SVG = "svg"
@@ -34,7 +34,7 @@ class Picture(StrEnum):
 
 
 class Look(StrEnum):
-    """For a screen with titles; for a paper without, since the caption says it."""
+    """For a screen with titles; for a paper without, since the caption has them."""
 
     SCREEN = "screen"
     PAPER = "paper"
@@ -60,7 +60,7 @@ _current: ContextVar[Style] = ContextVar("style", default=SCREEN)
 
 @contextmanager
 def drawn_in(style: Style) -> Iterator[None]:
-    """Pictures that are drawn meanwhile have this style."""
+    """Pictures that are drawn in this context have this style."""
     from matplotlib import rc_context, rcParams
 
     token = _current.set(style)
@@ -77,7 +77,7 @@ def drawn_in(style: Style) -> Iterator[None]:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a picture in the form of its name; for a paper without its titles."""
+    """Write a picture in the format of its name's suffix; for a paper without its titles."""
     if _current.get().look is Look.PAPER:
         figure.suptitle("")
         if len(figure.axes) == 1:

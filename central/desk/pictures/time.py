@@ -32,15 +32,15 @@ if TYPE_CHECKING:  # as in central.desk.pictures.run: Matplotlib is slow to impo
     from matplotlib.axes import Axes
 
 BINS = 40
-"""Stretches of team time in which values are put together."""
+"""Number of intervals of team time over which values are summed."""
 RATE_POINTS, RATE_WINDOWS = 200, 10.0
-"""Points of a line of bytes per second, and how many times its window goes into the run."""
+"""Points of a line of bytes per second, and the run's length in units of its window."""
 BAND = 0.95
 BAND_COLOUR = "#d9ead3"
 WARN, FAIL = 1.1, 1.3
 """The levels of the centre's consistency monitor."""
 LOGARITHMIC_FROM = 12.0
-"""A NEES beyond this needs a logarithmic axis to be seen at all."""
+"""A NEES beyond this is drawn on a logarithmic axis."""
 SHOWN_KEYS = 8
 EVENT_STYLES = {
     "joined": ("o", GREEN), "lost": ("X", RED), "restarted": ("^", ORANGE), "left": ("<", GREY),
@@ -53,9 +53,9 @@ EVENT_STYLES = {
 def binned(
     history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
-    """Sums of each of the values in the BINS stretches of the run; those without any left out.
+    """Sums of each of the values in the BINS intervals of the run; empty intervals are left out.
 
-    Returns the stretches' middles [s] and the sums; what lies outside of the run counts to its end.
+    Returns the intervals' middles [s] and the sums; values outside the run count to its ends.
     """
     edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
     where = np.clip(np.searchsorted(edges, history.seconds(stamps_ns), "right") - 1, 0, BINS - 1)
@@ -186,7 +186,7 @@ def _scale(axis: "Axes", largest: float) -> None:
 
 
 def traffic_picture(history: History, path: FilePath) -> bool:
-    """Payload bytes per second of team time: by channel, and what each robot says."""
+    """Payload bytes per second of team time: by channel, and by robot."""
     if not history.traffic:
         return False
     figure, axes = new_figure(9.0, 6.6, 2, 1)
@@ -225,7 +225,8 @@ def _rate(
 ) -> Float[np.ndarray, " k"]:
     """Bytes per second about each time, weighted by a triangle that is width_s wide on each side.
 
-    What is sent at regular intervals, as submaps are, has a level rate so: bins would beat with it.
+    With this window, messages at regular intervals, such as submaps, have a constant rate; with
+    bins the rate would oscillate.
     """
     order = np.argsort(seconds, kind="stable")
     times, sums = seconds[order], np.concatenate(([0.0], np.cumsum(sizes[order])))
@@ -273,13 +274,13 @@ def _log_scale(axis: "Axes") -> None:
 
 
 THICKEST = 4
-"""Robots beyond so many have the thickest curve of all."""
+"""Number of line widths: robots beyond it have the thickest curve."""
 
 
 def latency_picture(history: History, path: FilePath) -> bool:
     """Wall time from a submap's first and last measurement to the first map that used it.
 
-    Robots whose submaps came into one map have one curve: the first is drawn the thickest.
+    Robots whose submaps came into one map have equal curves: the first is drawn the thickest.
     """
     if not history.latencies:
         return False
@@ -344,7 +345,7 @@ def timeline_picture(history: History, path: FilePath) -> bool:
 
 
 def channel_name(key: str) -> str:
-    """The name of a key's channel; a viewer's keys together."""
+    """The name of a key's channel; a viewer's keys have one name."""
     found = channel_of(key)
     if found is not None:
         return found[0].name
@@ -352,7 +353,9 @@ def channel_name(key: str) -> str:
 
 
 def publisher(key: str) -> str | None:
-    """The robot whose node publishes on this key; None of what others say, its sensors too."""
+    """The robot whose node publishes on this key; None for other publishers, its sensors
+    included.
+    """
     found = channel_of(key)
     if found is None or found[0] in ch.SENSORS:
         return None

@@ -1,4 +1,4 @@
-"""The tables on landmarks without names: their scores, and what was decided of them."""
+"""The tables on landmarks without names: their scores, and the decisions on them."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ DECISION_NOTE = (
     "waits failed the test that is named; what is undone was taken back by a later one."
 )
 LISTED = 200
-"""Decisions in the table; report.json has them all."""
+"""Most decisions in the table; report.json has all."""
 
 
 def score_rows(found: AssociationResult) -> list[tuple[str, ...]]:
@@ -36,7 +36,7 @@ def _row(name: str, pairs: Pairs) -> tuple[str, ...]:
 
 
 def score_note(found: AssociationResult) -> str:
-    """What else the labels say, in words."""
+    """The other results of the labels, in words."""
     return (
         f"{found.landmarks} landmarks without names, {found.duplicates} of them duplicates, "
         f"{found.duplicates_confirmed} among those of two submaps or more; pairs of robots that "
@@ -46,7 +46,9 @@ def score_note(found: AssociationResult) -> str:
 
 
 def decision_rows(decisions: Sequence[m.AssociationDecision]) -> list[tuple[str, ...]]:
-    """A row for each closure and merge, the newest of what happened first, then what waits."""
+    """A row for each closure and merge: accepted and undone ones with the newest first, then those
+    that wait.
+    """
     made = [each for each in decisions if each.kind != "waits"]
     waits = [each for each in decisions if each.kind == "waits"]
     return [

@@ -1,4 +1,4 @@
-"""The report as a folder: one page that needs nothing beside it, its pictures, the figures."""
+"""Writes the report as a folder: one self-contained page, its pictures, the figures."""
 
 import base64
 import json
@@ -50,13 +50,13 @@ from central.desk.report.tables import (
 )
 
 LISTED_EVENTS = 200
-"""Events in the page's table; report.json has them all."""
+"""Most events in the page's table; report.json has all."""
 NIS_NOTE = (
     "NIS lies below 1 where a robot's sensor is configured with errors that last within a window "
     "(range_white, bearing_white): the particles take every error for a new one."
 )
 _ORIGIN = ("commit", "seed", "command", "python")
-"""What of a log's metadata comes first."""
+"""Metadata of a log that come first."""
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -91,7 +91,7 @@ PSS_NOTE = (
 
 
 def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str, Path]:
-    """Draw the pictures of a run in a style; by name what there was to draw."""
+    """Draw the pictures of a run in a style; returns by name those that had something to show."""
     evaluation, history = run.evaluation, run.history
     draw: dict[Picture, Callable[[Path], bool]] = {
         Picture.MAP: lambda path: map_picture(evaluation, path, run.paths),
@@ -108,9 +108,9 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
 
 
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
-    """Write report.html, report.json, pictures and trajectories into the folder; what was written.
+    """Write report.html, report.json, pictures and trajectories into the folder; returns the files.
 
-    figures: those of the evaluation and of the run. A picture that has nothing to show is left out.
+    figures: those of the evaluation and of the run. A picture without data is left out.
     """
     directory.mkdir(parents=True, exist_ok=True)
     evaluation = run.evaluation
@@ -131,7 +131,7 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
 
 
 def _taken_home(run: Run, directory: Path) -> list[Path]:
-    """The map and the paths as tables, where there are any; what was written."""
+    """The map and the paths as tables, where there are any; returns the files."""
     home, written = run.taken_home, []
     if run.evaluation.map is not None:
         written += write_map(
@@ -174,7 +174,7 @@ def _page(
 
 
 def _identities(run: Run) -> list[str]:
-    """How landmarks without names were told apart, and which closures and merges were decided."""
+    """The section on landmarks without names: scores, closures and merges."""
     parts = []
     if (found := run.evaluation.association) is not None:
         parts += [_table(SCORE_HEADINGS, score_rows(found)), _note(score_note(found))]
@@ -191,7 +191,7 @@ def _peers(run: Run) -> list[str]:
 
 
 def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
-    """What each process of a launch took; a log alone does not tell."""
+    """The resources of each process of a launch, which are not in its log."""
     if not processes:
         return []
     rows = [
@@ -211,7 +211,7 @@ def _notes(run: Run) -> str:
 
 
 def _own_maps(run: Run) -> list[str]:
-    """Where there is no fused map: each robot's own."""
+    """The robots' own maps, where there is no fused map."""
     if not unfused(run.evaluation):
         return []
     return [_table(OWN_HEADINGS, own_rows(run.evaluation)), _note(OWN_NOTE)]
@@ -230,7 +230,7 @@ def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 
 
 def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    """Whether the covariances are true: with truth NEES and coverage, without it NIS and cost."""
+    """The consistency of the covariances: with truth NEES and coverage, without it NIS and cost."""
     innovations, cost = run.history.innovations, run.evaluation.cost_by_robot
     scale = run.evaluation.scale_by_robot
     rows = []
@@ -369,7 +369,7 @@ def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 
 
 def _origin(run: Run) -> list[str]:
-    """The log's metadata; what is long is folded away."""
+    """The log's metadata; long values are collapsed."""
     short = {k: v for k, v in run.provenance.items() if len(v) <= 80}
     first = [(k, short[k]) for k in _ORIGIN if k in short]
     rest = [(k, v) for k, v in sorted(short.items()) if k not in _ORIGIN]

@@ -1,4 +1,4 @@
-"""Everything that a report says of a run, and its figures for machines."""
+"""The contents of a run's report, and its figures for machines."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from central.desk.paths import SmoothedPath
 
 @dataclass(frozen=True)
 class Run:
-    """A run as its log tells it.
+    """A run from its log.
 
-    provenance: the log's metadata. ledger: what `verify-ledger` finds, None where it was not asked
-    or where the log lacks what it needs: `no_ledger` says which. taken_home: paths at the rate of
-    keyframes, and counts; None where they were not asked for.
+    provenance: the log's metadata. ledger: the result of `verify-ledger`, None where it was not
+    requested or where the log lacks its inputs: `no_ledger` says which. taken_home: paths at the
+    rate of keyframes, and counts; None where they were not requested.
     """
 
     evaluation: Evaluation
@@ -32,7 +32,7 @@ class Run:
 
     @property
     def paths(self) -> Mapping[str, SmoothedPath]:
-        """The smoothed paths by robot, where they were asked for."""
+        """The smoothed paths by robot, where they were requested."""
         return {} if self.taken_home is None else self.taken_home.paths
 
     def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
@@ -54,7 +54,7 @@ def nis_line(run: Run) -> str | None:
 
 
 def run_figures(run: Run) -> dict[str, Any]:
-    """What a report adds to an evaluation's figures; angles in radians, times in seconds."""
+    """The figures that a report adds to an evaluation's; angles in radians, times in seconds."""
     history, ledger = run.history, run.ledger
     span_s = (history.end_ns - history.start_ns) * 1e-9
     return {

@@ -1,4 +1,4 @@
-"""The tables of a report, for a terminal and for the page: what a run was worth, in words."""
+"""The tables of a report, for a terminal and for the page."""
 
 from collections.abc import Sequence
 from math import degrees
@@ -9,7 +9,7 @@ from rich.text import Text
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 
 ABSURD_NEES = 1000
-"""Beyond this a NEES per dof is over-confident by any measure."""
+"""Beyond this a NEES per dof is shown in words."""
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 _COUNT_AGAIN = ("kalman", "kalman-per-axis")
 Rows = Sequence[tuple[str, str]]
@@ -39,7 +39,7 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def _paths(evaluation: Evaluation) -> list[Table]:
-    """A row for the path of each robot; nothing where no path was smoothed."""
+    """A row for the path of each robot; no table where no path was smoothed."""
     if all(robot.smoothed is None for robot in evaluation.robots.values()):
         return []
     paths = Table(caption=PATH_NOTE)
@@ -70,7 +70,7 @@ PEER_NOTE = (
 
 
 def peer_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
-    """Of each robot its final map's SHA-256, how much of the set it has, and what that took."""
+    """For each robot the SHA-256 of its final map, its part of the set, and the traffic for it."""
     rows: list[tuple[str, ...]] = []
     for name, peer in evaluation.peers.items():
         robot = evaluation.robots.get(name)
@@ -148,7 +148,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
 
 
 def _absurd(evaluation: Evaluation) -> str:
-    """The digits of a NEES of 1e18 say nothing to people; why it is so large does."""
+    """Words in place of the digits of a very large NEES, with the probable cause."""
     scenario = evaluation.scenario
     again = scenario is not None and scenario.fusion in _COUNT_AGAIN
     why = " (measurements counted again)" if again else ""
@@ -156,7 +156,7 @@ def _absurd(evaluation: Evaluation) -> str:
 
 
 def robot_note(evaluation: Evaluation) -> str:
-    """What has to be known to read the robots' rows."""
+    """The explanation of the robots' rows."""
     online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
     star = ", * of online ones" if online else ""
     frame = "; positions as aligned with the map" if evaluation.arbitrary_frame else ""
@@ -225,7 +225,7 @@ OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
 def unfused(evaluation: Evaluation) -> bool:
-    """Whether only the robots have maps, and each its own."""
+    """Whether there is no fused map, and each robot has its own."""
     empty = evaluation.map is not None and not len(evaluation.map.ids)
     return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
 

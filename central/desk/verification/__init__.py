@@ -1,1 +1,1 @@
-"""A log computed again, message by message, and compared with what was recorded."""
+"""Recomputes a log message by message and compares it with the recording."""

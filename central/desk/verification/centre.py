@@ -1,7 +1,8 @@
-"""The centre's messages again: each recorded map from the inputs that it names.
+"""Recomputes the centre's messages: each recorded map from the inputs that it names.
 
-The rule is the centre's own (`central.rule`), and so is the scheduler of those whose maps rest on
-each other: what a rule knew beyond the inputs (`unnamed`) is taken from the recorded map.
+The rule is the centre's own (`central.rule`); rules whose maps depend on earlier maps use the
+centre's scheduler, too. Fields that depend on more than the named inputs (`unnamed`) are taken from
+the recorded map.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,9 @@ from team.wire.bus import Outgoing
 
 
 def recomputed_centre(log: Recorded) -> dict[Identity, m.Message]:
-    """What the inputs that the recorded maps name give, under the names of these inputs."""
+    """The messages that follow from the inputs of the recorded maps, by the names of these
+    inputs.
+    """
     finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
     maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
     found: dict[Identity, m.Message] = {}
@@ -42,7 +45,7 @@ _OF_A_PEER = {
 
 
 def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """As `recomputed_centre`, of a peer's own fold: by the same rule from the same submaps."""
+    """The messages of a peer's own fold, by the same rule from the same submaps."""
 
     def maps_on(channel: ch.Channel) -> list[m.FusedMap]:
         key = channel.key(robot)
@@ -60,7 +63,7 @@ def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 def _recomputed(
     log: Recorded, maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
 ) -> Iterator[Outgoing]:
-    """What the inputs that maps name give, in the order of the inputs."""
+    """The messages that follow from the inputs of these maps, in the order of the inputs."""
     if not maps and not finals:
         return
     config, digest = log.central_config()
@@ -85,7 +88,7 @@ def _tail(fused: m.FusedMap) -> Tail:
 
 
 def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule[Any]) -> m.Message:
-    """With what the centre knew beyond the inputs when it said `fused`."""
+    """The message with the fields of `fused` that depend on more than the named inputs."""
     if isinstance(message, m.FusedMap | m.Prior):
         fields = set(rule.unnamed) & set(message.__struct_fields__)
         return msgspec.structs.replace(message, **{name: getattr(fused, name) for name in fields})
@@ -93,7 +96,9 @@ def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule[Any]) -> m
 
 
 def _from_measurements(log: Recorded, scheduler: Scheduler) -> Iterator[Outgoing]:
-    """What a rule on raw measurements says: of the whole stream, as each map changes the next."""
+    """The messages of a rule on raw measurements, from the whole stream, since each map changes the
+    next.
+    """
     for message in _inputs_in_order(log):
         scheduler.intake.take(message, 0)
     yield from scheduler.advance(TeamAttendance.of(scheduler.rule.team))
@@ -118,7 +123,7 @@ def _inputs_in_order(log: Recorded) -> Iterator[m.Message]:
 
 
 class _LogInputs:
-    """The inputs that a map names, out of a log."""
+    """Collects from a log the inputs that a map names."""
 
     def __init__(self, log: Recorded, consumed: Channel) -> None:
         self._consumed = consumed
@@ -135,7 +140,9 @@ class _LogInputs:
         self._maps = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
 
     def of(self, fused: m.FusedMap) -> Inputs | None:
-        """None where the log lacks a submap of the map's version vector, or something of it."""
+        """The inputs of a map; None where the log lacks a submap of its version vector, or its
+        initial pose or factors.
+        """
         vector = {(x.robot, x.incarnation): x.sequence for x in fused.members}
         if self._consumed == "own/map":
             named = ((*stream, k, fused.exchange) for stream, k in vector.items())

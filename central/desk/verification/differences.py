@@ -1,4 +1,4 @@
-"""Two messages that should be the same: the first field in which they are not."""
+"""Compares two messages that should be equal, and names the first field that differs."""
 
 import math
 from collections.abc import Callable
@@ -53,7 +53,9 @@ class FieldDifference:
 def first_difference(
     recorded: m.Message, recomputed: m.Message, *, exact: bool
 ) -> FieldDifference | None:
-    """In the order of the fields; None when there is none, within the tolerance unless `exact`."""
+    """The first differing field in the order of the fields; None where there is none, within the
+    tolerance unless `exact`.
+    """
     for name in recorded.__struct_fields__:
         a, b = getattr(recorded, name), getattr(recomputed, name)
         if a == b:

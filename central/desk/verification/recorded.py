@@ -1,4 +1,4 @@
-"""A log as what it is to whoever computes it again: inputs, and messages that name them."""
+"""Indexes a log by recorded inputs and recomputable outputs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,12 +23,12 @@ Identity = tuple[object, ...]
 
 
 class RerunError(ValueError):
-    """A log that can not be computed again: what it lacks."""
+    """A log that can not be recomputed; the text names what it lacks."""
 
 
 @dataclass(frozen=True)
 class RecordedOutput:
-    """A recorded message that can be computed again, as its sample and decoded."""
+    """A recorded message that can be recomputed, as its sample and decoded."""
 
     sample: Sample
     channel: ch.Channel
@@ -40,11 +40,11 @@ class Recorded:
     """Everything in a log that is an input or an output of a node; each measurement once.
 
     measurements: by (robot, incarnation) and counter. configured: the last announcement of each
-    node. contradicted: measurements that the log has twice with different content. reported: how
-    many measurements a robot had consumed by its own word. published: how many the world says there
-    are. known_map: what the robots were told of the landmarks, if they were.
-    withdrawals: of robots that the team went on without, the first word on each.
-    unsound: samples that no node would have let in.
+    node. outputs: the recomputable messages, in the order of the log. contradicted: measurements
+    that the log has twice with different content. reported: number of measurements that a robot has
+    reported as consumed. published: number of measurements that the source has announced.
+    known_map: the prior map of localisation-only robots, if there is one. withdrawals: the first
+    order on each withdrawn robot. unsound: number of invalid samples.
     """
 
     measurements: dict[Stream, dict[int, m.Measurement]] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class Recorded:
     unsound: int = 0
 
     def take(self, sample: Sample) -> None:
-        """File one sample; a view is nobody's input or output."""
+        """File one sample; a viewer's samples are neither input nor output."""
         if ch.VIEW.owner(sample.key) is not None:
             return
         try:
@@ -104,13 +104,13 @@ class Recorded:
 
     @property
     def robots(self) -> list[str]:
-        """Every robot that the log has measurements or messages of, by name."""
+        """Every robot with measurements or messages in the log, by name."""
         names = {robot for robot, _ in self.measurements}
         names |= {s.message.robot for s in self.outputs if isinstance(s.message, m.Submap | m.Done)}
         return sorted(names)
 
     def incarnations(self, robot: str) -> list[int]:
-        """The incarnations of a robot that there are measurements of, in order."""
+        """The incarnations of a robot with measurements, in order."""
         return sorted(incarnation for name, incarnation in self.measurements if name == robot)
 
     def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
@@ -174,7 +174,7 @@ def recorded(log: Log) -> Recorded:
 
 
 def identity(key: str, message: m.Message) -> Identity:
-    """The names by which a message says what it was computed from, under its key."""
+    """The names of a message's inputs, after its key."""
     match message:
         case m.Submap():
             names: Identity = (

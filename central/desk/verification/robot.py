@@ -1,4 +1,4 @@
-"""One robot's messages again: its node over its recorded measurements."""
+"""Recomputes one robot's messages: its node over its recorded measurements."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import takewhile
@@ -17,13 +17,15 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
-"""By (incarnation, stamp): the priors that the recorded poses name; None: none of them."""
+"""By (incarnation, stamp), the priors that the recorded poses name; None: a pose without a
+prior.
+"""
 
 
 class RecordedPoses(RunningPoses):
-    """Poses at the stamps of the log, each given the prior that it names.
+    """Poses at the stamps of the log, each with the prior that it names.
 
-    Which prior a running pose found depends on what had arrived, so the pose names it.
+    Which prior a running pose used depends on the arrival times, so the pose names it.
     """
 
     def __init__(self, config: RobotConfig, recorded: PriorsNamed) -> None:
@@ -31,7 +33,7 @@ class RecordedPoses(RunningPoses):
         self._recorded = recorded
 
     def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
-        """The poses of this stamp, by every prior that one of them names."""
+        """The poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
         for prior in self._recorded.get((writer.incarnation, stamp_ns), ()):
             here = prior if prior is not None and prior.incarnation == writer.incarnation else None
@@ -40,7 +42,7 @@ class RecordedPoses(RunningPoses):
 
 
 class RecomputedRobot:
-    """A robot's node over recorded messages, its poses those of the log.
+    """A robot's node over recorded messages, with poses at the recorded stamps.
 
     The configuration keeps the digest under which it was announced.
     """
@@ -61,7 +63,7 @@ class RecomputedRobot:
         self._boundary = Boundary(ch.robot_node(config.id))
 
     def given(self, message: m.Message) -> list[Outgoing]:
-        """Handle a message as the shell did: one that raises is set aside."""
+        """Handle a message as the shell does: one that raises is set aside."""
         return self._boundary.give(self.node, message)
 
 
@@ -69,7 +71,7 @@ NewRobot = Callable[[], RecomputedRobot]
 
 
 def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """Every message that the robot's measurements give, under the names of its inputs."""
+    """Every message that follows from the robot's measurements, by the names of its inputs."""
     config, digest = log.robot_config(robot)
     named = _priors_named(log, robot)
 
@@ -102,12 +104,12 @@ def _priors_named(log: Recorded, robot: str) -> PriorsNamed:
 
 
 def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Without feedback nothing from outside matters: each incarnation by itself, each life that
-    ended.
+    """The messages without feedback, where each incarnation, and each process that ended, is
+    independent.
 
-    A `Done` names the life that it closes: up to which measurement, over how many steps. A life
-    that began after a submap is computed from there, as a resumed robot does. Where a measurement
-    is not in the log, the computation goes on behind the next recorded submap.
+    A `Done` names the process that it closes: its last measurement and its number of steps. A
+    process that resumed after a submap is computed from there, as the robot does. Where a
+    measurement is not in the log, the computation continues after the next recorded submap.
     """
     for incarnation in log.incarnations(robot):
         measurements = log.measurements[(robot, incarnation)]
@@ -133,7 +135,7 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
 def _first_of(
     done: m.Done, chain: Sequence[m.Submap], measurements: Mapping[int, m.Measurement]
 ) -> int:
-    """The first measurement of the life that ended so, by its steps."""
+    """The first measurement of the process that ended with this `Done`, by its steps."""
     steps = 0
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in range(min(done.measurements, max(measurements) + 1), -1, -1):
@@ -152,8 +154,8 @@ def _life(
     first: int,
     until: int | None,
 ) -> Iterator[Outgoing]:
-    """The messages of a life from measurement `first` on; it ends before measurement `until`, if it
-    did.
+    """The messages of a process from measurement `first` on, up to measurement `until` if it ended
+    there.
     """
     start = measurements.get(0)
     if not isinstance(start, m.InitialPose):
@@ -178,9 +180,10 @@ def _life(
 
 
 def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Under a rule with feedback a robot waits for each round's map: it is the recorded one.
+    """The messages under a rule with feedback, where a robot waits for each round's map: the
+    recorded one.
 
-    A round that has no map in the log had no centre: the robot went on without it.
+    A round without a map in the log had no centre: the robot continued without it.
     """
     fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
     node = new()
@@ -210,10 +213,10 @@ def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]
 
 
 def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
-    """What the robot's node does with each measurement of an incarnation that it consumed, in its
-    own words.
+    """The disposition of each measurement of an incarnation that the robot's node consumed, as the
+    node words it.
 
-    Without a centre nothing holds it up.
+    The node runs without a centre, so that it waits for no map.
     """
     config, digest = log.robot_config(robot)
     disposition_of: dict[int, str] = {}

@@ -1,11 +1,11 @@
-"""Verification: every recomputable message of a log, computed again and compared.
+"""Verification: recomputes every recomputable message of a log and compares.
 
-A log's order is the recorder's, not a node's, so no run is played again: each message is computed
-from the inputs that it names. Submaps, own maps and own poses come from the measurements and the
-configuration alone; a team pose from the prior whose digest it names; a fused map, its priors,
-the trajectories and the final map from the recorded submaps of the map's version vector; what a
-rule with feedback exchanged from the recorded maps of the round. So one wrong message shows by
-itself, and what followed from it is right again.
+A log's order is the recorder's, not a node's, so no run is replayed: each message is computed from
+the inputs that it names. Submaps, own maps and own poses follow from the measurements and the
+configuration alone; a team pose from the prior whose digest it names; a fused map, its priors, the
+trajectories and the final map from the recorded submaps of the map's version vector; the exchanges
+of a rule with feedback from the recorded maps of the round. So one wrong message is found by
+itself, and messages that follow from it are judged by its recorded bytes.
 """
 
 from collections.abc import Mapping
@@ -39,14 +39,14 @@ CHECKED = (
     ch.ROBOT_DONE, ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
     ch.CENTRAL_POSE, ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_FINAL,
 )  # fmt: skip
-"""Causes before what follows from them."""
+"""Channels in the order of cause and effect."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """A recorded message that is not what its inputs give; `counter` is its publisher's.
+    """A recorded message that differs from the recomputed one; `counter` is its publisher's.
 
-    lacks: an input is not in the log, so that nothing can be said of the message.
+    lacks: an input is not in the log, so that the message can not be judged.
     """
 
     key: str
@@ -67,10 +67,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """One channel: messages in the log, equal to the last bit, equal within the tolerance only.
+    """One channel: number of messages in the log, of those equal to the last bit, and of those
+    equal within the tolerance only.
 
-    first: the first that differs by more, or that can not be judged where none does. lacking: how
-    many can not be judged, since an input is not in the log. Whatever is in no count differs.
+    first: the first that differs by more, or else the first that can not be judged. lacking: number
+    of messages that can not be judged, since an input is not in the log. All others differ.
     """
 
     channel: str
@@ -82,16 +83,17 @@ class ChannelResult:
 
     @property
     def different(self) -> int:
-        """Messages that are not what their inputs give."""
+        """Number of messages that differ from the recomputed ones."""
         return self.messages - self.equal - self.close - self.lacking
 
 
 @dataclass(frozen=True)
 class Verification:
-    """A log that was computed again.
+    """The result of recomputing a log.
 
-    other_platform: the metadata in which this platform is not the log's; with any, numbers are
-    compared within a tolerance. span_s: team time from the first measurement to the last.
+    other_platform: the metadata in which this platform differs from the log's; if there are any,
+    numbers are compared within a tolerance. span_s: team time from the first measurement to the
+    last.
     """
 
     channels: tuple[ChannelResult, ...]
@@ -102,7 +104,9 @@ class Verification:
 
     @property
     def first(self) -> Difference | None:
-        """The first difference, causes before what follows; without any, what lacks an input."""
+        """The first difference, causes before effects; without any, the first message that lacks an
+        input.
+        """
         found = [c.first for c in self.channels if c.first is not None]
         return min(found, key=lambda each: each.lacks, default=None)
 
@@ -113,7 +117,7 @@ class Verification:
 
 
 def verify(log: Log) -> Verification:
-    """Compute a log again and compare; raises RerunError, LogError."""
+    """Recompute a log and compare; raises RerunError, LogError."""
     here = provenance()
     other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
     found = recorded(log)
@@ -138,7 +142,7 @@ def verify(log: Log) -> Verification:
 
 
 def _others(log: Log, found: Recorded) -> frozenset[str]:
-    """In a robot's own log, the teammates: what they have said is an input and proves nothing."""
+    """The teammates in a robot's own log: their messages are inputs, and are not verified."""
     if OWN not in log.metadata:
         return frozenset()
     there = frozenset(r for r in found.robots if ch.robot_node(r) in found.configured)
@@ -212,7 +216,7 @@ def _names(message: m.Message) -> str:
 
 
 def _lacking(message: m.Message, log: Recorded) -> str | None:
-    """The input that is not in the log, in words; None where nothing that a message names lacks."""
+    """The named input that is not in the log, in words; None where all are there."""
     match message:
         case m.PoseEstimate() if any(message.map_digest):
             priors_of_all = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
@@ -240,7 +244,7 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
 
 
 def _gap(log: Recorded, message: m.Message) -> str | None:
-    """The first measurement of its stream that a message comes behind and the log has not."""
+    """The first measurement before a message that is not in the log."""
     robot, incarnation = getattr(message, "robot", ""), getattr(message, "incarnation", None)
     for stream in sorted(log.measurements):
         if stream[0] != robot or incarnation not in {None, stream[1]}:

@@ -1,4 +1,4 @@
-"""What is drawn of a team's messages: landmarks and thinned paths."""
+"""The drawable part of a team's messages: landmarks and thinned paths."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ from team import translate
 from team.wire import messages as m
 
 PATH_POINTS = 1_000
-"""Points of one path at the most; a longer one keeps every second."""
+"""Most points of one path; a longer one keeps every second."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ def landmarks_of(message: m.MapEstimate | m.FusedMap) -> Landmarks:
 
 @dataclass
 class Track:
-    """A path as it grows, thinned to what can be drawn: (x [m], y [m]) at a least spacing [ns]."""
+    """A growing path, thinned for drawing: (x [m], y [m]) at a least spacing [ns]."""
 
     stamps: list[int] = field(default_factory=list)
     points: list[tuple[float, float]] = field(default_factory=list)
     spacing_ns: int = 100_000_000
 
     def take(self, stamp_ns: int, x: float, y: float) -> None:
-        """Append a point, unless the last is nearer than the spacing; one out of order is none."""
+        """Append a point, unless it is nearer than the spacing to the last, or out of order."""
         if self.stamps and stamp_ns < self.stamps[-1] + self.spacing_ns:
             return
         self.stamps.append(stamp_ns)

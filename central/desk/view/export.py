@@ -1,4 +1,6 @@
-"""The views of a log that was recorded: what a viewer would have published, in their order."""
+"""Computes the views of a recorded log: those that a viewer would have published, in their
+order.
+"""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -16,7 +18,9 @@ _CHANNELS = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE
 
 
 def for_viewer(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
-    """What a viewer hears in a sample; None in what is not for it, or not sound."""
+    """The channel and message of a sample if a viewer subscribes to it; None otherwise, and for
+    invalid samples.
+    """
     found = ch.channel_of(sample.key)
     if found is None or found[0].name not in _CHANNELS:
         return None
@@ -28,14 +32,14 @@ def for_viewer(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
 
 
 class Viewing:
-    """A viewer over samples: what arrives goes to the node, what it says comes out as samples."""
+    """A viewer over samples: passes messages to the node, and returns its views as samples."""
 
     def __init__(self) -> None:
         self.node = ViewerNode()
         self._counters: dict[str, int] = {}
 
     def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
-        """The views that a sample and what was heard in it bring, with counters of their own."""
+        """The views that follow from a sample's message, with counters of their own."""
         out = []
         for shown in [] if input_ is None else self.node.handle(*input_):
             counter = self._counters.get(shown.key, 0)
@@ -45,7 +49,7 @@ class Viewing:
 
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
-    """The samples, and behind each the views that it brings; earlier views are left out."""
+    """The samples, each followed by its views; views in the log are left out."""
     viewing, centre = Viewing(), PeersAsCentre()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
@@ -55,7 +59,7 @@ def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
 
 
 def export_views(log: Log, out: Path) -> int:
-    """Write a log with its views to a new log `out`; how many messages it has.
+    """Write a log with its views to a new log `out`; returns the number of its messages.
 
     Raises `LogError` for a damaged log, `RecorderError` when `out` exists.
     """

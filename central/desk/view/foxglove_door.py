@@ -1,8 +1,8 @@
-"""Who may connect to Foxglove's WebSocket: viewers of this machine, no page of a stranger.
+"""Controls access to Foxglove's WebSocket: viewers of this machine, no page of a foreign origin.
 
-The SDK's server takes any origin, so it listens where nobody looks (a random address of loopback
-and a random port), and what is offered to viewers is this door before it: it looks at Host and
-Origin as the page's server does, then hands every frame on, both ways.
+The SDK's server accepts any origin, so it listens at a random address of loopback and a random
+port. Viewers connect to this proxy: it checks Host and Origin as the page's server does, then
+forwards every frame in both directions.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ from websockets.typing import Subprotocol
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 VIEWERS = ("https://app.foxglove.dev", "file://")
-"""Origins beside this machine's own that are viewers: Foxglove in a browser, and on a desktop."""
+"""Origins of viewers beside this machine's own: Foxglove in a browser, and on a desktop."""
 PROTOCOLS = tuple(map(Subprotocol, ("foxglove.sdk.v1", "foxglove.websocket.v1")))
 
 
@@ -37,10 +37,10 @@ def hidden_host() -> str:
 
 
 def refusal(listening_at: str, host: str, origins: list[str]) -> str | None:
-    """Why whoever asks for `host` from a page of these origins is not let in; None: it is.
+    """Why a request for `host` from a page of these origins is refused; None: it is not.
 
-    listening_at: our own address; on loopback whoever reaches us under another name is refused
-    (DNS rebinding).
+    listening_at: our own address; on loopback a request under another name is refused (DNS
+    rebinding).
     """
     if listening_at in LOOPBACK and _name(host) not in LOOPBACK:
         return f"{host!r} is not this machine\n"
@@ -60,7 +60,9 @@ def _name(host: str) -> str:
 
 @contextmanager
 def door(host: str, port: int, behind: str) -> Iterator[int]:
-    """Listen, on a thread, for viewers of the server at `behind`; the port. OSError: it can not."""
+    """Listen, on a thread, for viewers of the server at `behind`; yields the port. Raises
+    OSError.
+    """
     loop = asyncio.new_event_loop()
     outcome: list[tuple[int, asyncio.Event] | BaseException] = []
     ready = threading.Event()

@@ -1,6 +1,6 @@
-"""Foxglove's messages from what is to be drawn: the one module that imports its encoders.
+"""Encodes drawable things as Foxglove's messages: the one module that imports its encoders.
 
-z is height: the plane of the map is z = 0. Directions are turns about z, (0, 0, sin θ/2, cos θ/2).
+z is height: the plane of the map is z = 0. Rotations are about z, (0, 0, sin θ/2, cos θ/2).
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,7 +21,7 @@ TRUTH: Shade = ("#8a93a3", 0.9)
 LANDMARK: Shade = ("#f5b83d", 1.0)
 _FLAT_M = 0.002
 _LEAST_M = 0.01
-"""A flat or a needle of an ellipse is drawn at least so thick and wide."""
+"""Least thickness and width of an ellipse."""
 
 
 def stamp(stamp_ns: int) -> fox.Timestamp:
@@ -31,7 +31,7 @@ def stamp(stamp_ns: int) -> fox.Timestamp:
 
 
 def scene(entities: Iterable[fox.SceneEntity]) -> bytes:
-    """A scene update; an entity takes the place of the earlier one with its name."""
+    """A scene update; an entity replaces the earlier one with its name."""
     return bytes(fox.SceneUpdate(entities=list(entities)).encode())
 
 
@@ -73,7 +73,7 @@ def robot_entity(
     *,
     lost: bool,
 ) -> fox.SceneEntity:
-    """A robot: an arrow, the 95 % ellipse of its position, its name, where it just was."""
+    """A robot: an arrow, the 95 % ellipse of its position, its name, its recent path."""
     x, y, theta = (float(v) for v in pose)
     P = np.array([[covariance[0, 0], covariance[0, 1], covariance[1, 1]]])
     (major,), (minor,), (direction,) = ellipses(P)
@@ -98,7 +98,7 @@ def robot_entity(
 def true_robot_entity(
     stamp_ns: int, name: str, pose: Float[np.ndarray, "3"], size_m: float
 ) -> fox.SceneEntity:
-    """Where a robot truly is."""
+    """The true pose of a robot."""
     x, y, theta = (float(v) for v in pose)
     arrow = _arrow(_pose(x, y, theta), 0.8 * size_m, (TRUTH[0], 0.6))
     return _entity(stamp_ns, f"true robot {name}", arrows=[arrow])
@@ -107,7 +107,7 @@ def true_robot_entity(
 def path_entity(
     stamp_ns: int, name: str, points: Sequence[tuple[float, float]], shade: Shade, pixels: float
 ) -> fox.SceneEntity:
-    """A path as a line, so many pixels wide."""
+    """A path as a line of this width in pixels."""
     return _entity(stamp_ns, name, lines=[_line(points, shade, pixels)])
 
 

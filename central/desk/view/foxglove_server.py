@@ -1,7 +1,7 @@
 """Foxglove's WebSocket: a team's views in Foxglove or Lichtblick, of a log or of a run.
 
-A log can be played, paused and jumped in from there; of a run the views come as they are made.
-Whoever subscribes gets the newest view of that topic at once.
+A log can be played, paused and searched there; of a run the views are sent as they are made. A new
+subscriber gets the newest view of its topic at once.
 """
 
 import socket
@@ -32,11 +32,11 @@ from team.wire.bus import Sample
 
 TURN_S = 0.05
 MOST_BYTES = 400_000_000
-"""Of views that are kept to be played; of a longer log what is beyond is not."""
+"""Most bytes of views that are stored for playing; the rest of a longer log is left out."""
 
 
 class Views:
-    """The views of one team, as Foxglove's channels; what was said can be said again."""
+    """The views of one team as Foxglove's channels; the newest of each can be sent again."""
 
     def __init__(self) -> None:
         self.context = Context()
@@ -46,7 +46,7 @@ class Views:
         self._lock = threading.Lock()
 
     def name(self, team: str) -> None:
-        """The team whose views they are; before the first."""
+        """Set the team's name; before the first view."""
         self._team = team
 
     def introduce(self, key: str) -> Channel:
@@ -58,14 +58,14 @@ class Views:
             return channel
 
     def say(self, view: Sample) -> None:
-        """To whoever listens."""
+        """Send a view to the subscribers."""
         channel = self.introduce(view.key)
         with self._lock:
             self._newest[view.key] = view
         channel.log(view.payload, log_time=max(view.stamp_ns, 0))
 
     def again(self, topic: str) -> None:
-        """The newest view of a topic once more."""
+        """Send the newest view of a topic once more."""
         with self._lock:
             found = [v for key, v in self._newest.items() if self._topic(key) == topic]
         for view in found:
@@ -89,7 +89,7 @@ class Views:
 
 
 class Player(ServerListener):
-    """Plays views by their stamps, as whoever looks at them asks."""
+    """Plays recorded views by their stamps, controlled by the viewer."""
 
     def __init__(self, views: Views, recorded: list[Sample]) -> None:
         self._views = views
@@ -106,21 +106,21 @@ class Player(ServerListener):
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """Of the views."""
+        """The first and last stamp of the views."""
         return (self._stamps[0], self._stamps[-1]) if self._stamps else (0, 1)
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """The newest view of the topic, at once."""
+        """Send the newest view of the topic at once."""
         self._views.again(channel.topic)
 
     def on_playback_control_request(self, request: PlaybackControlRequest) -> PlaybackState:
-        """Play, pause, another speed, a jump."""
+        """Play, pause, change the speed, or jump."""
         play = request.playback_command == PlaybackCommand.Play
         self.ask(request.seek_time, request.playback_speed, play=play)
         return self.state(did_seek=request.seek_time is not None, request_id=request.request_id)
 
     def ask(self, seek_ns: int | None, speed: float, *, play: bool) -> None:
-        """Jump there, if anywhere; then play at this speed, or pause."""
+        """Jump to a time, if one is given; then play at this speed, or pause."""
         with self._lock:
             self.playing = play
             self.speed = speed or 1.0
@@ -128,7 +128,7 @@ class Player(ServerListener):
                 self._jump(seek_ns)
 
     def state(self, *, did_seek: bool = False, request_id: str | None = None) -> PlaybackState:
-        """What is played."""
+        """The state of playing."""
         at_end = self.now_ns >= self.span_ns[1]
         status = (
             PlaybackStatus.Ended if at_end
@@ -138,7 +138,7 @@ class Player(ServerListener):
         return PlaybackState(status, self.now_ns, self.speed, did_seek, request_id)
 
     def turn(self, passed_s: float) -> bool:
-        """So much time has passed: say what is due; whether something was playing."""
+        """Advance by this time and send the views that are due; returns whether it is playing."""
         with self._lock:
             if not self.playing:
                 return False
@@ -152,7 +152,7 @@ class Player(ServerListener):
             return True
 
     def _jump(self, to_ns: int) -> None:
-        """Every topic as it was at that time."""
+        """Send every topic's newest view at that time."""
         self.now_ns = min(max(to_ns, self.span_ns[0]), self.span_ns[1])
         self._sent = bisect_right(self._stamps, self.now_ns)
         newest: dict[str, Sample] = {}
@@ -171,7 +171,8 @@ class _Newest(ServerListener):
 
 
 class FoxgloveFeed:
-    """The audience of a log for Foxglove: of a run at once, of a log when all of it has been read.
+    """Sends the views of a log to Foxglove: of a run at once, of a log when all of it has been
+    read.
 
     Raises ServerError where it can not listen.
     """
@@ -193,7 +194,7 @@ class FoxgloveFeed:
 
     @property
     def url(self) -> str:
-        """Where Foxglove connects; a log is there when it has been read."""
+        """The address for Foxglove; a log is available once it has been read."""
         return f"ws://{self._host}:{self._port}"
 
     def __enter__(self) -> Self:
@@ -208,7 +209,7 @@ class FoxgloveFeed:
             self._server.stop()
 
     def begin(self, team: str) -> None:
-        """Whose views they are."""
+        """Set the team's name."""
         self._views.name(team)
 
     def say(self, view: Sample) -> None:
@@ -249,7 +250,7 @@ class FoxgloveFeed:
         listener: Player | _Newest,
         span_ns: tuple[int, int] | None,
     ) -> WebSocketServer:
-        """The SDK's server where nobody looks, and the door to it where we said."""
+        """The SDK's server at a hidden address, and the proxy at the requested one."""
         hidden = hidden_host()
         server = foxglove.start_server(
             name="teamslam",
@@ -270,7 +271,7 @@ class FoxgloveFeed:
 
 
 def taken(host: str, port: int) -> ServerError:
-    """That nobody can listen there."""
+    """The error that the address can not be listened at."""
     return ServerError(
         f"can not serve Foxglove at {host}:{port}: the port is taken or the address is not this "
         "machine's; choose another --foxglove-port, 0 for any free one"

@@ -1,17 +1,18 @@
-"""Why an unnamed landmark of a map is one: its members, and the step by which each came to it."""
+"""The members of a map's unnamed landmarks, and the step by which each was associated."""
 
 from central.unnamed_landmarks import STEPS
 from team.wire import messages as m
 from team.wire.arrays import floats, ids
 
 MOST = 12
-"""So many members of a landmark are told; a landmark may have hundreds."""
+"""Most members of a landmark that are listed; a landmark may have hundreds."""
 
 
 def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
-    """Of each landmark that has unnamed members: its number of submaps, and its members in words.
+    """For each landmark with unnamed members: its number of submaps, and its members in words.
 
-    `r1/1/12/7` is robot, incarnation, submap, local landmark: what `teamslam verdict` takes.
+    `r1/1/12/7` is robot, incarnation, submap, local landmark: the form that `teamslam verdict`
+    reads.
     """
     found: dict[int, tuple[set[tuple[str, int, int]], list[str]]] = {}
     for table in fused.memberships:

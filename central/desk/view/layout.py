@@ -1,4 +1,4 @@
-"""A layout for Foxglove and Lichtblick: scene, events, errors in their bounds, consistency."""
+"""A layout for Foxglove and Lichtblick: scene, events, errors with bounds, consistency."""
 
 import json
 from collections.abc import Sequence
@@ -69,7 +69,9 @@ def _scene(prefix: str, robots: Sequence[str]) -> dict[str, object]:
 
 
 def _errors(prefix: str, robots: Sequence[str], of: str, title: str) -> dict[str, object]:
-    """Each robot's error; the bounds are those of the first, since so many lines are unreadable."""
+    """Each robot's error, with the bounds of the first robot only, since more lines are
+    unreadable.
+    """
     lines = []
     for number, robot in enumerate(robots):
         topic = f"{prefix}/{views.ROBOT.key(robot)}"
@@ -103,7 +105,7 @@ def _split(direction: str, first: object, second: object, percentage: int) -> di
 
 
 def _column(panels: Sequence[str]) -> object:
-    """Panels one below the other, equally high."""
+    """Panels one below the other, of equal height."""
     if len(panels) == 1:
         return panels[0]
     return _split("column", panels[0], _column(panels[1:]), round(100 / len(panels)))

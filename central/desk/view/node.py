@@ -1,7 +1,7 @@
 """The viewer's node: the team's messages in, views out; no I/O, no clock.
 
-It hears the truth as an evaluator does, and nobody who estimates hears it: no node of a team
-subscribes to a view.
+It receives the truth as an evaluator does; no estimator does, since no node of a team subscribes to
+a view.
 """
 
 import math
@@ -26,19 +26,19 @@ from team.wire.arrays import floats
 from team.wire.channels import Channel
 
 PERIOD_NS = 1_000_000_000
-"""Team time between two views of what moves."""
+"""Team time between two views of poses and errors."""
 PATHS_EVERY = 10
 """Whole paths come with every tenth view."""
 TRAIL_NS = 15_000_000_000
-"""So much of its path goes with a robot; the rest comes with the whole paths."""
+"""Length of the recent path that is sent with a robot; the rest is sent with the whole paths."""
 LAG_NS = 30_000_000_000
 """A robot that is further behind the fastest is not waited for."""
 MOST_PERIODS = 60
-"""Views at the most for one message; of a longer jump in time the earlier part is left out."""
+"""Most views for one message; of a longer jump in time the earlier part is left out."""
 FORGET_NS = 10_000_000_000
-"""An estimate waits so long for its truth."""
+"""Time for which an estimate waits for its truth."""
 _MARKS_ACROSS = 45.0
-"""Robots are drawn so large that as many fit across what is known of the place."""
+"""Number of robots, at their drawn size, that fit across the known extent."""
 
 
 class Shown(NamedTuple):
@@ -51,9 +51,9 @@ class Shown(NamedTuple):
 
 @dataclass
 class _Robot:
-    """What is known of one robot; the team's pose of it goes before its own.
+    """The state of one robot; the team's pose of it is preferred to its own.
 
-    coming: estimates that the view's time has not reached. reached_ns: how far the robot is.
+    coming: estimates after the view's time. reached_ns: the robot's team time.
     """
 
     coming: deque[m.PoseEstimate] = field(default_factory=deque)
@@ -71,17 +71,17 @@ class _Robot:
     status: dict[str, float] = field(default_factory=dict)
 
     def pose(self) -> Float[np.ndarray, "3"]:
-        """(x [m], y [m], theta [rad]); call where there is an estimate."""
+        """(x [m], y [m], theta [rad]); to be called where there is an estimate."""
         assert self.estimate is not None
         return floats(self.estimate.pose, "pose").astype(np.float64)
 
     def covariance(self) -> Float[np.ndarray, "3 3"]:
-        """Of the pose."""
+        """The covariance of the pose."""
         assert self.estimate is not None
         return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
     def go_to(self, now_ns: int) -> None:
-        """The estimates up to this time are taken."""
+        """Take the estimates up to this time."""
         while self.coming and self.coming[0].stamp_ns <= now_ns:
             self.estimate = self.coming.popleft()
             x, y, _ = self.pose().tolist()
@@ -94,7 +94,7 @@ class _Robot:
         self.errors.forget(now_ns - FORGET_NS)
 
     def note(self, errors: PoseErrors | None) -> None:
-        """The newest error stands until the next."""
+        """Set the newest error, which holds until the next."""
         if errors is not None:
             self.last_error = (errors.errors[-1], float(errors.nees[-1]) / 3.0)
 
@@ -102,8 +102,8 @@ class _Robot:
 class ViewerNode:
     """One viewer of a team: `handle` until `finished`.
 
-    The view's time is that of the slowest robot at work, so that all are seen where they were at
-    one time, however far the others have run ahead; nobody is waited for beyond LAG_NS.
+    The view's time is that of the slowest robot at work, so that all robots are shown at one time,
+    however far the others are ahead; no robot is waited for beyond LAG_NS.
     """
 
     listens = (
@@ -133,7 +133,9 @@ class ViewerNode:
         return 0 if self._now_ns is None else self._now_ns
 
     def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
-        """Take one message of a channel; the views that are due, one per period of team time."""
+        """Take one message of a channel; returns the views that are due, one per period of team
+        time.
+        """
         out = [_logged(event) for event in self._detector.take(message, self.now_ns)]
         self._take(channel, message)
         reached = self._reached_ns()
@@ -150,7 +152,7 @@ class ViewerNode:
         return out
 
     def _reached_ns(self) -> int | None:
-        """How far the team is; None before anybody has moved."""
+        """The team time up to which all robots have moved; None before any has."""
         marks = {n: r.reached_ns for n, r in self._robots.items() if r.reached_ns is not None}
         if not marks:
             return None
@@ -220,7 +222,7 @@ class ViewerNode:
             )  # fmt: skip
 
     def _size_m(self) -> float:
-        """How large a robot is drawn: 1, 2 or 5 times a power of ten, so that it rarely changes."""
+        """The drawn size of a robot: 1, 2 or 5 times a power of ten, so that it rarely changes."""
         left, bottom, right, top = self._reach
         across = max(right - left, top - bottom) / _MARKS_ACROSS
         if not across > 0.0 or not math.isfinite(across):
@@ -250,7 +252,7 @@ class ViewerNode:
         return out
 
     def _go_to(self, now_ns: int, *, last: bool) -> None:
-        """Everything is as it was at this time; at the last view, the final map is there, too."""
+        """Set every part to its state at this time; at the last view with the final map."""
         self._now_ns = now_ns
         while self._maps and (last or self._maps[0].stamp_ns <= now_ns):
             self._fused = self._maps.popleft()

@@ -1,12 +1,13 @@
-"""What the page is told: one frame per piece of news, as JSON, in the order of the log.
+"""The frames that the page receives: one per event, as JSON, in the order of the log.
 
-t: seconds of team time since the first measurement. Poses and errors come as rows of numbers, maps
-and particles as base64 of little-endian float32 and uint32. Frames, by `k`:
+t: seconds of team time since the first measurement. Poses and errors are rows of numbers, maps and
+particles base64 of little-endian float32 and uint32. Frames, by `k`:
 
-hello: team, title, colours, live. now: how far all robots at work are. pose: rows x, y, heading,
-xx, xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per degree of
-freedom. truth: rows x, y, heading. truth_map, map, cloud, path: what they are called. fig: a node's
-figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been read.
+hello: team, title, colours, live. now: the team time of all robots at work. pose: rows x, y,
+heading, xx, xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per
+degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as their names. fig: a
+node's figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been
+read.
 """
 
 import base64
@@ -29,15 +30,15 @@ from team.wire.arrays import floats, stamps
 from team.wire.bus import Sample
 
 SPACING_NS = 100_000_000
-"""Between two poses, of truth and of estimates, that the page gets."""
+"""Least time between two poses, of truth and of estimates, that the page receives."""
 MAP_SPACING_NS = 1_000_000_000
-"""Between two maps that the page gets."""
+"""Least time between two maps that the page receives."""
 _OF_A_SET = ("set_submaps", "set_agrees")
 _BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
 
 
 def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
-    """What the page is called: scenario, seed, file."""
+    """The title of the page: scenario, seed, file."""
     try:
         scenario = str(json.loads(metadata.get("scenario", "{}"))["name"])
     except (ValueError, KeyError, TypeError):
@@ -48,7 +49,7 @@ def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
 
 @dataclass
 class _Stream:
-    """One robot's poses on their way to the page."""
+    """One robot's poses that are not sent to the page yet."""
 
     errors: RunningErrors = field(default_factory=RunningErrors)
     by_team: bool = False
@@ -63,7 +64,7 @@ class _Stream:
 
 
 class PageFrames:
-    """Samples in, frames out: `take` them, `flush` what is ready."""
+    """Converts samples to frames: `take` them, `flush` the frames that are ready."""
 
     def __init__(self) -> None:
         self._out: list[str] = []
@@ -82,7 +83,7 @@ class PageFrames:
         self._say("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
     def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> None:
-        """Take one sample of the log, and what a viewer hears in it."""
+        """Take one sample of the log, and its message if a viewer subscribes to it."""
         found = ch.channel_of(sample.key)
         channel = "" if found is None else found[0].name
         if self._origin_ns is None and channel in _BEGIN:
@@ -95,7 +96,7 @@ class PageFrames:
             self._take(*input_)
 
     def flush(self, now_ns: int | None = None) -> list[str]:
-        """The frames since the last time; now_ns: how far the robots are."""
+        """The frames since the last call; now_ns: the team time of the robots."""
         for robot, stream in self._streams.items():
             self._tell_errors(stream)
             for kind, (times, values) in stream.rows.items():
@@ -111,7 +112,7 @@ class PageFrames:
         return out
 
     def end(self, notes: Sequence[str] = (), *, complete: bool) -> list[str]:
-        """The last frames: there is nothing more; notes: what was wrong with the log."""
+        """The last frames; notes: faults of the log."""
         out = self.flush(self._newest_ns)
         for note in notes:
             self._say("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
@@ -122,7 +123,7 @@ class PageFrames:
         self._out.append(json.dumps({"k": kind, **fields}, separators=(",", ":")))
 
     def _t(self, stamp_ns: int) -> float:
-        """Seconds since the first measurement; 0 for what was said before it."""
+        """Seconds since the first measurement; 0 for earlier messages."""
         if self._origin_ns is None:
             return 0.0
         return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)
@@ -227,7 +228,7 @@ class PageFrames:
 
 
 def _short(value: float) -> float:
-    """Seven digits are more than can be seen."""
+    """The value in seven digits: more can not be seen."""
     return float(f"{value:.7g}")
 
 

@@ -1,7 +1,7 @@
 """The page's server: files and one stream of frames over a WebSocket, for this machine alone.
 
-Whoever connects gets every frame of the log from the first on, then what comes. A page of another
-origin may not connect, nor one that reaches us under another name (DNS rebinding).
+A new connection gets every frame of the log from the first on, then the new ones. A page of another
+origin may not connect, nor one that uses another name for this machine (DNS rebinding).
 """
 
 import asyncio
@@ -28,7 +28,7 @@ from team.wire.bus import BusError, Sample
 
 STREAM = "/stream"
 LOOK_S = 0.2
-"""Between two looks at a log that is being written."""
+"""Time [s] between two readings of a log that is being written."""
 _BATCH_BYTES = 500_000
 _TYPES = {
     ".html": "text/html",
@@ -41,7 +41,7 @@ _LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
 class ServerError(BusError):
-    """The page can not be served there."""
+    """The page can not be served at this address."""
 
 
 def page_files() -> dict[str, tuple[str, bytes]]:
@@ -57,23 +57,23 @@ def page_files() -> dict[str, tuple[str, bytes]]:
 
 @runtime_checkable
 class Audience(Protocol):
-    """Whoever takes the views of a log as they are made."""
+    """Receives the views of a log as they are made."""
 
     def begin(self, team: str) -> None:
-        """Whose views they are."""
+        """Receive the team's name."""
 
     def say(self, view: Sample) -> None:
-        """One view."""
+        """Receive one view."""
 
     def end(self) -> None:
-        """There are no more."""
+        """There are no more views."""
 
 
 @dataclass
 class Feed:
-    """Reads a log as it grows, and keeps the frames that it makes.
+    """Reads a log as it grows, and stores the frames of it.
 
-    audience: is given every view, once, in order. error: why the measurement ended early.
+    audience: receives every view, once, in order. error: why reading ended early.
     """
 
     tail: Tail
@@ -86,7 +86,9 @@ class Feed:
     _greeted: bool = False
 
     def look(self, *, growing: bool) -> bool:
-        """Take what has come; whether there was something. A log that does not grow ends here."""
+        """Read what is new; returns whether there was anything. A log that does not grow
+        ends here.
+        """
         try:
             samples = self.tail.more()
         except (LogError, OSError) as error:
@@ -118,7 +120,7 @@ class Feed:
         return bool(samples)
 
     def _wrong(self) -> list[str]:
-        """What of the log could not be read."""
+        """The faults of the log, in words."""
         found = [] if self.error is None else [self.error]
         if self.tail.damaged:
             found.append(
@@ -129,7 +131,7 @@ class Feed:
 
 
 class PageServer:
-    """One page at a host and port; run it in an event loop of its own."""
+    """Serves one page at a host and port; to be run in an event loop of its own."""
 
     def __init__(self, feed: Feed, host: str, *, growing: bool) -> None:
         self._feed = feed
@@ -216,7 +218,7 @@ def _is_loopback(host: str) -> bool:
 
 @contextmanager
 def serving(feed: Feed, host: str, port: int, *, growing: bool) -> Iterator[str]:
-    """Serve the page on a thread until the context ends; its URL. Raises ServerError."""
+    """Serve the page on a thread until the context ends; yields its URL. Raises ServerError."""
     ready = threading.Event()
     ends: dict[str, object] = {}
 

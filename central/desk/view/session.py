@@ -1,4 +1,4 @@
-"""One look at a log: the page, and Foxglove's WebSocket beside it."""
+"""Shows a log: the page, and Foxglove's WebSocket beside it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ from team.recording.tail import Tail
 
 @dataclass(frozen=True)
 class Shown:
-    """Where a log is shown."""
+    """The addresses at which a log is shown."""
 
     url: str
     foxglove: str
@@ -25,7 +25,7 @@ def session(
 ) -> Iterator[Shown]:
     """Show a log until the context ends; raises ServerError where a port is taken.
 
-    growing: its recorder may still be at work, or has not begun.
+    growing: its recorder may still be running, or has not begun.
     """
     with FoxgloveFeed(host, foxglove_port, live=growing) as foxglove:
         feed = Feed(Tail(log), foxglove)

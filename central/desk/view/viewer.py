@@ -1,4 +1,4 @@
-"""The viewer's process: a bus around the node; what it publishes the recorder takes as it is."""
+"""The viewer's process: a bus around the node; the recorder records its views."""
 
 import threading
 import time
@@ -17,7 +17,8 @@ NODE = "viewer"
 
 
 def run_viewer(bus: Bus, stop: threading.Event) -> int:
-    """Publish the views of a team until its final map is shown, or until `stop`; how many.
+    """Publish the views of a team until its final map is shown, or until `stop`; returns their
+    number.
 
     Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
     """
