@@ -150,8 +150,6 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
-    for earlier_set in sorted(folder.glob("*.set")):
-        _set_aside(earlier_set)  # what another run's robots have sent is nothing of this one
     from sim.launch.plan import Plan
 
     plan = Plan(
@@ -165,6 +163,8 @@ def launch(
         keys=keys and keys.resolve(),
         insecure=insecure,
     )
+    for earlier_set in plan.earlier_sets:
+        _set_aside(earlier_set)
     page = (
         shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
         if view

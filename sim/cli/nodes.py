@@ -142,7 +142,9 @@ def robot(
     store: Annotated[
         Path | None,
         typer.Option(
-            "--set", help="With --peers: the file that keeps the team's set.", metavar="FILE"
+            "--set",
+            help="With --peers: the file that stores the team's set, of one run only.",
+            metavar="FILE",
         ),
     ] = None,
     fold: Annotated[
@@ -248,8 +250,8 @@ def central(
         Path | None,
         typer.Option(
             "--set",
-            help="The file that keeps the team's set; a centre that is started again continues "
-            "from it.",
+            help="The file that stores the team's set, of one run only; a centre that is started "
+            "again continues from it.",
             metavar="FILE",
         ),
     ] = None,

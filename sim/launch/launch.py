@@ -183,23 +183,17 @@ def _endpoint(service: Supervised) -> str:
     raise LaunchError(f"the router did not come up within {ROUTER_PATIENCE_S:g} s")
 
 
-def _kept(plan: Plan, node: str) -> list[str]:
-    """Where a node keeps its set: robots that are peers, and a centre."""
-    keeps = plan.scenario.peers or (node == "central" and plan.scenario.central.fusion == "join")
-    return ["--set", str(plan.folder / f"{node}.set")] if keeps else []
-
-
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
     robots = [
-        (f"robot-{r.id}", ["robot", *common, r.id, *_kept(plan, r.id)])
+        (f"robot-{r.id}", ["robot", *common, r.id, *plan.stores(r.id)])
         for r in plan.scenario.robots
     ]
     return [
         ("recorder", ["record", *common, "--output", str(plan.log)]),
         *(
-            [("central", ["central", *common, *_kept(plan, "central")])]
+            [("central", ["central", *common, *plan.stores("central")])]
             if plan.scenario.centre
             else []
         ),

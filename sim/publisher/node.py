@@ -46,7 +46,7 @@ class WorldNode:
     new incarnation instead: an unknown initial pose, and counters from zero. configurations: the
     expected announcements; the world does not begin while one forbids it. tells_map: the true
     landmarks are published for robots that only localise themselves. batch_s: most team time
-    between two readings of incoming messages. peers: robots whose own final maps the world waits
+    between two looks at incoming messages. peers: robots whose own final maps the world waits
     for, until all are of the same set.
     """
 

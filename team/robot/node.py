@@ -202,7 +202,10 @@ class RobotNode:
                 return self._inbox.refusal(message) if own else f"a measurement of {message.robot}"
             case m.Progress() if message.incarnation == self._incarnation:
                 if message.submaps > self.submaps + AHEAD:
-                    return f"acknowledges {message.submaps} submaps of {self.submaps}"
+                    return (
+                        f"acknowledges {message.submaps} submaps of {self.submaps}: the centre's "
+                        "set is of another run; start the centre again with a new --set FILE"
+                    )
             case m.End() | m.StreamHead():
                 return self._stream_end.refusal(message)
             case _:

@@ -28,7 +28,7 @@ from team.wire.bus import BusError, Sample
 
 STREAM = "/stream"
 LOOK_S = 0.2
-"""Time [s] between two readings of a log that is being written."""
+"""Time [s] between two looks at a log that is being written."""
 _BATCH_BYTES = 500_000
 _TYPES = {
     ".html": "text/html",

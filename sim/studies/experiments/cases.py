@@ -14,10 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from joblib import Memory, Parallel, delayed, parallel_config
-from joblib.externals.loky.process_executor import (
-    TerminatedWorkerError,
-    _ExecutorManagerThread,
-)
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from sim.studies.experiments.task import Task
 
@@ -130,7 +127,7 @@ def _cancelling() -> Iterator[None]:
     previous = threading.excepthook
 
     def hook(error: threading.ExceptHookArgs) -> None:
-        ours = isinstance(error.thread, _ExecutorManagerThread)
+        ours = type(error.thread).__module__ == TerminatedWorkerError.__module__
         if not (ours and error.exc_type is KeyError):
             previous(error)
 
