@@ -147,9 +147,11 @@ def _misscale(scale: Scale, limit: float) -> str:
         return ""
     if abs(math.log(value)) <= max(math.log(limit), SCALE_SIGMAS * scale.log_sigma):
         return ""
-    if value > 1.0:
-        return f"covariances ought to be {value:.1f} times as large: their map claims too much"
-    return f"covariances ought to be {value:.2f} times as large: their map claims too little"
+    digits, much = (1, "much") if value > 1.0 else (2, "little")
+    return (
+        f"covariances ought to be {value:.{digits}f} times as large: their map claims too {much}; "
+        "learn the sensors' and odometry's noise by `teamslam calibrate` of the log or the data"
+    )
 
 
 def _level(chi2: float, dof: float) -> str | None:

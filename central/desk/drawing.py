@@ -23,6 +23,8 @@ ROBOT_COLOURS = (
 """Robots' colours in the order of their names, distinguishable on dark and on light ground."""
 ELLIPSE_SCALE = float(np.sqrt(5.991))
 """95 % of a Gaussian in the plane lie within this Mahalanobis distance."""
+BENT_RAD = 0.09
+"""Between two poses whose headings differ by more, a path is drawn as a curve."""
 _DIGITS = re.compile("([0-9]+)")
 
 
@@ -41,6 +43,31 @@ def colour_of(number: int) -> str:
 def robot_colours(names: Iterable[str]) -> dict[str, str]:
     """The colour of each robot of a team; the same team has the same colours everywhere."""
     return {name: colour_of(number) for number, name in enumerate(in_order(names))}
+
+
+def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:
+    """Points of a curve through poses (x [m], y [m], theta [rad]) that has their headings.
+
+    Between two poses whose headings differ it is the cubic that is closest to an arc; where they do
+    not point the same way along the line between them, as of a robot that turns on the spot, it is
+    that line. Backwards is as good as forwards.
+    """
+    if len(poses) < 2:
+        return poses[:, :2].copy()
+    chords = np.diff(poses[:, :2], axis=0)
+    turns = (np.diff(poses[:, 2]) + np.pi) % (2.0 * np.pi) - np.pi
+    ahead = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    along = np.einsum("ki,ki->k", ahead[:-1], chords), np.einsum("ki,ki->k", ahead[1:], chords)
+    lengths = np.linalg.norm(chords, axis=1) / np.cos(0.25 * turns) ** 2
+    pieces = np.where(along[0] * along[1] > 0.0, np.ceil(np.abs(turns) / BENT_RAD), 1).astype(int)
+    points = [poses[:1, :2]]
+    for k, count in enumerate(np.maximum(pieces, 1).tolist()):
+        s = np.arange(1, count + 1)[:, np.newaxis] / count
+        tangent = np.sign(along[0][k]) * lengths[k] * (s - 2.0 * s**2 + s**3) * ahead[k]
+        tangent += np.sign(along[1][k]) * lengths[k] * (s**3 - s**2) * ahead[k + 1]
+        bent = poses[k, :2] + (3.0 * s**2 - 2.0 * s**3) * chords[k] + tangent
+        points.append(bent if count > 1 else poses[k + 1 : k + 2, :2])
+    return np.concatenate(points)
 
 
 def ellipses(

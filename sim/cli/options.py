@@ -201,6 +201,8 @@ def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
         pose = ()
     if len(pose) not in (3, 5) or (colon and not robot):
         fail(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57", WRONG_USE)
+    if abs(pose[2]) > 2.0 * math.pi:
+        fail(f"--start {text}: theta is in radians, in one turn: {pose[2]:g} is not", WRONG_USE)
     return robot, pose
 
 

@@ -257,6 +257,10 @@ def start_of(table: CsvTable) -> StartPose | None:
     if len(table) > 1:
         raise table.fault(f"{len(table)} rows: one pose is where a robot starts")
     pose = table.numbers(*POSES)[0]
+    if abs(pose[2]) > MOST_RAD:
+        raise table.error(
+            0, "theta_rad", f"{pose[2]:g} is more than a whole turn; it is in radians"
+        )
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return StartPose(pose, None)
     covariance = pose_covariances(table)[0]

@@ -91,7 +91,8 @@ def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
 def test_no_loss_bounds_the_covariance_scale(factor):
     found = watched(0, with_covariance_times(factor, lambda _: True), ROBUST)
     assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.4)
-    assert any("ought to be" in w for w in found.warnings)
+    (said,) = (w for w in found.warnings if "ought to be" in w)
+    assert "learn the sensors' and odometry's noise by `teamslam calibrate`" in said
 
 
 def test_outliers_of_a_minority_do_not_move_the_covariance_scale():

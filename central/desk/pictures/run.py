@@ -13,6 +13,7 @@ from central.desk.drawing import (
     MAP_COLOUR,
     TRUE_LANDMARK_COLOUR,
     TRUTH_COLOUR,
+    curve_through,
     draw_ellipses,
     landmark_blocks,
     robot_colours,
@@ -159,7 +160,8 @@ def _draw_paths(
         x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
         axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
     if len(smoothed.stamps_ns):
-        axis.plot(*line.poses.T[:2], color=colour, linewidth=1.1, alpha=0.8, zorder=2)
+        drawn = line.poses[:, :2] if dense is None else curve_through(line.poses)
+        axis.plot(*drawn.T, color=colour, linewidth=1.1, alpha=0.8, zorder=2)
         axis.plot(
             *smoothed.poses.T[:2], color=colour, linestyle="", marker="o", markersize=3.5, zorder=3
         )

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from central.desk.compare import compare_rows
-from central.desk.drawing import ELLIPSE_SCALE, colour_of, ellipses, in_order, robot_colours
+from central.desk.drawing import (
+    ELLIPSE_SCALE,
+    colour_of,
+    curve_through,
+    ellipses,
+    in_order,
+    robot_colours,
+)
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.evaluation.history import history
 from central.desk.pictures.run import (
@@ -48,6 +55,18 @@ def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(
     for end in ends:
         assert end @ np.linalg.solve(P, end) == pytest.approx(ELLIPSE_SCALE**2, rel=1e-6)
     assert major >= minor
+
+
+@pytest.mark.parametrize("speed", [0.4, -0.4])
+def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed: float) -> None:
+    theta = np.array([0.3, 0.35, 2.0, 3.3])  # an eye for landmarks only at these; up to 95° between
+    radius = speed / 0.2
+    arc = np.column_stack([radius * np.sin(theta), -radius * np.cos(theta), theta])
+    drawn = curve_through(arc)
+    assert len(drawn) > 30
+    assert np.abs(np.linalg.norm(drawn, axis=1) - abs(radius)).max() < 0.01 * abs(radius)
+    on_the_spot = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 3.0], [0.01, 0.0, 0.1]])
+    assert curve_through(on_the_spot).tolist() == on_the_spot[:, :2].tolist()
 
 
 def test_a_robot_has_the_same_colour_in_the_report_and_on_the_page() -> None:

@@ -333,6 +333,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
             "column duration_s: not above 0",
         ),
         ("start", "x_m,y_m,theta_rad\n0,0,0\n1,1,1\n", "2 rows: one pose is where"),
+        ("start", "x_m,y_m,theta_rad\n0,0,90\n", "90 is more than a whole turn; it is in rad"),
         ("start", "x_m,y_m,theta_rad,c_xx,c_xy\n0,0,0,1,0\n", "c_yy, c_xt, c_yt, c_tt missing"),
         ("truth", "t_s,x_m,y_m,theta_rad\n1e9,0,0,0\n", "are not those of the odometry"),
         (

@@ -320,6 +320,7 @@ def test_wrong_use_is_said(tmp_path: Path) -> None:
         ((bag, "-o", tmp_path / "set"), "is not empty: give a new folder"),
         ((bag, "-o", tmp_path / "a", "--robot", "R1"), "--robot R1: a small letter"),
         ((bag, "-o", tmp_path / "a", "--start", "1,2"), "--start 1,2: give x,y,theta"),
+        ((bag, "-o", tmp_path / "a", "--start", "1,2,90"), "theta is in radians, in one turn"),
         ((bag, "-o", tmp_path / "a", "--start", "r9:1,2,3"), "--start: which robot's?"),
         ((tmp_path / "none", "-o", tmp_path / "a"), "none: no such file or folder"),
         ((bag, "-o", tmp_path / "a", "--ros2", tmp_path / "x.toml"), "x.toml: can not be read"),
