@@ -1,4 +1,4 @@
-"""Estimation values to messages and back: the one module that knows both."""
+"""Converts estimation values to messages and back: the one module that imports both."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -20,7 +20,7 @@ from team.wire.codec import unsound
 
 
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
-    """The start pose and its covariance (None: unknown; exactly known)."""
+    """The initial pose and its covariance; pose None: unknown; covariance None: exactly known."""
     pose = floats(message.pose, "pose").copy() if message.pose else None
     covariance = (
         floats(message.covariance, "covariance").reshape(3, 3).copy()
@@ -31,7 +31,7 @@ def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matr
 
 
 def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
-    """The start as the join takes it; None for an unknown pose."""
+    """The initial pose as a factor of map joining; None for an unknown pose."""
     pose, covariance = pose_of(message)
     return (
         None
@@ -41,10 +41,11 @@ def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
 
 
 def scan_of(message: m.AnyScan | m.Detections) -> Scan:
-    """Landmarks seen, in the machine's byte order; points become range and bearing.
+    """The observed landmarks, in the machine's byte order; points are converted to range and
+    bearing.
 
-    Detections without identities have the numbers 2³¹ + their place in the message, until their
-    window knows better.
+    Detections without identities have the numbers 2³¹ + their index in the message, until their
+    window associates them.
     """
     if isinstance(message, m.Detections):
         seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
@@ -62,16 +63,16 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
 
 
 def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
-    """A measurement's team time [ns]; that of an interval of odometry is its end's.
+    """A measurement's team time [ns]; for an odometry interval that of its end.
 
-    What the odometry's clock stamps t happened at t + clock_offset_s.
+    An interval that the odometry's clock stamps t ends at t + clock_offset_s.
     """
     offset_s = clock_offset_s if isinstance(message, m.AnyOdometry) else 0.0
     return message.stamp_ns + round(offset_s * 1e9)
 
 
 def motion_of(message: m.AnyOdometry, config: RobotConfig) -> Interval:
-    """One interval of odometry as the robot's motion model reads it."""
+    """One odometry interval, in the form that the robot's motion model takes."""
     end_ns, duration_ns = team_time_of(message, config.clock_offset_s), message.duration_ns
     match message:
         case m.Odometry():
@@ -109,8 +110,8 @@ def submap_message(
     sightings: int = 0,
     gated: int = 0,
 ) -> m.Submap:
-    """A local map with the names of its inputs, how many inter-robot measurements belong to it,
-    what was gated.
+    """The message of a local map, with the names of its inputs, the number of its inter-robot
+    measurements and of gated landmarks.
     """
     return m.Submap(
         stamp_ns=span_ns[1],
@@ -166,7 +167,7 @@ def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
 def association_message(
     robot: str, incarnation: int, sequence: int, stamp_ns: int, became: Became
 ) -> m.Association:
-    """What became of the detections of a submap's window."""
+    """The message with the outcomes of all detections of a submap's window."""
     landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
     return m.Association(
         stamp_ns=stamp_ns,
@@ -183,7 +184,7 @@ def association_message(
 def sighting_message(
     sighting: Sighting, config: bytes, measurements: tuple[int, ...]
 ) -> m.SightingFactor:
-    """An inter-robot factor with the names of its inputs."""
+    """The message of an inter-robot factor, with the names of its inputs."""
     return m.SightingFactor(
         stamp_ns=sighting.stamp_ns,
         robot=sighting.robot,
@@ -199,7 +200,7 @@ def sighting_message(
 
 
 def sighting_of(message: m.SightingFactor) -> Sighting:
-    """An inter-robot factor message as the join takes it."""
+    """The inter-robot factor in a message, as map joining takes it."""
     return Sighting(
         message.robot,
         message.incarnation,
@@ -212,7 +213,7 @@ def sighting_of(message: m.SightingFactor) -> Sighting:
 
 
 def contribution_of(message: m.Submap) -> Contribution:
-    """A submap message as the join takes it."""
+    """The submap in a message, as map joining takes it."""
     return Contribution(
         message.robot,
         message.incarnation,
@@ -231,7 +232,7 @@ def pose_message(
     pose: Float[np.ndarray, "3"],
     covariance: Float[np.ndarray, "3 3"],
 ) -> m.PoseEstimate:
-    """A pose with its covariance, symmetric to the last bit."""
+    """The message of a pose with its covariance, which is made exactly symmetric."""
     symmetric = 0.5 * (covariance + covariance.T)
     return m.PoseEstimate(
         stamp_ns=stamp_ns,
@@ -245,7 +246,7 @@ def pose_message(
 
 
 def joint_bytes(covariance: Matrix) -> bytes:
-    """A joint covariance, packed."""
+    """The bytes of a joint covariance: its packed upper triangle."""
     return from_floats(packed(covariance))
 
 
@@ -262,12 +263,12 @@ def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
 
 
 def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
-    """A landmark covariance as maps carry it: whole, or each landmark's own block only."""
+    """The bytes of a landmark covariance: the joint one, or each landmark's own block only."""
     return joint_bytes(covariance) if joint else block_bytes(blocks_of(covariance))
 
 
 def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
-    """The joint 2L × 2L covariance; block-diagonal where the message carries blocks only."""
+    """The joint 2L × 2L covariance; block-diagonal where the message contains blocks only."""
     n = len(ids(message.ids, "ids"))
     values = floats(message.covariance, "covariance")
     if message.joint:
@@ -293,14 +294,14 @@ def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray,
 
 LandmarkMap = TypeVar("LandmarkMap", m.MapEstimate, m.FusedMap)
 NAMED = 10
-"""Landmarks that are left out are named up to so many."""
+"""Number of omitted landmarks that are named."""
 
 
 def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
-    """A map as every receiver takes it, and in words what it leaves out for that.
+    """The map in a form that every receiver accepts, and in words what it omits for that.
 
-    A joint covariance that rounding has spoilt gives way to the landmarks' own ones; a landmark
-    whose own covariance is none, or whose mean is not finite, is left out.
+    A joint covariance that is not positive definite by rounding is replaced by the landmarks' own
+    ones; a landmark whose own covariance is invalid, or whose mean is not finite, is omitted.
     """
     said = []
     if message.joint and unsound(message) is not None:
@@ -353,7 +354,9 @@ def prior_message(
     members: Sequence[m.VersionEntry] = (),
     heard: int = 0,
 ) -> m.Prior:
-    """The joint marginal of a robot's last fused end pose and the landmarks; of which set."""
+    """The message of a robot's prior: the joint marginal of its last fused end pose and the
+    landmarks, with the members of the set that it contains.
+    """
     return m.Prior(
         stamp_ns=stamp_ns,
         robot=robot,
@@ -376,7 +379,7 @@ def prior_message(
 
 
 def prior_of(message: m.Prior) -> RobotPrior:
-    """A prior as the robot's conditioning takes it."""
+    """The prior in a message, as the robot's conditioning takes it."""
     mean = floats(message.mean, "mean").astype(np.float64)
     covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
     landmark_ids = ids(message.ids, "ids").astype(np.uint32)

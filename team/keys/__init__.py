@@ -1,1 +1,1 @@
-"""Certificates: who is in a team, and the proof of it that each process carries."""
+"""Certificates: the members of a team, and the credentials of each process."""

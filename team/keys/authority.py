@@ -1,8 +1,9 @@
-"""A team's authority: its certificate and key, and the certificates that it gives.
+"""A team's certificate authority: its certificate and key, and the certificates that it issues.
 
-Keys are on the curve P-256. A certificate names its node (CN) and its team (O); the router's also
-the hosts by which it is reached. A node's certificate is for clients alone, so that no robot can
-pass for the router. It is valid from an hour before it was made, since robots' clocks differ.
+Keys are on the curve P-256. A certificate names its node (CN) and its team (O), the router's also
+the host names under which it is reached. A node's certificate is for clients alone, so that no
+robot can pose as the router. It is valid from an hour before its creation, since robots' clocks
+differ.
 """
 
 import os
@@ -32,12 +33,12 @@ CA_KEY = "ca.key"
 AUTHORITY_DAYS = 3650
 SKEW = timedelta(hours=1)
 LOCAL = ("localhost", "127.0.0.1", "::1")
-"""Hosts that every router's certificate is good for."""
+"""Hosts for which every router's certificate is valid."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """What was done: nodes with new certificates, those left as they were, and those revoked."""
+    """The nodes with new certificates, those left unchanged, and the revoked ones."""
 
     roster: Roster
     made: tuple[str, ...]
@@ -57,11 +58,13 @@ def make_keys(
     revoke: Sequence[str] = (),
     now: datetime | None = None,
 ) -> Made:
-    """Make an authority in the folder if there is none, and the certificates that are missing.
+    """Creates an authority in the folder if there is none, and the missing certificates.
 
-    nodes: who is to be in the team. renew: nodes that get a new key and certificate under the same
-    name. revoke: nodes whose name the router is to forget; one that is made again later has another
-    name, so that the old certificate stays worthless. Raises KeysError.
+    nodes: the nodes of the team.
+    renew: nodes that get a new key and certificate under the same name.
+    revoke: nodes whose name the router no longer accepts; a certificate that is issued for one
+        later has another name, so that the old one stays invalid.
+    Raises KeysError.
     """
     now = now or datetime.now(UTC)
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -98,7 +101,7 @@ _Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 
 def _authority(folder: Path, team: str, now: datetime) -> _Authority:
-    """The folder's own, or a new one where there is none."""
+    """The folder's authority, or a new one where there is none."""
     paths = folder / CA, folder / CA_KEY
     if all(path.exists() for path in paths):
         certificate = x509.load_pem_x509_certificate(paths[0].read_bytes())
@@ -219,7 +222,7 @@ def _write_pair(
 
 
 def _write(path: Path, content: bytes) -> None:
-    """In one step, and for the owner's eyes only."""
+    """Writes the file atomically, readable by its owner only."""
     new = path.with_name(f".{path.name}.new")
     new.unlink(missing_ok=True)
     with os.fdopen(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file:

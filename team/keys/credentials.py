@@ -1,7 +1,8 @@
-"""What one process carries: the authority's certificate, its own, and its key; checked on the spot.
+"""The credentials of one process: the authority's certificate, its own, and its key, all checked.
 
-Zenoh tells a client that is refused nothing at all. So everything that can be known without the
-router is looked at before: that the files are there and fit one another, whose they are, and when.
+Zenoh does not report to a refused client why it was refused. Everything that can be checked without
+the router is therefore checked before: that the files exist and fit each other, to which node and
+team they belong, and when they are valid.
 """
 
 import re
@@ -19,13 +20,13 @@ from team.keys.roster import KeysError
 
 CA = "ca.pem"
 SOON = timedelta(days=7)
-"""A certificate that ends within this time is spoken of."""
+"""A certificate that expires within this time leads to a warning."""
 _REMEDY = "make new ones by `teamslam keys` and copy them"
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """The files of one node, which have been checked; ends: when the certificate does."""
+    """The checked files of one node; ends: when the certificate expires."""
 
     node: str
     team: str
@@ -36,14 +37,14 @@ class Credentials:
     readable_by_others: bool = False
 
     def context(self) -> ssl.SSLContext:
-        """A TLS client with these files, as the standard library has it."""
+        """A TLS client context of the standard library with these files."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(self.authority)
         context.load_cert_chain(self.certificate, self.key)
         return context
 
     def warnings(self, now: datetime | None = None) -> list[str]:
-        """What is not wrong yet: it ends soon, or others can read the key."""
+        """Warnings: the certificate expires soon, or other users can read the key."""
         found = []
         if self.ends - (now or datetime.now(UTC)) < SOON:
             found.append(
@@ -58,9 +59,9 @@ class Credentials:
 def credentials_of(
     folder: Path, node: str, team: str | None = None, now: datetime | None = None
 ) -> Credentials:
-    """The node's files in a folder; raises KeysError that names what is wrong and what to do.
+    """Loads and checks a node's files in a folder; raises KeysError with the defect and its remedy.
 
-    team: whose they must be; None: whoever's.
+    team: the team that they must belong to; None: any.
     """
     paths = folder / CA, folder / f"{node}.pem", folder / f"{node}.key"
     for path in paths:
@@ -123,7 +124,7 @@ def _check_fit(
 
 
 def _named(certificate: x509.Certificate) -> tuple[str, str]:
-    """The common name and the team; empty where there is none."""
+    """The common name and the team; empty where the certificate has none."""
     found = []
     for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME):
         values = certificate.subject.get_attributes_for_oid(oid)

@@ -1,8 +1,8 @@
-"""The roster of a team: which nodes have a certificate, and by which common name.
+"""The roster of a team: the nodes with a certificate, and their common names.
 
-A node is one voice: `robot-<name>`, `source-<name>` (the driver of a robot's sensors), `central`,
+A node is one sender: `robot-<name>`, `source-<name>` (the driver of a robot's sensors), `central`,
 `world`, `recorder`, `viewer`, `operator` (the commands of a person: `launch`, `withdraw`),
-`router`, and `replay`, which may say everything and is made only if asked for.
+`router`, and `replay`, which may publish on every key and is created on request only.
 """
 
 import re
@@ -20,12 +20,17 @@ ROBOT = re.compile("[a-z][a-z0-9_]{0,31}")
 
 
 class KeysError(RuntimeError):
-    """Keys that are missing, do not fit, or can not be made: which, and what to do."""
+    """Keys are missing, do not fit, or can not be created; the text says which, and gives the
+    remedy.
+    """
 
 
 class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """nodes: the generation of each node's certificate. hosts: by which the router is reached.
-    revoked: the last generation of each node that was revoked; a later one has another name.
+    """The roster as its file contains it.
+
+    nodes: the generation of each node's certificate.
+    hosts: host names under which the router is reached.
+    revoked: the last revoked generation of each node; a later one has another name.
     """
 
     team: str
@@ -34,7 +39,7 @@ class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     revoked: dict[str, int] = msgspec.field(default_factory=dict)
 
     def common_name(self, node: str) -> str:
-        """By what the router knows the node: its name; after a revocation with a number."""
+        """The name under which the router knows the node: after a revocation with a number."""
         return common_name(node, self.nodes[node])
 
     @property
@@ -55,7 +60,7 @@ def nodes_of(robots: Iterable[str]) -> list[str]:
 
 
 def is_node(text: str) -> bool:
-    """Whether a node can have this name."""
+    """Whether this is a valid name of a node."""
     kind, dash, name = text.partition("-")
     if not dash:
         return text in (*STANDING, REPLAY)
@@ -81,12 +86,12 @@ def load_roster(folder: Path) -> Roster:
 
 
 def roster_bytes(roster: Roster) -> bytes:
-    """As the file has it."""
+    """The contents of the roster's file."""
     return msgspec.json.format(msgspec.json.encode(roster, order="deterministic"), indent=2) + b"\n"
 
 
 def chosen(nodes: Sequence[str], roster: Roster) -> list[str]:
-    """The named nodes, `all` for every one; raises KeysError for one that has no certificate."""
+    """The named nodes, `all` for every one; raises KeysError for one without a certificate."""
     if "all" in nodes:
         return sorted(roster.nodes)
     for node in nodes:

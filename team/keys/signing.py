@@ -1,7 +1,7 @@
-"""Signatures by a node's own key: what one robot has said, a third one can carry and all can check.
+"""Signatures by a node's own key: any peer can relay a robot's message, and all can verify it.
 
-ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member; checked by
-the node's certificate, which the team's authority has issued.
+ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member; verified
+with the node's certificate, which the team's authority has issued.
 """
 
 import re
@@ -21,7 +21,7 @@ _ALGORITHM = ec.ECDSA(hashes.SHA256())
 
 
 class Signer:
-    """Signs as one node, and knows what the team's authority has issued.
+    """Signs as one node, and verifies certificates that the team's authority has issued.
 
     certificate: the node's own, DER. Raises KeysError for a key of another kind.
     """
@@ -37,15 +37,15 @@ class Signer:
         self.certificate = found.public_bytes(serialization.Encoding.DER)
 
     def sign(self, named: bytes) -> bytes:
-        """The signature of what these bytes name."""
+        """The signature of the member with this name."""
         return self._key.sign(self._team.encode() + b"\0" + named, _ALGORITHM)
 
     def refusal(self, node: str, certificate: bytes) -> str | None:
-        """Why a certificate is not the node's, in words; None: it is."""
+        """Why a certificate is not a valid one of the node, in words; None if it is."""
         return _refusal(self._authority, self._team, node, certificate)
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
-        """Whether the holder of a certificate's key has signed what the bytes name."""
+        """Whether the signature of this name was made with the key of the certificate."""
         try:
             key = x509.load_der_x509_certificate(certificate).public_key()
             if not isinstance(key, ec.EllipticCurvePublicKey):

@@ -1,1 +1,1 @@
-"""MCAP: the only folder that imports `mcap`; it stores wire bytes as they came."""
+"""MCAP logs: the only folder that imports `mcap`; it stores the wire's bytes unchanged."""

@@ -1,4 +1,4 @@
-"""Check: whether a log is whole, complete and sound; every finding one line."""
+"""Checks a log: whether it is whole, complete and sound; each finding is one line."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -19,11 +19,11 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
 FILE = "file"
-"""Where a finding is that no key has."""
+"""The place of a finding that belongs to no key."""
 
 
 class Finding(NamedTuple):
-    """What is wrong, and where: a key, or `FILE`."""
+    """A defect of a log, and its place: a key, or `FILE`."""
 
     where: str
     what: str
@@ -33,11 +33,12 @@ class Finding(NamedTuple):
 
 
 def checked(log: Log) -> list[Finding]:
-    """Everything that is wrong with a log: file, schemas, counters, messages; none if it is sound.
+    """All defects of a log: of the file, its schemas, counters and messages; none if the log is
+    sound.
 
-    What is missing is known by the measurements' and submaps' own numbers, the streams' ends, the
-    counters of each key, and what the processes said at their ends (`holes`). Memory: 16 bytes a
-    message, and one chunk.
+    Missing messages are recognised by the numbers of measurements and submaps, the ends of the
+    streams, the counters of each key, and the totals that processes publish when they end
+    (`holes`). Memory: 16 bytes a message, and one chunk.
     """
     found = _of_file(log)
     evidence = _Evidence(part=_noted(log, CUT))
@@ -64,10 +65,10 @@ def checked(log: Log) -> list[Finding]:
 
 
 def holes(log: Log) -> list[Finding]:
-    """What a log lacks, or has twice; nothing of one that has every message.
+    """The messages that a log lacks or has twice; empty for a complete log.
 
     Liveliness and the recorder's own messages are not published on a counted key: their counters
-    are not looked at.
+    are ignored.
     """
     evidence = _Evidence(part=_noted(log, CUT))
     damaged = []
@@ -82,7 +83,7 @@ def holes(log: Log) -> list[Finding]:
 
 @dataclass
 class _Evidence:
-    """What the samples of a log say of those that are missing."""
+    """The evidence about missing samples in the samples of a log."""
 
     part: bool
     inventory: Inventory = field(default_factory=Inventory)
@@ -114,7 +115,9 @@ class _Evidence:
                 self.tallies[key].append(TallyCount(message.since_ns, sample.wall_ns, count))
 
     def findings(self) -> Iterator[Finding]:
-        """By key; of a part of a log only what is missing between two messages of a publisher."""
+        """The findings by key; for a part of a log only the gaps between two messages of a
+        publisher.
+        """
         for key in sorted(self.counters.keys() | self.tallies.keys()):
             row = ch.channel_of(key)
             if row is not None and (row[0] is ch.ALIVE or row[1] == "recorder"):
@@ -139,7 +142,7 @@ class _Evidence:
 
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _OF_AN_END = (ch.ROBOT_DONE, ch.FINAL_MAP)
-"""Who says this has heard of the end of the streams."""
+"""Channels whose publisher has received the end of the streams."""
 NO_END = "missing: how many measurements there were is not known"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
 
@@ -165,5 +168,5 @@ def _unsound(sample: Sample) -> str | None:
 
 
 def _noted(log: Log, note: str) -> bool:
-    """Whether the metadata has this note, of the log or of one that it was merged from."""
+    """Whether the metadata has this note, for the log or for one that it was merged from."""
     return any(name.partition("@")[0] == note for name in log.metadata)

@@ -1,8 +1,8 @@
-"""The counters of one key: which publications a log lacks, has twice, or has out of order.
+"""The counters of one key: the publications that a log lacks, has twice, or has out of order.
 
-A publisher counts what it publishes on a key from 0, and its wall clock ascends with the count. So
-in the order of the wall clock a step of more than one is a gap, and a step back, or none, is a
-publisher that was started again.
+A publisher counts its publications on a key from 0, and its wall clock increases with the counter.
+In the order of the wall clock, a step of more than one is therefore a gap, and a step back, or of
+zero, is a restart of the publisher.
 """
 
 from array import array
@@ -17,7 +17,9 @@ from team.wire.bus import NO_COUNTER, Sample
 
 
 class TallyCount(NamedTuple):
-    """A publisher's last word on a key: how many it published, between which wall clocks [ns]."""
+    """A publisher's final total for a key: number of publications, first and last wall clock
+    [ns].
+    """
 
     since_ns: int
     until_ns: int
@@ -27,7 +29,8 @@ class TallyCount(NamedTuple):
 class Counters:
     """The counters and wall clocks [ns] of one key's samples in the order of the file: 16 B each.
 
-    Two publications of one life at equal wall clocks are in the order of their counters.
+    Two publications of one life of the publisher at equal wall clocks are in the order of their
+    counters.
     """
 
     def __init__(self) -> None:
@@ -35,18 +38,19 @@ class Counters:
         self._walls = array("q")
 
     def take(self, sample: Sample) -> None:
-        """Note one more."""
+        """Adds the counter of one more sample."""
         self._counters.append(sample.counter)
         self._walls.append(min(sample.wall_ns, 2**63 - 1))
 
     def findings(
         self, *, part: bool, numbered: bool = False, tallies: Sequence[TallyCount] = ()
     ) -> list[str]:
-        """What is wrong, one line each; nothing of a sound key.
+        """The defects, one line each; empty for a sound key.
 
-        part: the log is a cut, so that what a publisher said before it began is no loss. numbered:
-        the messages have numbers of their own, so that what is missing is known by these. tallies:
-        what its publishers said at their ends. Order is not looked at: what was asked for is late.
+        part: the log is a cut, so that publications before its beginning are not missing.
+        numbered: the messages have numbers of their own, by which missing ones are recognised.
+        tallies: the final totals of its publishers. Order is not checked: replies to requests
+            arrive late.
         """
         counters, walls = (np.frombuffer(each, np.int64) for each in (self._counters, self._walls))
         order = np.lexsort((counters, walls))
@@ -71,7 +75,7 @@ class Counters:
 
 
 def _gaps(counters: Int64[np.ndarray, " n"], *, part: bool) -> list[tuple[int, int]]:
-    """The intervals of counters that are not there; a step back begins again at 0."""
+    """The missing intervals of counters; after a step back counting begins again at 0."""
     before = np.concatenate([[-1], counters[:-1]])
     begins = counters <= before
     begins[:1] = True

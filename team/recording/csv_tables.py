@@ -1,6 +1,6 @@
-"""A log as CSV: one table per channel, numbers that read back exactly.
+"""Exports a log as CSV: one table per channel, with numbers that can be read back exactly.
 
-An array is its numbers with spaces between them, a digest hexadecimal, a list or a table JSON.
+An array is a list of numbers separated by spaces, a digest hexadecimal, a list or a table JSON.
 """
 
 import csv
@@ -19,7 +19,7 @@ from team.wire.messages import Digest, Message
 
 
 def export_csv(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
-    """Write `<channel>.csv` of each channel (of all without) that has a message into `folder`.
+    """Writes `<channel>.csv` for each of the channels (None: all) that has a message into `folder`.
 
     Raises `LogError` for a damaged log, OSError where the folder can not be written.
     """

@@ -1,4 +1,4 @@
-"""Cut: a stretch of team time or some channels of a log, as a log of its own."""
+"""Cuts an interval of team time, or some channels, out of a log, into a log of its own."""
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -10,12 +10,12 @@ from team.wire import channels as ch
 from team.wire.bus import Sample
 
 CUT = "cut"
-"""The metadata that says that a log is a part of another, and which."""
+"""Name of the metadata that marks a log as a part of another one, and names that one."""
 STANDING = frozenset(
     channel.name
     for channel in (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.WORLD_CONFIG, ch.TRUTH_LANDMARKS)
 )
-"""Channels whose messages hold from when they are said: a cut keeps those from before it."""
+"""Channels whose messages stay valid: a cut contains those from before its beginning, too."""
 
 
 def cut(
@@ -25,12 +25,13 @@ def cut(
     to_s: float | None = None,
     channels: Collection[ch.Channel] | None = None,
 ) -> int:
-    """Write the samples of [from_s, to_s) on these channels to a new log `out`; how many.
+    """Writes the samples of [from_s, to_s) on these channels to a new log `out`; returns their
+    number.
 
-    Seconds of team time since the first measurement; None: no bound. So adjoining cuts part a log.
-    Of `STANDING` channels what was said before from_s is kept, too. The metadata is kept, with a
-    note of the cut. Raises `LogError` when nothing is left or the log is damaged, before `out` is
-    made, and `RecorderError` when `out` exists.
+    Times are seconds of team time since the first measurement; None: no bound. Adjacent cuts
+    therefore partition a log. Messages of `STANDING` channels from before from_s are written, too.
+    The metadata is copied, with a note of the cut. Raises `LogError` when no sample is left or the
+    log is damaged, before `out` is created, and `RecorderError` when `out` exists.
     """
     summary = summarised(log)
     if summary.damaged:

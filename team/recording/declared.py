@@ -1,4 +1,4 @@
-"""What a log says of its channels: the encoding and the schema of each key."""
+"""The channels that a log declares: the encoding and the schema of each key."""
 
 import json
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from team.wire.messages import Message, tag_of
 
 
 class Declared(NamedTuple):
-    """A key as a log declares it; without a schema its name is empty."""
+    """A key's declaration in a log; the schema's name is empty where it has none."""
 
     key: str
     encoding: str
@@ -27,7 +27,9 @@ class Declared(NamedTuple):
 
 
 def declared(log: Log) -> dict[str, Declared]:
-    """The declaration of each key, the last where there are several; damaged parts give none."""
+    """The declaration of each key, the last one where there are several; damaged parts are left
+    out.
+    """
     schemas: dict[int, tuple[str, bytes]] = {0: ("", b"")}
     found: dict[str, Declared] = {}
     for frame in _declarations(log):
@@ -47,9 +49,10 @@ def declared(log: Log) -> dict[str, Declared]:
 
 
 def misdeclared(of: Declared) -> str | None:
-    """What is wrong with the declaration of a key; None of a sound one.
+    """The defect of a key's declaration; None for a sound one.
 
-    A version of the program may append fields: of two field lists one begins with the other.
+    A later version of the program may append fields: the shorter of two field lists has to be the
+    beginning of the longer one.
     """
     row = channel_of(of.key)
     if row is None:
@@ -66,7 +69,7 @@ def misdeclared(of: Declared) -> str | None:
 
 
 def _fields(text: bytes, kind: type[Message]) -> list[Any]:
-    """The types of a schema's fields in order; none of what is no schema of this message."""
+    """The types of a schema's fields in order; empty where it is no schema of this message."""
     try:
         fields = json.loads(text)["$defs"][kind.__name__]["prefixItems"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -75,7 +78,7 @@ def _fields(text: bytes, kind: type[Message]) -> list[Any]:
 
 
 def _declarations(log: Log) -> Iterator[Frame]:
-    """Schema and channel records, in chunks or in the index behind them."""
+    """The schema and channel records, in chunks or in the index behind them."""
     wanted = (Opcode.SCHEMA, Opcode.CHANNEL)
     with log.path.open("rb") as file:
         try:

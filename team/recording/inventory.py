@@ -1,8 +1,9 @@
-"""What a log has of each numbered stream, and what is known that it lacks.
+"""The numbered streams of a log: which numbers it contains, and which ones it is known to lack.
 
-A robot's measurements are numbered by its source across all sensor channels, its submaps by itself;
-`world/end`, or each driver's head, says how many measurements there are, `progress` and `done` how
-many there are at least. So what is missing at the end or altogether is known, too.
+A robot's measurements are numbered by their source across all sensor channels, its submaps by the
+robot; `world/end`, or each driver's head, gives the total number of measurements, `progress` and
+`done` a lower bound. Missing numbers are therefore known at the end of a stream, too, and where a
+stream is missing altogether.
 """
 
 import zlib
@@ -21,7 +22,7 @@ from team.wire.codec import WireError
 _HEAD = 128  # bytes of a message: its tag, stamp, robot, incarnation and number are within
 Kind = Literal["measurements", "submaps"]
 _ASKED_FOR = (ch.SIGHTING_FACTOR, ch.FINAL_MAP, *ch.REPLIES[ch.ORDERS_KEPT])
-"""What has no number of its own and is asked for."""
+"""Channels without numbers whose messages are sent as replies."""
 
 
 class Stream(NamedTuple):
@@ -34,10 +35,10 @@ class Stream(NamedTuple):
 
 @dataclass
 class Numbered:
-    """Which numbers of a stream are there: of each a check sum of its payload.
+    """The numbers of a stream that are present, each with a check sum of its payload.
 
-    newest: the last number that is known of. Memory is that of what is there: 4 bytes a number
-    without a gap before it, some more for the others; of what is missing nothing.
+    newest: the last number that is known. Memory is needed for present numbers only: 4 bytes for a
+        number without a gap before it, somewhat more for the others.
     """
 
     newest: int = -1
@@ -48,11 +49,11 @@ class Numbered:
 
     @property
     def whole(self) -> int:
-        """All numbers before this one are there."""
+        """The number up to which, exclusively, all numbers are present."""
         return len(self._sums)
 
     def take(self, number: int, payload: bytes) -> bool:
-        """Note a payload; False if it is there already, with the same content."""
+        """Adds a payload; returns False if it is present already, with the same content."""
         found = zlib.crc32(payload)
         there = self._sums[number] if number < self.whole else self._beyond.get(number)
         if there is not None:
@@ -66,12 +67,12 @@ class Numbered:
         return True
 
     def know(self, newest: int) -> None:
-        """Somebody has said that there is this number."""
+        """Records that a message has mentioned this number."""
         self.newest = max(self.newest, newest)
 
     @property
     def missing(self) -> list[tuple[int, int]]:
-        """The intervals that are known of and not there."""
+        """The intervals of numbers that are known and missing."""
         here = sorted(self._beyond)
         begins = [self.whole, *(number + 1 for number in here)]
         ends = [*(number - 1 for number in here), self.newest]
@@ -82,7 +83,7 @@ class Numbered:
 class Inventory:
     """The numbered streams of a log, sample by sample.
 
-    has_earlier_parts: the log has earlier parts, whose messages may come again.
+    has_earlier_parts: whether the log has earlier parts, whose messages may be repeated.
     """
 
     has_earlier_parts: bool = False
@@ -91,12 +92,14 @@ class Inventory:
     _contents: set[int] = field(default_factory=set, init=False)
 
     def remember(self, sample: Sample) -> None:
-        """Note a sample of an earlier part of the log: it may come again."""
+        """Adds a sample of an earlier part of the log, which may be repeated."""
         self._earlier.add(_name(sample))
         self.take(sample)
 
     def is_new(self, sample: Sample) -> bool:
-        """Note a sample; False where it is in the log already, or in an earlier part of it."""
+        """Adds a sample; returns False where it is in the log already, or in an earlier part of
+        it.
+        """
         if self.has_earlier_parts:
             name = _name(sample)
             if name in self._earlier and sample.counter != NO_COUNTER:
@@ -105,7 +108,7 @@ class Inventory:
         return self.take(sample)
 
     def take(self, sample: Sample) -> bool:
-        """Note a sample; False where it is one of a stream that is there already."""
+        """Adds a sample; returns False where its stream contains it already."""
         found = ch.channel_of(sample.key)
         if found is None:
             return True
@@ -150,7 +153,7 @@ class Inventory:
                 pass
 
     def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
-        """How many measurements and submaps there are of each incarnation (robot, incarnation)."""
+        """The numbers of measurements and submaps present, by (robot, incarnation)."""
         found: dict[tuple[str, int], tuple[int, int]] = {}
         for (kind, robot, incarnation), each in self.streams.items():
             measurements, submaps = found.get((robot, incarnation), (0, 0))
@@ -160,18 +163,20 @@ class Inventory:
 
     @property
     def gaps(self) -> dict[Stream, int]:
-        """The first number that is missing of each stream that is not whole."""
+        """The first missing number of each incomplete stream."""
         return {
             name: each.whole for name, each in self.streams.items() if each.newest >= each.whole
         }
 
     def span(self, stream: Stream) -> tuple[int, int]:
-        """The first and the last number that are missing of a stream that is not whole."""
+        """The first and the last missing number of an incomplete stream."""
         missing = self.streams[stream].missing
         return missing[0][0], missing[-1][1]
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """What is missing, or there twice and not the same: a key, and what is wrong with it."""
+        """Missing numbers, and numbers that are present twice with different contents: key and
+        description.
+        """
         for (kind, robot, incarnation), found in sorted(self.streams.items()):
             key = ch.SUBMAP.key(robot) if kind == "submaps" else f"source/{robot}"
             of = f"of {incarnation_named(incarnation)}"
@@ -192,7 +197,7 @@ def incarnation_named(incarnation: int) -> str:
 
 
 SHOWN = 3
-"""Intervals that a finding names; it counts the rest."""
+"""Number of intervals that a finding lists; it counts the others."""
 
 
 def intervals(of: list[tuple[int, int]]) -> str:
@@ -202,8 +207,8 @@ def intervals(of: list[tuple[int, int]]) -> str:
 
 
 def numbered_in(payload: bytes) -> tuple[int, int] | None:
-    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …]; None: it is
-    no such.
+    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …]; None for
+    others.
     """
     unpacker = msgpack.Unpacker()
     unpacker.feed(payload[:_HEAD])

@@ -1,8 +1,9 @@
-"""The last words of a log's processes: whose end is not known, so that its tail may be missing.
+"""Finds the processes of a log that ended without announcing it, so that messages may be missing.
 
-A process counts what it publishes and says at its end how much that was (`Tally`). One that was
-killed says nothing: what it had published last may never have left its machine, and no counter that
-arrived tells of it. Each life of a process counts its statuses from 0, so its lives are known.
+A process counts its publications and publishes the totals when it ends (`Tally`). A process that
+was killed does not: its last publications may never have left its machine, and no received counter
+shows that. Each process counts its statuses from 0, which separates the lives of a restarted
+process.
 """
 
 from collections import defaultdict
@@ -15,11 +16,11 @@ from team.wire.bus import NO_COUNTER, Sample
 from team.wire.messages import Tally
 
 MISSING = "missing: "
-"""How the recorder's last word on what it lacks begins."""
+"""Beginning of the recorder's last note, which lists what it lacks."""
 
 
 class _Spoke(NamedTuple):
-    """A status: the publisher's wall clock [ns], its counter, the team time [ns]."""
+    """One status: the publisher's wall clock [ns], its counter, the team time [ns]."""
 
     wall_ns: int
     counter: int
@@ -28,24 +29,24 @@ class _Spoke(NamedTuple):
 
 @dataclass
 class LastWords:
-    """The statuses and last words of each process of a log; 24 bytes a status and more."""
+    """The statuses and final totals of each process of a log; 24 bytes a status and more."""
 
     _spoke: dict[str, list[_Spoke]] = field(default_factory=lambda: defaultdict(list))
     _ended: dict[str, list[tuple[int, int]]] = field(default_factory=lambda: defaultdict(list))
 
     def take_status(self, node: str, sample: Sample) -> None:
-        """Note that a node was there."""
+        """Adds a status of a node."""
         if sample.counter != NO_COUNTER:
             self._spoke[node].append(_Spoke(sample.wall_ns, sample.counter, sample.stamp_ns))
 
     def take_tally(self, tally: Tally, wall_ns: int) -> None:
-        """Note how a process ended: between which wall clocks it was there."""
+        """Adds the final totals of a process; wall_ns: their wall clock [ns]."""
         self._ended[tally.node].append((tally.since_ns, wall_ns))
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """A key, and what is not known of its process; nothing where no process says how it ends.
+        """A key, and what is unknown about its process; empty where no process published totals.
 
-        A log of nodes in memory has no last words at all.
+        A log of nodes in memory has no such totals.
         """
         if not self._ended:
             return
@@ -62,7 +63,7 @@ class LastWords:
 
 
 def _lives(spoke: list[_Spoke]) -> Iterator[list[_Spoke]]:
-    """The statuses of each process in turn: each counts from the beginning."""
+    """The statuses of one process after the other: each counts from 0."""
     life: list[_Spoke] = []
     for each in spoke:
         if life and each.counter <= life[-1].counter:

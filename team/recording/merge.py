@@ -1,4 +1,4 @@
-"""Merge: the logs of several robots, or the parts of one, as one log."""
+"""Merges the logs of several robots, or the parts of one log, into one log."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -12,25 +12,25 @@ from team.wire.channels import SENSORS, SIGHTING_FACTOR, SUBMAP, channel_of
 
 _BY_CONTENT = (*SENSORS, SUBMAP, SIGHTING_FACTOR)
 MERGED = "merged"
-"""The metadata that names what a log was merged from."""
+"""Name of the metadata that lists the logs that a log was merged from."""
 
 
 class Merged(NamedTuple):
-    """Messages in the new log, and duplicates that are not."""
+    """Number of messages in the new log, and of duplicates that were left out."""
 
     messages: int
     duplicates: int
 
 
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
-    """Write every sample of the logs once to a new log `out`, by team time.
+    """Writes each sample of the logs once to a new log `out`, in the order of team time.
 
-    Equal stamps stay in the order of the logs and of each file. Equal key, counter, wall clock and
-    payload is one publication that several recorders took; a robot that was started again announces
-    the same configuration by another. A measurement, a submap and an inter-robot measurement are
-    what they are by their content: one recorder may have had to ask for what another heard. All
-    samples are in memory at once. Raises `LogError` where the logs are of different teams or one is
-    damaged, before `out` is made, and `RecorderError` when `out` exists.
+    Equal stamps stay in the order of the logs and of each file. Samples of equal key, counter, wall
+    clock and payload are one publication that several recorders wrote; a restarted robot announces
+    the same configuration once more. Measurements, submaps and inter-robot measurements are
+    identified by their content, since one recorder may have requested what another one received.
+    All samples are in memory at once. Raises `LogError` where the logs are of different teams or
+    one is damaged, before `out` is created, and `RecorderError` when `out` exists.
     """
     first = logs[0]
     for log in logs[1:]:
@@ -45,7 +45,7 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
 
 
 def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
-    """What the logs that have it agree on, as it is; the rest as `name@file` of each log.
+    """The entries on which all logs that have them agree; the others as `name@file` for each log.
 
     Logs of equal file names are numbered: `name@1:file`.
     """

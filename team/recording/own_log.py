@@ -1,4 +1,4 @@
-"""A process's own log: what it publishes and receives, whatever becomes of the team's recorder."""
+"""A process' own log: its publications and received samples, independent of the team's recorder."""
 
 import logging
 from collections.abc import Iterator
@@ -12,14 +12,14 @@ from team.recording.recorder import Recorder, RecorderError
 from team.wire.bus import Sample
 
 OWN = "own_log"
-"""The metadata that says that a log is of what one process heard."""
+"""Name of the metadata that marks a log as the samples of a single process."""
 _LOG = logging.getLogger("teamslam")
 
 
 class OwnLog:
-    """Writes samples to a log, each once, and knows what a death has cost it: a bus's `Tap`.
+    """Writes samples to a log, each once, and knows what was lost in a crash: a bus's `Tap`.
 
-    failed: it can not be written any more, which was said.
+    failed: whether the log could not be written any more, which was reported.
     """
 
     def __init__(self, recorder: Recorder, inventory: Inventory) -> None:
@@ -28,7 +28,7 @@ class OwnLog:
         self.failed = False
 
     def __call__(self, samples: list[Sample]) -> None:
-        """Write what of these is new."""
+        """Writes those samples that are new."""
         if self.failed:
             return
         try:
@@ -38,9 +38,11 @@ class OwnLog:
             _LOG.error("its own log is not written any more: %s", error)
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Measurements of a robot that are known of and not in the log: incarnation, first, last.
+        """Measurements of a robot that are known and not in the log: incarnation, first, last
+        number.
 
-        What a killed process had not flushed; its robot may have used it, and not ask for it again.
+        A killed process loses what it had not flushed; its robot may have used these measurements,
+        and then does not request them again.
         """
         if self.failed:
             return []
@@ -54,10 +56,10 @@ class OwnLog:
 
 @contextmanager
 def own_log(path: Path, team: str) -> Iterator[OwnLog]:
-    """What writes samples to the log; started again it goes on in a further part.
+    """A context that writes samples to the log; after a restart it continues in a further part.
 
-    A log that can not be written is named and left: the process goes on. Raises `RecorderError`
-    where there can be none at `path`.
+    A log that can not be written any more is reported and abandoned: the process goes on. Raises
+    `RecorderError` where no log can be created at `path`.
     """
     recorder, inventory = next_part(path, team, {**provenance(), OWN: path.name})
     own = OwnLog(recorder, inventory)

@@ -1,4 +1,4 @@
-"""A log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and the like.
+"""Exports a log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and the like.
 
 Arrays are lists of numbers, a digest is hexadecimal, a list or a table of parts JSON. pyarrow is
 the extra `parquet`: only this module imports it, and only when it is called.
@@ -19,11 +19,13 @@ from team.wire.messages import Digest, Message
 
 GROUP_ROWS = 20_000
 GROUP_BYTES = 32 * 2**20
-"""A row group is written when it has so many rows, or messages of so many payload bytes."""
+"""Payload bytes of the messages in a row group; a group is also written when its rows are
+complete.
+"""
 
 
 class _Table:
-    """One channel's file: rows are gathered by column and written as row groups."""
+    """One channel's file: rows are collected by column and written as row groups."""
 
     def __init__(self, path: Path, kind: type[Message]) -> None:
         import pyarrow as pa

@@ -1,8 +1,8 @@
-"""A log in parts: a recorder that is started again goes on in a further file.
+"""A log in parts: a restarted recorder continues in a further file.
 
 `log.mcap` is the first part, `log.part2.mcap` the second. When the run has ended they are joined,
-in the order of arrival, and `log.mcap` is the whole; where the disk has no room for that they stay,
-and `teamslam log merge` joins them elsewhere.
+in the order of arrival, and `log.mcap` is the complete log; where the disk has no room for that the
+parts remain, and `teamslam log merge` joins them elsewhere.
 """
 
 import shutil
@@ -18,9 +18,9 @@ from team.recording.repair import salvaged
 from team.wire.channels import FINAL_MAP, TEAM_FINAL
 
 LONGEST_AWAY_S = 3600.0
-"""A recorder is not started again later than this; the log is of another run then."""
+"""Time [s] after which a recorder does not continue a log: it is then taken for another run's."""
 ROOM = 16 * 2**20
-"""Bytes that must be free beyond what is to be written."""
+"""Bytes that must remain free on the disk."""
 JOINING = ".joining"
 
 
@@ -30,7 +30,7 @@ def part_of(path: Path, number: int) -> Path:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The parts of a log that are there."""
+    """The existing parts of a log."""
     found = []
     number = 1
     while (part := part_of(path, number)).exists():
@@ -40,9 +40,9 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def check_continues(path: Path, team: str, metadata: Mapping[str, str]) -> None:
-    """Raise `LogError` unless the log at `path` is of this very run and not finished.
+    """Raises `LogError` unless the log at `path` is of this same run and not finished.
 
-    Of this run: the same team and scenario, and its last part was written to within the hour.
+    The same run has the same team and scenario, and wrote to the log's last part within the hour.
     """
     parts = parts_of(path)
     away_s = time.time() - parts[-1].stat().st_mtime
@@ -62,9 +62,9 @@ def check_continues(path: Path, team: str, metadata: Mapping[str, str]) -> None:
 
 
 def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recorder, Inventory]:
-    """A recorder of the next part, and what the earlier ones have.
+    """A recorder for the next part, and the inventory of the earlier ones.
 
-    Raises `RecorderError` where there is no room for one, or no right to write it.
+    Raises `RecorderError` where the disk is full or the file can not be created.
     """
     earlier = parts_of(path)
     if earlier and shutil.disk_usage(path.parent).free < ROOM:
@@ -80,7 +80,7 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
 
 
 def inventory_of(parts: Sequence[Path]) -> Inventory:
-    """What these parts have; what of them is damaged is not there."""
+    """The inventory of these parts; damaged chunks are left out."""
     inventory = Inventory(has_earlier_parts=bool(parts))
     for part in parts:
         log = _opened(part)
@@ -92,9 +92,9 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
 
 
 def join(path: Path) -> list[Path]:
-    """Make the parts of a log one; the parts that are left, one if that could be done.
+    """Joins the parts of a log to one; returns the parts that remain, a single one on success.
 
-    What of them is whole is copied in the order of arrival. Where the disk has no room nothing
+    Their undamaged chunks are copied in the order of arrival. Where the disk is full nothing
     changes.
     """
     parts = parts_of(path)
@@ -122,7 +122,7 @@ def join(path: Path) -> list[Path]:
 
 
 def _opened(path: Path) -> Log | None:
-    """None of a part whose recorder ended before it had begun."""
+    """Opens a part; None where its recorder ended before it had begun."""
     with suppress(LogError):
         return open_log(path)
     return None

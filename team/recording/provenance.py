@@ -1,4 +1,6 @@
-"""Where a log came from: what has to be equal for the same bits to come out again."""
+"""The provenance of a log: everything that has to be equal for the same bits to be computed
+again.
+"""
 
 import hashlib
 import subprocess
@@ -14,7 +16,7 @@ _PACKAGES = ("teamslam", "numpy", "scipy", "numba", "llvmlite", "eclipse-zenoh",
 
 
 def provenance() -> dict[str, str]:
-    """Versions, BLAS, CPU and kernels of this process, as a log's metadata carries them."""
+    """Versions, BLAS, CPU and kernels of this process, as they are stored in a log's metadata."""
     cpu_name, cpu_features = _cpu()
     versions = {f"version.{package}": _version(package) for package in _PACKAGES}
     return {
@@ -55,7 +57,7 @@ def git_commit() -> str:
 
 
 def cpu() -> tuple[str, str]:
-    """The processor and its features, as the kernels' compiler sees them."""
+    """The processor and its features, as the kernels' compiler determines them."""
     from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
 
     features = binding.get_host_cpu_features()
@@ -63,7 +65,7 @@ def cpu() -> tuple[str, str]:
 
 
 def _cpu() -> tuple[str, str]:
-    """Asked of a process of its own, unless this one has the compiler: it takes 110 MB."""
+    """Determined in a separate process, unless this one has the compiler, which takes 110 MB."""
     if "llvmlite.binding" in sys.modules:
         return cpu()
     code = f"from {__name__} import cpu; print(*cpu(), sep='\\n')"

@@ -1,4 +1,4 @@
-"""The reader: the samples of a log, also of one whose recorder was killed."""
+"""Reads the samples of a log, also of one whose recorder was killed."""
 
 import os
 import struct
@@ -43,8 +43,8 @@ _MESSAGE = struct.Struct("<HIQQ")
 class Log:
     """A log on disk. `complete` is False when its recorder did not finish it.
 
-    `metadata` is its provenance, `team` the team's name. An incomplete log reads up to the last
-    chunk that is whole.
+    `metadata` is its provenance, `team` the team's name. An incomplete log is read up to its last
+    whole chunk.
     """
 
     path: Path
@@ -53,9 +53,10 @@ class Log:
     metadata: dict[str, str] = field(repr=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
-        """Samples in the order of the file, of the given channels (all without); `LogError`.
+        """The samples of the given channels (None: all) in the order of the file; raises
+        `LogError`.
 
-        A counter comes back modulo 2³², a stamp before zero as it was.
+        A counter is returned modulo 2³², a stamp before zero with its true value.
         """
         for chunk in self.chunks(channels):
             if isinstance(chunk, DamagedChunkError):
@@ -63,7 +64,9 @@ class Log:
             yield from chunk
 
     def in_time_order(self, channels: Collection[Channel] | None = None) -> list[Sample]:
-        """Samples by team time, equal stamps in the order of the file; all in memory."""
+        """The samples in the order of team time, equal stamps in that of the file; all in
+        memory.
+        """
         return sorted(self.samples(channels), key=lambda sample: sample.stamp_ns)
 
     def counts(self) -> dict[str, Count]:
@@ -109,7 +112,9 @@ class Log:
     def samples_in(
         self, frame: Frame, keys: dict[int, str | None], names: set[str] | None = None
     ) -> list[Sample]:
-        """The samples of a chunk, on channels of these names; `keys` learns what it introduces."""
+        """The samples of a chunk, on channels of these names; channels that it declares are added
+        to `keys`.
+        """
         samples = []
         for record in records(expanded(frame.body)):
             if record.opcode == Opcode.CHANNEL:

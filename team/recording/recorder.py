@@ -1,10 +1,10 @@
-"""The recorder: samples into an MCAP file, their payload bytes as they came.
+"""Writes samples into an MCAP file, with their payload bytes unchanged.
 
-Channel: the full key, encoding `msgpack`, the JSON Schema of its message; of a view, encoding and
-schema of the tools that draw it. Log time: team time.
-Publish time: the publisher's wall clock. Sequence: its counter modulo 2³². MCAP's times are
-unsigned: a stamp before zero is logged at zero, and its true value stays in the payload, where the
-reader takes it from. Who wrote the log and how stands in the metadata record "teamslam".
+Channel: the full key, encoding `msgpack`, the JSON Schema of its message; for a view, encoding and
+    schema of the tools that draw it. Log time: team time. Publish time: the publisher's wall clock.
+    Sequence: its counter modulo 2³². MCAP's times are unsigned: a stamp before zero is logged at
+    zero; the reader takes its true value from the payload. The metadata record "teamslam" describes
+    the run and the program that wrote the log.
 """
 
 import threading
@@ -25,9 +25,11 @@ from team.wire.codec import tag_in
 
 METADATA = "teamslam"
 CHUNK_NS = 500_000_000
-"""Of recorded time (the publishers' wall clocks) in one chunk, as a flipped bit costs a chunk …"""
+"""Largest span of recorded time (the publishers' wall clocks) in one chunk, since a flipped bit
+costs a chunk …
+"""
 CHUNK_LEAST = 16
-"""… or so many messages."""
+"""… unless the chunk has fewer messages than this."""
 FLUSH_S = 0.5
 """Seconds between flushes: what a killed recorder can lose."""
 
@@ -37,14 +39,14 @@ class RecorderError(RuntimeError):
 
 
 class Count(NamedTuple):
-    """What is in the log of one key."""
+    """Number and bytes of the messages of one key in the log."""
 
     messages: int
     bytes: int
 
 
 class Recorder:
-    """Writes one log, on a thread of its own; what goes wrong there is raised by the next call.
+    """Writes one log, on a thread of its own, whose errors are raised by the next call.
 
     Raises `RecorderError` when the file can not be created; it never overwrites one.
     """
@@ -78,7 +80,7 @@ class Recorder:
         self.close()
 
     def write(self, samples: Iterable[Sample]) -> None:
-        """Hand samples over to the writing thread; raises `RecorderError` once it has failed."""
+        """Queues samples for the writing thread; raises `RecorderError` once that has failed."""
         self._check()
         if self._closed:
             raise RecorderError(f"{self.path} is closed")
@@ -90,11 +92,11 @@ class Recorder:
         return dict(self._counts)
 
     def waiting(self) -> int:
-        """Samples that are handed over and not written yet."""
+        """Number of samples that are queued and not written yet."""
         return self._queue.qsize()
 
     def close(self) -> None:
-        """Write what is handed over, then the index; raises `RecorderError` if that failed."""
+        """Writes the queued samples, then the index; raises `RecorderError` if that failed."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)
@@ -134,10 +136,10 @@ class Recorder:
                 flushed, unflushed = time.monotonic(), False
 
     def _bound_chunk(self, sample: Sample) -> None:
-        """End the chunk before it spans more than CHUNK_NS of recorded time.
+        """Ends the chunk before it spans more than CHUNK_NS of recorded time.
 
-        A flipped bit costs a chunk. What comes late, out of its time, may make a chunk of
-        CHUNK_LEAST messages longer.
+        A flipped bit costs a chunk. Late samples, out of their order, may make a chunk of
+        CHUNK_LEAST messages span more.
         """
         first, last = self._span
         first, last = min(first, sample.wall_ns), max(last, sample.wall_ns)
@@ -164,7 +166,9 @@ class Recorder:
         self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
     def _tag(self, sample: Sample) -> str:
-        """Of a key that carries several kinds of messages, that of this one: each is declared."""
+        """The tag of the message, on a key with several types of messages: each type is
+        declared.
+        """
         found = channel_of(sample.key)
         if found is None or not found[0].alternatives:
             return ""
@@ -182,7 +186,9 @@ class Recorder:
 
 
 def _opened_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:
-    """A writer that has written its head and the metadata, so that a killed log has them."""
+    """A writer that has written its header and the metadata, so that a log whose recorder is killed
+    has them.
+    """
     writer = Writer(file)
     try:
         writer.start(profile="teamslam")

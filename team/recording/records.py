@@ -1,7 +1,7 @@
-"""The records of an MCAP file, one after another, as an untrusted input has to be read.
+"""Reads the records of an MCAP file, one after another, as untrusted input.
 
-Every length is checked before it is believed, every chunk's CRC is checked, and a chunk that claims
-to expand beyond what the recorder can have written is refused before it is expanded.
+Every length and every chunk's CRC is checked before use, and a chunk that claims a larger expanded
+size than a recorder can have written is refused before it is expanded.
 """
 
 import os
@@ -23,30 +23,40 @@ from mcap.writer import MCAP0_MAGIC
 from team.wire.codec import LARGEST_PAYLOAD
 
 LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
-"""Bytes of one chunk, expanded: the largest message behind a chunk that was almost full."""
+"""Largest size in bytes of an expanded chunk: the largest message behind a chunk that was almost
+full.
+"""
 LARGEST_RATIO = 10_000
-"""Of expanded to compressed bytes; a map of zeros reaches a thousand, a bomb ten thousands."""
+"""Largest ratio of expanded to compressed bytes; a map of zeros reaches a thousand, a decompression
+bomb ten thousands.
+"""
 MOST_RECORDS = 250_000
-"""Records of one chunk: a recorder's chunk of a MiB has 34 000 of the smallest messages."""
+"""Largest number of records of a chunk: a recorder's chunk of one MiB has 34 000 of the smallest
+messages.
+"""
 _FRAME = struct.Struct("<BQ")
 _BLOCK = 2**20
 _AHEAD = 4096
 _OPCODES = frozenset((*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)))
 _LENGTHS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
-"""Of what ends a file: a flipped bit makes a chunk one of them."""
+"""Sizes of the records at the end of a file: a flipped bit can turn a chunk's opcode into one of
+them.
+"""
 _COMPRESSION = b"\x04\0\0\0zstd"
-"""In the head of each chunk that a recorder of ours writes …"""
+"""Bytes in the head of each chunk that our recorder writes …"""
 _TO_COMPRESSION = _FRAME.size + 28
-"""… behind its opcode, length, two times, its size and its checksum."""
+"""… and their distance from its beginning: opcode, length, two times, size and checksum."""
 FRAME_SIZE = _FRAME.size
 FOOTER_SIZE = FRAME_SIZE + 20
 MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
-"""What mcap raises where a record is not what its opcode says."""
+"""The exceptions of mcap for a record whose content does not fit its opcode."""
 REPAIR = "`teamslam repair` saves the rest"
 
 
 class LogError(ValueError):
-    """A file that is no log of ours, or a damaged one: which file, what is wrong, what to do."""
+    """A file that is no log of ours, or a damaged one: gives the file, the defect and the
+    remedy.
+    """
 
     def __init__(self, path: Path, what: str, remedy: str) -> None:
         super().__init__(f"{path}: {what}; {remedy}")
@@ -56,11 +66,11 @@ class LogError(ValueError):
 
 
 class DamagedChunkError(LogError):
-    """One chunk can not be read; what comes after it can, by `Log.chunks`."""
+    """One chunk can not be read; later ones can, by `Log.chunks`."""
 
 
 class Frame(NamedTuple):
-    """One record: where it begins, what it is, and its bytes."""
+    """One record: its position, its opcode and its bytes."""
 
     offset: int
     opcode: int
@@ -68,14 +78,14 @@ class Frame(NamedTuple):
 
 
 def index(file: IO[bytes], path: Path) -> Iterator[Frame]:
-    """The records of the summary section; the footer says where it starts (0: there is none)."""
+    """The records of the summary section, which begins where the footer says (0: there is none)."""
     file.seek(_FRAME.size - FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
     (start,) = struct.unpack("<Q", file.read(8))
     return frames(file, path, start) if start else iter(())
 
 
 def index_damage(file: IO[bytes]) -> str | None:
-    """What is wrong with the index of a complete file; None when its CRC is that of its bytes.
+    """The defect of a complete file's index; None when its CRC fits its bytes.
 
     The CRC spans the summary section and the footer up to the CRC itself; 0: none was written.
     """
@@ -95,10 +105,10 @@ def index_damage(file: IO[bytes]) -> str | None:
 
 
 def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
-    """The whole records of the file from `start`; a record that is cut off is the end.
+    """The whole records of the file from `start`; a record that is cut off ends it.
 
-    Where what should be a record is none, its length or the one before it is damaged: it goes on at
-    the next chunk that can be found.
+    Where the bytes at a record's place are no record, its length or the one before it is damaged:
+    reading continues at the next chunk that can be found.
     """
     size = os.fstat(file.fileno()).st_size
     if start > size:
@@ -123,7 +133,7 @@ def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterat
 
 
 def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
-    """Where the next chunk record begins, by what its head looks like."""
+    """Position of the next chunk record, recognised by the bytes of its head."""
     file.seek(start)
     kept, begin, ahead = b"", start, _AHEAD
     while block := file.read(ahead):
@@ -143,9 +153,10 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
 
 
 def records(data: bytes) -> Iterator[Frame]:
-    """The records of an expanded chunk; ValueError where one ends beyond it or there are too many.
+    """The records of an expanded chunk; raises ValueError where one exceeds it or there are too
+    many.
 
-    Small records grow many times as Python's objects, so their number is bounded as the bytes are.
+    Small records take many times their size as Python objects, so their number is bounded as well.
     """
     starts: list[int] = []
     offset, size = 0, len(data)
@@ -163,8 +174,8 @@ def records(data: bytes) -> Iterator[Frame]:
 def expanded(body: bytes) -> bytes:
     """The records in a chunk record's body.
 
-    Raises ValueError before anything is expanded that can not be ours, one of `MALFORMED` where
-    the body is no chunk, `ZstdError` where it is damaged.
+    Raises ValueError, before anything is expanded, for a body that our recorder can not have
+    written; one of `MALFORMED` where it is no chunk; `ZstdError` where it is damaged.
     """
     chunk = cast(Chunk, Chunk.read(ReadDataStream(BytesIO(body))))
     size, packed = chunk.uncompressed_size, len(chunk.data)

@@ -1,4 +1,6 @@
-"""Repair: what is whole in a damaged or unfinished log, in a new and complete one."""
+"""Repairs a log: copies the undamaged chunks of a damaged or unfinished log to a new, complete
+one.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +12,9 @@ from team.wire.bus import Sample
 
 
 class Report(NamedTuple):
-    """What was saved: messages, the newest team time among them [ns], chunks that were not."""
+    """The result of a repair: messages copied, newest team time among them [ns], chunks that were
+    lost.
+    """
 
     messages: int
     until_ns: int | None
@@ -18,7 +22,9 @@ class Report(NamedTuple):
 
 
 def salvaged(log: Log) -> Iterator[list[Sample] | LogError]:
-    """Every whole chunk's samples; in the place of what is damaged, its error. Never raises it."""
+    """The samples of every undamaged chunk; in the place of a damaged one its error, which is not
+    raised.
+    """
     try:
         yield from log.chunks()
     except LogError as error:  # nothing behind this place can be found any more
@@ -26,9 +32,9 @@ def salvaged(log: Log) -> Iterator[list[Sample] | LogError]:
 
 
 def repaired(path: str | Path, out: str | Path) -> Report:
-    """Copy every whole chunk of the log at `path` to a new, complete log `out`.
+    """Copies every undamaged chunk of the log at `path` to a new, complete log `out`.
 
-    The metadata is kept. Raises `LogError` when `path` is no log, `RecorderError` when `out`
+    The metadata is copied. Raises `LogError` when `path` is no log, `RecorderError` when `out`
     exists.
     """
     log = open_log(path)

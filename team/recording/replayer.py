@@ -1,4 +1,4 @@
-"""When a log's samples are to be published again: a function of their stamps alone."""
+"""The times at which a log's samples are published again: a function of their stamps alone."""
 
 from collections.abc import Iterable, Iterator
 
@@ -6,11 +6,11 @@ from team.wire.bus import Sample
 
 
 def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:
-    """(delay [s] after the one before, sample), in the order given, at `speed` × team time.
+    """(delay [s] after the previous one, sample), in the given order, at `speed` × team time.
 
-    delay = max(0, t − newest stamp so far)/speed: a sample that is older than what went before
-    goes at once, and the delays add up to the team time that has passed. The first goes at once.
-    An infinite speed never waits. Raises ValueError unless speed > 0.
+    delay = max(0, t − newest stamp so far)/speed: a sample that is older than an earlier one is
+    published at once, and the delays add up to the team time that has passed. The first one is
+    published at once. At infinite speed there is no delay. Raises ValueError unless speed > 0.
     """
     if not speed > 0.0:
         raise ValueError(f"out of bounds: speed {speed} is not positive")

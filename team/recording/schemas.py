@@ -1,7 +1,7 @@
-"""JSON Schemas of the messages, so that a log explains itself to any MCAP viewer.
+"""JSON Schemas of the messages, so that any MCAP viewer can interpret a log.
 
-A schema describes the MessagePack array position by position. Fields that say
-`contentEncoding: base64` travel as MessagePack `bin`: little-endian numbers, see docs/wire.md.
+A schema describes the MessagePack array position by position. Fields with `contentEncoding: base64`
+are encoded as MessagePack `bin`: little-endian numbers, see docs/wire.md.
 """
 
 import json
@@ -29,9 +29,9 @@ class Declaration(NamedTuple):
 
 
 def declaration_of(key: str, tag: str = "") -> Declaration | None:
-    """The declaration of a relative key of the team; None for a key that no row has.
+    """The declaration of a relative key of the team; None for a key without a row in the table.
 
-    tag: of the message, where the key carries more than one kind.
+    tag: of the message, where the key carries more than one type.
     """
     found = channel_of(key)
     if found is not None:

@@ -43,7 +43,7 @@ from team.wire.patience import Patience
 
 NODE = "recorder"
 PROGRESS_EVERY = 256
-"""Measurements of a robot between two reports of progress while the queue is busy."""
+"""Number of measurements of a robot between two progress reports while the queue is busy."""
 _FAR_BEHIND = 20_000  # samples: the disk takes half a second for as many
 _WAIT_S = 0.05
 _QUIET_S = 0.5
@@ -54,15 +54,17 @@ _LOG = logging.getLogger("teamslam")
 
 
 More = Callable[[], tuple[Recorder, Inventory]]
-"""Opens a further part of a log; what the parts before it have. Raises `RecorderError`."""
+"""Opens a further part of a log, with the inventory of the earlier ones. Raises `RecorderError`."""
 
 
 class RecordLoop:
-    """Takes samples from a bus, writes each once, asks for what is missing, says how far it is.
+    """Writes each sample from a bus once, requests missing ones, and reports progress.
 
-    The log also gets what the recorder itself observes: `Liveliness` of the others, at the newest
-    team time seen, and its own status. inventory: what earlier parts of the log have. more: opens
-    the next part of a log that could not be written on; without it that is raised.
+    The log also receives the recorder's own observations: `Liveliness` of the others, at the newest
+    team time seen, and its own status.
+    inventory: of the earlier parts of the log.
+    more: opens the next part of a log that could not be written any more; without it the error is
+        raised.
     """
 
     def __init__(
@@ -96,20 +98,20 @@ class RecordLoop:
 
     @property
     def written(self) -> int:
-        """How many messages have gone to the log."""
+        """Number of messages written to the log."""
         return self._messages + self._statuses
 
     @property
     def finished(self) -> bool:
-        """The final map is in the log and nobody else is alive."""
+        """Whether the final map is in the log and no other process is present."""
         return self._final and not self._alive
 
     def take(self, samples: list[Sample]) -> None:
-        """Write these samples; report progress of robots that are due, of all when there are none.
+        """Writes these samples; reports progress of the robots that are due, or of all when there
+        are none.
 
-        A new submap is reported at once: its robot does not leave before it is in the log.
-
-        Progress is credit: while the writing thread is far behind, nothing is reported.
+        A new submap is reported at once: its robot does not leave before it is in the log. Progress
+        is credit: while the writing thread is far behind, nothing is reported.
         """
         noted = [(sample, self._noted(sample)) for sample in samples]
         self._write([said for sample, said in noted if self._inventory.is_new(sample)])
@@ -131,7 +133,7 @@ class RecordLoop:
                 self._reported[robot, incarnation] = (measurements, submaps)
 
     def _write(self, samples: list[Sample]) -> None:
-        """To the log, if it can be written: the run goes on without it."""
+        """Writes to the log, if that is possible: the run goes on without it."""
         if self._recorder is None:
             return
         try:
@@ -149,7 +151,9 @@ class RecordLoop:
         self._retry_s = time.monotonic() + _RETRY_S
 
     def _go_on(self, now_s: float) -> None:
-        """Open a new part of a log that could not be written; what it missed is asked for."""
+        """Opens a new part of a log that could not be written; the samples missed meanwhile are
+        requested.
+        """
         if self._recorder is not None or self._more is None or now_s < self._retry_s:
             return
         self._retry_s = now_s + _RETRY_S
@@ -164,12 +168,12 @@ class RecordLoop:
         _LOG.warning("recording goes on in %s", self._recorder.path)
 
     def tell(self, scenario: Sequence[Configuration]) -> None:
-        """Write what a world would have said, where there is none."""
+        """Writes the messages that a world would have published, where there is none."""
         said = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
         self._write([each for each in said if self._inventory.is_new(each)])
 
     def close(self) -> None:
-        """Complete the log; raises `RecorderError` if it can not be written."""
+        """Completes the log; raises `RecorderError` if it can not be written."""
         try:
             if self._recorder is not None:
                 self._recorder.close()
@@ -179,7 +183,9 @@ class RecordLoop:
             raise self._failure
 
     def mend(self, now_s: float) -> None:
-        """Ask sources and robots for what has been missing for a while, without waiting for it."""
+        """Requests from sources and robots what has been missing for a while, without waiting for
+        the reply.
+        """
         self._go_on(now_s)
         for stream in self._patience.due(self._inventory.gaps, now_s):
             kind, robot, incarnation = stream
@@ -206,7 +212,7 @@ class RecordLoop:
 
     @property
     def lacking(self) -> list[str]:
-        """What the log lacks, in words."""
+        """Describes what the log lacks."""
         numbered = [f"{key}: {what}" for key, what in self._inventory.findings()]
         others = [
             f"{key}: {intervals(lost)}"
@@ -238,7 +244,9 @@ class RecordLoop:
         return replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
     def look(self, end: TheEnd) -> None:
-        """Take a final map that was missed, and see who has left while nobody said so."""
+        """Requests a final map that was missed, and removes processes that left without an
+        announcement.
+        """
         missed = end.missed()
         if missed and not self._final:
             self.take(missed)
@@ -246,7 +254,9 @@ class RecordLoop:
             self._alive = {node for node in self._alive if self._bus.is_alive(node)}
 
     def status(self, *, last: bool = False) -> Status:
-        """Publish and log what the recorder is doing; returns it. The last one says what lacks."""
+        """Publishes and logs the recorder's status; returns it. The last one lists what the log
+        lacks.
+        """
         waiting = 0 if self._recorder is None else self._recorder.waiting()
         figures = {"messages": float(self._messages), "waiting": float(waiting)}
         failure = () if self._failure is None else (f"nothing is recorded: {self._failure}",)
@@ -276,13 +286,15 @@ def record(
     stop: threading.Event | None = None,
     scenario: Sequence[Configuration] = (),
 ) -> int:
-    """Record until the final map is there and all other nodes have gone, or until `stop`; close.
+    """Records until the final map is present and all other nodes have left, or until `stop`; then
+    closes.
 
-    Returns how many messages were written.
-    `expected`: nodes whose absence is a warning in the status. `inventory`, `more`: what earlier
-    parts of the log have, and what opens the next one when this one can not be written. scenario:
-    of a team without a world, whose place it takes in the log. Raises
-    `RecorderError` when the log can not be written: at once without `more`, else at the end.
+    Returns the number of messages written.
+    expected: nodes whose absence is a warning in the status.
+    inventory, more: the inventory of earlier parts of the log, and the function that opens the next
+        one when this one can not be written.
+    scenario: for a team without a world, the configurations that stand in its place in the log.
+    Raises `RecorderError` when the log can not be written: at once without `more`, else at the end.
     """
     stop = threading.Event() if stop is None else stop
     loop = RecordLoop(bus, recorder, expected, inventory, more)
@@ -315,10 +327,10 @@ def record(
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:
-    """Publish samples again, byte by byte, at `speed` × team time; returns how many.
+    """Publishes samples again, with the same bytes, at `speed` × team time; returns their number.
 
-    Each is due at a time counted from the first, so that delays do not add up. Ends when `stop` is
-    set.
+    Each sample is due at a time relative to the first one, so that delays do not accumulate. Ends
+    when `stop` is set.
     """
     due = time.monotonic()
     published = 0

@@ -1,4 +1,4 @@
-"""What is in a log: messages, bytes, rates and times of each key, and the span of its
+"""Summarises a log: messages, bytes, rates and times of each key, and the span of its
 measurements.
 """
 
@@ -11,7 +11,7 @@ from team.wire.bus import Sample
 from team.wire.channels import SENSORS, VIEW, channel_of
 
 FOREIGN = "(no channel)"
-"""The channel of a key that no row of the table has."""
+"""The channel of a key without a row in the table."""
 
 
 @dataclass
@@ -33,7 +33,7 @@ class KeySummary:
         return (self.messages - 1) * 1e9 / (self.last_ns - self.first_ns)
 
     def take(self, sample: Sample) -> None:
-        """Count one more."""
+        """Counts one more sample."""
         self.messages += 1
         self.bytes += len(sample.payload)
         self.first_ns = min(self.first_ns, sample.stamp_ns)
@@ -41,7 +41,7 @@ class KeySummary:
 
 
 class Summary(NamedTuple):
-    """The keys in the order of their first message, and what of the log can not be read."""
+    """The keys in the order of their first message, and the defects of the log."""
 
     keys: tuple[KeySummary, ...]
     damaged: tuple[str, ...]
@@ -60,7 +60,7 @@ class Summary(NamedTuple):
 
 
 def summarised(log: Log) -> Summary:
-    """One pass over every whole chunk of a log, damaged or not."""
+    """Summarises every whole chunk of a log, damaged or not, in one pass."""
     found: dict[str, KeySummary] = {}
     damaged = []
     for chunk in salvaged(log):

@@ -32,12 +32,12 @@ _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "signature": octets,
     "sha256": octets,
 }
-"""How the bytes of a field are read by its name; all others are floats."""
+"""The decoder of a field's bytes, by the field's name; all other fields are floats."""
 
 
 @dataclass
 class Exported:
-    """The rows of each file that was written, and messages that no file has: not sound."""
+    """The number of rows of each written file, and of unsound messages, which are in no file."""
 
     rows: dict[Path, int] = field(default_factory=dict)
     unsound: int = 0
@@ -45,7 +45,7 @@ class Exported:
     def messages(
         self, log: Log, channels: Collection[Channel] | None
     ) -> Iterator[tuple[Sample, Channel, Message]]:
-        """Every sound message of the given channels (of all without); the others are counted.
+        """Every sound message of the given channels (None: all); the others are counted.
 
         A viewer's own messages have no fields that this program knows: they are left out.
         """
@@ -72,5 +72,5 @@ def numbers_of(name: str, value: bytes) -> NDArray[Any]:
 
 
 def type_of_numbers(name: str) -> str:
-    """Their type as NumPy names it."""
+    """The type of these numbers, in NumPy's notation."""
     return str(numbers_of(name, b"").dtype)

@@ -1,4 +1,4 @@
-"""The tail of a log: its samples as its recorder writes them, chunk by chunk."""
+"""Follows a log: its samples while its recorder writes them, chunk by chunk."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,15 +11,16 @@ from team.recording.records import FRAME_SIZE, MALFORMED, frames
 from team.wire.bus import Sample
 
 MOST = 20_000
-"""Samples at a time, so that a long log is told in parts."""
+"""Number of samples that one call returns at most, about."""
 
 
 @dataclass
 class Tail:
-    """Reads a log that may still grow, or is not there yet; what was read is not read again.
+    """Reads a log that may still grow, or does not exist yet; no sample is returned twice.
 
-    log: once there is one. ended: its recorder has finished it, and all is read. damaged: chunks
-    that could not be read.
+    log: once it exists.
+    ended: whether its recorder has finished it, and all of it is read.
+    damaged: number of chunks that could not be read.
     """
 
     path: Path
@@ -30,7 +31,9 @@ class Tail:
     _keys: dict[int, str | None] = field(default_factory=dict)
 
     def more(self) -> list[Sample]:
-        """What whole chunks have come since; at most about MOST. Raises `LogError` for no log."""
+        """The samples of whole chunks written since; at most about MOST. Raises `LogError` for no
+        log.
+        """
         if self.ended or (self.log is None and not self._opened()):
             return []
         assert self.log is not None
@@ -53,7 +56,7 @@ class Tail:
         return found
 
     def _opened(self) -> bool:
-        """Whether the log is there; its recorder writes its head at once."""
+        """Whether the log exists; its recorder writes its header at once."""
         if not self.path.exists() or self.path.stat().st_size == 0:
             return False
         try:
@@ -66,4 +69,4 @@ class Tail:
 
 
 _HEAD = 65_536
-"""A file that is larger and no log will not become one."""
+"""Size in bytes above which a file that is no log will not become one."""

@@ -14,20 +14,22 @@ INITIAL_POSE = "start pose"
 
 
 OnDisposition = Callable[[int, str], None]
-"""Hears of a measurement, by its counter, what becomes of it; of the same one the last word holds.
+"""Receives the counter of a measurement and its disposition; a later call for the same one replaces
+it.
 """
 
 
 def unheard(_number: int, _disposition: str) -> None:
-    """Nobody asks what became of a single measurement."""
+    """Ignores the dispositions of single measurements."""
 
 
 class Ledger:
     """Counts the measurements of an incarnation by their disposition.
 
     used: the disposition of a measurement that the estimator takes. A measurement is counted as
-    used when it comes; the window that ends says which of them it has not used after all, so scans
-    and inter-robot measurements are kept until then. said: hears what becomes of each one.
+        used when it arrives; the window that closes lists those that it did not use after all, so
+        scans and inter-robot measurements are stored until then. on_disposition: receives the
+        disposition of each.
     """
 
     def __init__(self, used: str, resumed: int = 0, said: OnDisposition = unheard) -> None:
@@ -41,7 +43,7 @@ class Ledger:
     def count(
         self, measurement: m.Measurement, rejected: Rejection | None, used: str | None = None
     ) -> None:
-        """One measurement more: rejected for this reason, or used."""
+        """Counts one more measurement: rejected for this reason, or used."""
         number, stamp_ns = measurement.number, measurement.stamp_ns
         taken = self.used if used is None else used
         if rejected is None:
@@ -60,7 +62,7 @@ class Ledger:
         self._said(number, disposition)
 
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
-        """Measurements that were counted as used were not, for this reason."""
+        """Recounts measurements that were counted as used and were not, for this reason."""
         for number in numbers:
             self.counts[used] -= 1
             self.counts[reason.disposition] += 1
@@ -74,12 +76,12 @@ class Ledger:
         return by_stamp[len(by_stamp) - count :]
 
     def cover(self, until_ns: int) -> None:
-        """An estimator without windows has used every scan up to a time."""
+        """An estimator without windows has used every scan up to this time."""
         self._scans = {n: at_ns for n, at_ns in self._scans.items() if at_ns > until_ns}
         self._detections.clear()
 
     def close(self, closed: ClosedWindow) -> None:
-        """A window has become a submap, which says what it could not use."""
+        """A window has become a submap, which lists what it could not use."""
         self.leave_out(set().union(*(each.measurements for each in closed.sightings)))
         self._reject(self._behind(closed.late), Rejection.LATE, self.used)
         behind = {n: at_ns for n, at_ns in self._scans.items() if at_ns > closed.end_ns}

@@ -1,4 +1,4 @@
-"""What a recursive estimator over a state of its own is: functions of one shape each."""
+"""The functions of which a recursive estimator over a state of its own consists."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,8 +16,9 @@ IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
 """The dispositions of a measurement that such an estimator takes."""
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the noises
-that they claim (`team.estimation.scans`) at its end."""
+"""The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the
+measurements' own covariances (`team.estimation.scans`) at its end.
+"""
 InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 FilterStep = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
 Judged = Callable[
@@ -28,10 +29,12 @@ Judged = Callable[
 class Filter(NamedTuple):
     """A recursive estimator over a state of its own.
 
-    looks: it takes landmarks, and claims: those with covariances of their own; maps: it has a map
-    of its own. joint: with the covariance between landmarks. absorbed: the state with these
-    landmarks in place of its own. particles: those of a state, for viewers. innovation: of a step's
-    measurements, as the state before it predicts them.
+    looks: whether it takes landmarks; claims: whether it takes those with covariances of their own;
+        maps: whether it has a map.
+    joint: whether its map has covariances between landmarks.
+    absorbed: the state with the given landmarks in the place of its own.
+    particles: the particles of a state, for viewers.
+    innovation: of a step's measurements, as the state before it predicts them.
     """
 
     initial_state: InitialState

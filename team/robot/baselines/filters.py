@@ -1,4 +1,4 @@
-"""The estimators that keep one state over a whole stream, by name: functions of one shape each."""
+"""The estimators that have one state over a whole stream, by name."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -190,7 +190,8 @@ def _plain(proposal: Proposal) -> Filter:
 def _localisation_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
-    """At an unknown start anywhere from where the sensor may see a landmark of the known map.
+    """At an unknown initial pose anywhere from where the sensor may see a landmark of the known
+    map.
 
     That is the map's box widened by the sensor's reach, at most by half the box's longer side.
     """

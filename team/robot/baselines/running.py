@@ -1,4 +1,4 @@
-"""An estimator that keeps one state from the start of a stream to its end."""
+"""An estimator that has one state from the start of a stream to its end."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -34,11 +34,13 @@ start, a motion without lateral noise, fewer than four particles that differ."""
 
 
 class RunningEstimator:
-    """The state after every keyframe so far; its map is said once per window, or at every keyframe.
+    """The state after every keyframe so far; its map is published once per window, or at every
+    keyframe.
 
-    It makes no submaps, so it can not be resumed: a robot that was started again takes its stream
-    from the beginning, and says the same again. sequence: keyframes so far. associates: it takes
-    scans without identities; what became of them it says at the end.
+    It makes no submaps, so it can not be resumed: a restarted robot takes its stream from the
+    beginning, and publishes the same messages again.
+    sequence: number of keyframes so far.
+    associates: whether it takes scans without identities; it reports their outcomes at the end.
     """
 
     def __init__(
@@ -75,11 +77,11 @@ class RunningEstimator:
 
     @property
     def innovation(self) -> Innovation:
-        """Of all keyframes so far."""
+        """The innovation of all keyframes so far."""
         return self._innovation.plus(self._unsaid)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan (ids, ranges, bearings); the reason if it is rejected."""
+        """Takes a scan (ids, ranges, bearings); returns the reason if it is rejected."""
         if not self._filter.looks:
             return Rejection.NO_LANDMARKS
         unnamed = bool((scan.ids >= UNNAMED).any())
@@ -97,7 +99,7 @@ class RunningEstimator:
         *,
         measured: bool = True,
     ) -> Estimates:
-        """Take one odometry interval and run the keyframes that lie in it."""
+        """Takes one odometry interval and runs the keyframes that lie in it."""
         if self._segmenter.now_ns is None:
             self._segmenter.begin(stamp_ns - duration_ns)
             self._map_ns = stamp_ns - duration_ns
@@ -112,7 +114,7 @@ class RunningEstimator:
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
-        """What is new since `before` keyframes; the map if it is due, or was not said at the
+        """The results since `before` keyframes; the map if it is due, or was not published at the
         end.
         """
         now_ns = self.last_keyframe_ns
@@ -130,13 +132,15 @@ class RunningEstimator:
         return Estimates(pose_ns=pose_ns, map_ns=map_ns, cloud=self._cloud(map_ns), judged=said)
 
     def _cloud(self, map_ns: int | None) -> Cloud | None:
-        """The particles, where there are any and a map is said."""
+        """The particles, where there are any and a map is published."""
         if map_ns is None or self._filter.particles is None:
             return None
         return thinned(self._filter.particles(self._state), np.zeros(3))
 
     def _take(self, keyframe: Keyframe) -> None:
-        """A keyframe: its scans without identities one by one, then what it has with names."""
+        """Takes a keyframe: its scans without identities one by one, then all observations with
+        names.
+        """
         for look in keyframe.looks:
             self._looks.append(look)
             seen = look.ids, look.ranges, look.bearings, look.own
@@ -191,8 +195,8 @@ class RunningEstimator:
         self.last_keyframe_ns = stamp_ns
 
     def _after(self, step: Step) -> tuple[Any, Innovation] | None:
-        """The state after a step, and how well its measurements were predicted; None: there is
-        none.
+        """The state after a step, and how well its measurements were predicted; None where there is
+        no state.
 
         A state without a finite pose is none.
         """
@@ -210,7 +214,9 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """The stream has ended: the last keyframe and map; how many scans no odometry covered."""
+        """Ends the stream: returns the last keyframe and map, and the number of scans that no
+        odometry covered.
+        """
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:
@@ -240,7 +246,7 @@ def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
 
 
 class AbsorbingEstimator(RunningEstimator):
-    """One whose landmarks the fused ones replace, under a rule with feedback."""
+    """An estimator whose landmarks are replaced by the fused ones, under a rule with feedback."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the landmarks by the fused ones."""
