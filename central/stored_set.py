@@ -23,14 +23,14 @@ class StoredSet:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._keeper = Keeper(path)
-        self._found = self._keeper.kept
+        self._found = self._keeper.members
         self._known = {member.hash for member in self._found}
 
     def samples(self) -> list[Sample]:
         """The members in the file, as samples that arrive now."""
         now_ns, found = time.time_ns(), self._found
         self._found = []
-        return [member.heard(now_ns) for member in found]
+        return [member.as_sample(now_ns) for member in found]
 
     def note(self, samples: Iterable[Sample]) -> None:
         """Keep the valid and new members among these samples."""

@@ -24,7 +24,7 @@ from team.wire.codec import WireError, decoded, encoded
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000
 """Most attempts of a node to continue behind one message, where it raises again and again."""
-KEPT_TEXT = 1000
+LONGEST_TEXT = 1000
 """Characters of an exception's text, or of a key, that are kept."""
 _OURS = ("team.", "central.", "sim.")
 _LOG = logging.getLogger("teamslam")
@@ -141,8 +141,8 @@ class Boundary:
         """Count and log a fault; returns its message."""
         self.faults += 1
         place = place_of(error.__traceback__)
-        text = _cut(str(error), KEPT_TEXT)
-        key = _cut(sample.key, KEPT_TEXT)
+        text = _cut(str(error), LONGEST_TEXT)
+        key = _cut(sample.key, LONGEST_TEXT)
         what = f"{tag} " if tag else ""
         self.last = f"{what}{_cut(key, 80)}: {type(error).__name__} at {place}: {_cut(text, 200)}"
         _LOG.error("set aside: %s", self.last)
@@ -202,7 +202,7 @@ def place_of(trace: TracebackType | None) -> str:
               for f, line in traceback.walk_tb(trace)]  # fmt: skip
     ours = [frame for frame in frames if f"{frame[0]}.".startswith(_OURS)]
     module, function, line = (ours or [("?", "?", 0), *frames])[-1]
-    return _cut(f"{module}:{function}:{line}", KEPT_TEXT)
+    return _cut(f"{module}:{function}:{line}", LONGEST_TEXT)
 
 
 def _cut(text: str, length: int) -> str:

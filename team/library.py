@@ -93,10 +93,10 @@ class Keyframe:
 
     def calibrated(self, sensor: Sensor) -> "Keyframe":
         """The measurements within the sensor's limits, with its calibration applied."""
-        kept = acceptable(sensor, self.ranges, self.bearings)
-        ranges, bearings = corrected(sensor, self.ranges[kept], self.bearings[kept])
+        valid = acceptable(sensor, self.ranges, self.bearings)
+        ranges, bearings = corrected(sensor, self.ranges[valid], self.bearings[valid])
         return Keyframe(
-            increment=self.increment, ids=self.ids[kept], ranges=ranges, bearings=bearings
+            increment=self.increment, ids=self.ids[valid], ranges=ranges, bearings=bearings
         )
 
 

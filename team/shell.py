@@ -318,13 +318,13 @@ def process(
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()
-    told: list[int] = []
+    signals: list[int] = []
 
     def take(number: int, _: FrameType | None) -> None:
-        told.append(number)
+        signals.append(number)
         stop.set()
         if patient:
-            signal.alarm(min(len(told) - 1, 1))  # of 0: never
+            signal.alarm(min(len(signals) - 1, 1))  # of 0: never
             return
         signal.alarm(LAST_S)  # by the kernel: neither a closing link nor the exit holds it
 
@@ -337,8 +337,8 @@ def process(
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    if told and not endless:
-        sys.exit(128 + told[0])
+    if signals and not endless:
+        sys.exit(128 + signals[0])
 
 
 def _tie_to(parent: int, stop: threading.Event) -> None:

@@ -59,8 +59,8 @@ class TheEnd:
             replies = self._bus.ask(
                 FINAL_KEPT, "", FinalMapRequest(stamp_ns=0, node=self._node), FINAL_ASK_S
             )
-            kept = [decoded(reply, FinalMapReply) for reply in replies]
-            return [_sample(k.final) for k in kept[:1] if k.missed or 1e-9 * k.age_ns <= life_s]
+            replied = [decoded(reply, FinalMapReply) for reply in replies]
+            return [_sample(k.final) for k in replied[:1] if k.missed or 1e-9 * k.age_ns <= life_s]
         except (BusError, WireError) as error:
             _LOG.debug("%s", error)
             return []

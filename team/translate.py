@@ -303,15 +303,15 @@ def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
     A joint covariance that is not positive definite by rounding is replaced by the landmarks' own
     ones; a landmark whose own covariance is invalid, or whose mean is not finite, is omitted.
     """
-    said = []
+    warnings = []
     if message.joint and unsound(message) is not None:
-        said.append("the joint covariance is lost to rounding: each landmark has its own only")
+        warnings.append("the joint covariance is lost to rounding: each landmark has its own only")
         blocks = block_bytes(landmark_blocks_of(message))
         message = msgspec.structs.replace(message, joint=False, covariance=blocks)
     if unsound(message) is not None:
         message, left_out = _with_sound_landmarks(message)
-        said.append(f"left out, their covariance is none: {', '.join(map(str, left_out))}")
-    return message, tuple(said)
+        warnings.append(f"left out, their covariance is none: {', '.join(map(str, left_out))}")
+    return message, tuple(warnings)
 
 
 def _with_sound_landmarks(message: LandmarkMap) -> tuple[LandmarkMap, list[int]]:
@@ -321,13 +321,13 @@ def _with_sound_landmarks(message: LandmarkMap) -> tuple[LandmarkMap, list[int]]
     with np.errstate(all="ignore"):
         sound = np.isfinite(means).all(axis=1) & np.isfinite(blocks).all(axis=(1, 2))
         sound &= (a > 0.0) & (c > 0.0) & (np.abs(b) < np.sqrt(a) * np.sqrt(c))
-    kept = msgspec.structs.replace(
+    remaining = msgspec.structs.replace(
         message,
         ids=from_ids(landmark_ids[sound]),
         means=from_floats(means[sound]),
         covariance=block_bytes(blocks[sound]),
     )
-    return kept, landmark_ids[~sound][:NAMED].tolist()
+    return remaining, landmark_ids[~sound][:NAMED].tolist()
 
 
 def landmarks_of(
@@ -352,7 +352,7 @@ def prior_message(
     digest: bytes,
     prior: RobotPrior,
     members: Sequence[m.VersionEntry] = (),
-    heard: int = 0,
+    received: int = 0,
 ) -> m.Prior:
     """The message of a robot's prior: the joint marginal of its last fused end pose and the
     landmarks, with the members of the set that it contains.
@@ -374,7 +374,7 @@ def prior_message(
             for bias, value, sigma in prior.shared.biases
         ),
         members=tuple(members),
-        heard=heard,
+        heard=received,
     )
 
 

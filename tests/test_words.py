@@ -34,6 +34,25 @@ KEPT = {
     "doubts": "a verb",
 }
 """Parts of names that may stand in prose."""
+VAGUE = {
+    "told": "a configuration, an announcement, a report: what it is",
+    "said": "a message, an announcement, a text: what it is",
+    "kept": "stored, remaining, accepted: which of them",
+    "heard": "received",
+    "met": "an encounter",
+    "held": "buffered, known, delayed: which of them",
+    "looked": "searched, observed",
+    "wanted": "requested, expected",
+    "begun": "initial_state",
+    "lean": "compact",
+    "parted": "separated",
+    "elsewhere": "name the place",
+}
+"""Participles that do not name a thing, and what is said instead; for identifiers of `team`."""
+ON_THE_WIRE = ("team/wire/messages/", "team/wire/channels.py")
+"""Where fields and keys are named as logs have them."""
+DRIVERS = ("team/driver/", "team/ros2/", "team/ros2_driver.py")
+"""Folders whose identifiers are not examined for such participles yet."""
 FORMER = {"team/former_names.py"}
 """Files that are about former names."""
 FOLDERS = ("team", "central", "sim", "examples", "benchmarks")
@@ -63,6 +82,11 @@ def names_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.attr
 
 
+def parts_of(name: str) -> set[str]:
+    """The words of an identifier, in lower case."""
+    return {part.lower() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)}
+
+
 def docstrings_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Docstrings of modules, classes and functions, and those below a constant or a field."""
     for node in ast.walk(tree):
@@ -73,8 +97,7 @@ def docstrings_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 def bad_name(name: str) -> str | None:
     """The first part of a name that is not used."""
-    parts = {part.lower() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)}
-    return next((word for word in NAMES if word in parts), None)
+    return next((word for word in NAMES if word in parts_of(name)), None)
 
 
 def bad_words(text: str) -> list[str]:
@@ -94,6 +117,17 @@ def test_no_name_has_a_word_that_the_field_has_a_better_one_for():
     assert found == []
 
 
+def test_an_identifier_of_team_names_a_thing_and_no_vague_participle():
+    found = [
+        f"{name}:{line}: {each}: {VAGUE[word]}"
+        for name, tree in sources()
+        if name.startswith("team/") and not name.startswith((*ON_THE_WIRE, *DRIVERS))
+        for line, each in names_of(tree)
+        for word in sorted(parts_of(each) & VAGUE.keys())
+    ]
+    assert found == []
+
+
 def test_no_docstring_and_no_page_has_such_a_word():
     texts = [
         (f"{name}:{line}", text) for name, tree in sources() for line, text in docstrings_of(tree)
@@ -105,6 +139,8 @@ def test_no_docstring_and_no_page_has_such_a_word():
 def test_the_check_finds_such_words_and_leaves_names_in_backticks():
     assert bad_name("GarbageKind") == bad_name("in_garbage") == "garbage"
     assert bad_name("garbageman") is None
+    assert parts_of("_said_of") & VAGUE.keys() == parts_of("SaidBy") & VAGUE.keys() == {"said"}
+    assert not parts_of("metres_along") & VAGUE.keys()
     assert bad_words("Three readings, of which one is\ngarbage.") == ["readings", "garbage"]
     assert bad_words("`sightings` on `source/r1/sightings`, sightings: those of this tick") == []
     assert bad_words("it has begun") == []

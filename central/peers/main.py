@@ -98,7 +98,7 @@ class PeerShell(RobotShell):
 
     def _resume(self) -> bool:
         """Take over what is on disk; whether the stream goes on behind it."""
-        stored = self._keeper.kept
+        stored = self._keeper.members
         if not stored:
             return False
         goes_on = self._peer.restore(stored)
@@ -137,7 +137,7 @@ class PeerShell(RobotShell):
         tap: Tap | None = getattr(self.bus, "tap", None)
         if tap is not None and members:
             now_ns = time.time_ns()
-            tap([member.heard(now_ns) for member in members])
+            tap([member.as_sample(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
         """Nobody needs this peer any more: all have concluded, or the world has left."""
@@ -184,10 +184,10 @@ class CentreShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.MEMBERS, CENTRE, self._peer.answer)
-        self._peer.keep(self._keeper.kept)
+        self._peer.keep(self._keeper.members)
         self._peer.peer.unsaved.clear()
-        if self._keeper.kept:
-            _LOG.info("%d members of the set are kept", len(self._keeper.kept))
+        if self._keeper.members:
+            _LOG.info("%d members of the set are kept", len(self._keeper.members))
         try:
             self._shell.run(self._duty)
         finally:

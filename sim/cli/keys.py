@@ -74,7 +74,7 @@ def keys(
         renew=renew or (),
         revoke=revoke or (),
     )
-    for what, nodes in (("made", made.made), ("kept", made.kept), ("revoked", made.revoked)):
+    for what, nodes in (("made", made.made), ("kept", made.unchanged), ("revoked", made.revoked)):
         if nodes:
             typer.echo(f"{what:8} {', '.join(nodes)}")
     if made.made:

@@ -31,21 +31,21 @@ def compile_once(dispatcher: Any, lock_of: Callable[[], Path]) -> None:
         good; threads take Numba's own lock first.
     """
     compile_here = dispatcher.compile
-    held = False
+    compiling = False
     lock: Path | None = None
 
     def compile_(signature: Any) -> Any:
-        nonlocal held, lock
+        nonlocal compiling, lock
         with global_compiler_lock:
-            if held:  # one of its forms within another
+            if compiling:  # one of its forms within another
                 return compile_here(signature)
-            held = True
+            compiling = True
             try:
                 lock = lock_of() if lock is None else lock
                 with alone(lock, PATIENCE_S):
                     return compile_here(signature)
             finally:
-                held = False
+                compiling = False
 
     dispatcher.compile = compile_
 

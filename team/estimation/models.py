@@ -123,11 +123,11 @@ def motion_variances(
         forward_var, turn_var, both = forward_var + added[0], turn_var + added[1], added[2]
     lateral = _variance(motion.lateral, duration_s, distance, turn)
     if motion.shares is not None and duration_s > 0.0:
-        held = distance * distance * motion.shares_interval_s / duration_s
+        shared = distance * distance * motion.shares_interval_s / duration_s
         along, across, heading = motion.shares
-        forward_var += along * along * held
-        lateral += across * across * held
-        turn_var += heading * heading * held
+        forward_var += along * along * shared
+        lateral += across * across * shared
+        turn_var += heading * heading * shared
     return forward_var, turn_var, both, final, lateral
 
 

@@ -131,8 +131,8 @@ def calibrated(motion: MotionModel, twist: Pose, duration_s: float) -> Pose:
     turn = min(max(turn, -limit * duration_s), limit * duration_s)
     way = math.hypot(twist[0], twist[1])
     scale = motion.slow_scale if way < motion.slow_below * duration_s else motion.forward_scale
-    kept = max(scale * way - motion.turn_drag * abs(turn), 0.0)
-    share = kept / way if way > 0.0 else 0.0
+    effective = max(scale * way - motion.turn_drag * abs(turn), 0.0)
+    share = effective / way if way > 0.0 else 0.0
     forward, left = share * float(twist[0]), share * float(twist[1])
     return np.array([forward, left, turn + motion.veer * forward])
 

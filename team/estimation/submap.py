@@ -31,8 +31,8 @@ class Unnamed:
         count = seen.sum(axis=0)
         inside = seen.T @ seen == count[:, None]
         np.fill_diagonal(inside, False)
-        kept = (count >= 3) & ~inside.any(axis=1)
-        return tuple(np.flatnonzero(column) for column in seen[:, kept].T)
+        usable = (count >= 3) & ~inside.any(axis=1)
+        return tuple(np.flatnonzero(column) for column in seen[:, usable].T)
 
 
 class Slipped(NamedTuple):
@@ -123,13 +123,13 @@ class LocalMap:
     @property
     def named(self) -> "LocalMap":
         """The marginal without the landmarks that have no name: what another window can know."""
-        kept = int(np.searchsorted(self.ids, UNNAMED))
-        if kept == len(self.ids):
+        named = int(np.searchsorted(self.ids, UNNAMED))
+        if named == len(self.ids):
             return self
-        size = len(self.mean) - 2 * (len(self.ids) - kept)
+        size = len(self.mean) - 2 * (len(self.ids) - named)
         return replace(
             self,
-            ids=self.ids[:kept],
+            ids=self.ids[:named],
             mean=self.mean[:size],
             covariance=self.covariance[:size, :size],
             sensitivity=self.sensitivity[:, :size] if self.biases else NO_COLUMNS,
@@ -154,12 +154,12 @@ class LocalMap:
         if not len(self.node_stamps):
             return self
         behind = 3 + 3 * len(self.node_stamps)
-        kept = np.concatenate([np.arange(3), np.arange(behind, len(self.mean))])
+        numbers = np.concatenate([np.arange(3), np.arange(behind, len(self.mean))])
         return LocalMap(
             self.ids,
-            self.mean[kept],
-            self.covariance[np.ix_(kept, kept)],
+            self.mean[numbers],
+            self.covariance[np.ix_(numbers, numbers)],
             biases=self.biases,
-            sensitivity=self.sensitivity[:, kept] if self.biases else NO_COLUMNS,
+            sensitivity=self.sensitivity[:, numbers] if self.biases else NO_COLUMNS,
             unnamed=self.unnamed,
         )

@@ -42,7 +42,7 @@ class Made:
 
     roster: Roster
     made: tuple[str, ...]
-    kept: tuple[str, ...]
+    unchanged: tuple[str, ...]
     revoked: tuple[str, ...]
     ends: datetime
 
@@ -93,8 +93,8 @@ def make_keys(
             (folder / f"{node}.{suffix}").unlink(missing_ok=True)
     _write(folder / ROSTER, roster_bytes(roster))
     new = (*missing, *renewed)
-    kept = tuple(sorted(node for node in generations if node not in new))
-    return Made(roster, tuple(sorted(new)), kept, tuple(sorted(gone)), ends)
+    unchanged = tuple(sorted(node for node in generations if node not in new))
+    return Made(roster, tuple(sorted(new)), unchanged, tuple(sorted(gone)), ends)
 
 
 _Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]

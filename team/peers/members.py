@@ -43,7 +43,7 @@ class Member:
         """Approximate size on the wire and on disk [bytes]."""
         return len(self.key) + len(self.payload) + len(self.signature)
 
-    def heard(self, now_ns: int) -> Sample:
+    def as_sample(self, now_ns: int) -> Sample:
         """The member as a sample that arrives now (wall clock [ns])."""
         return Sample(self.key, self.payload, self.message.stamp_ns, now_ns, NO_COUNTER)
 
@@ -63,10 +63,3 @@ def about(message: m.Message) -> str:
     if isinstance(message, m.GivenUp):
         return ch.robot_of(message.node) or ""
     return str(getattr(message, "robot", ""))
-
-
-def said_by(key: str) -> str:
-    """The node that publishes a member's key, as certificates name it: `robot-r1`."""
-    first, _, rest = key.partition("/")
-    name = rest.partition("/")[0]
-    return f"{first}-{name}" if first in ("robot", "source") else first

@@ -82,10 +82,10 @@ class PeerNode:
         self.proofs = proofs
         self._now_s = 0.0
         self._serial = 0
-        self._said: bytes | None = None
-        self._said_s = -REPEAT_S
+        self._announced_digest: bytes | None = None
+        self._announced_s = -REPEAT_S
         self._answer_s: float | None = None
-        self._heard: dict[str, tuple[float, m.SetSummary]] = {}
+        self._summaries: dict[str, tuple[float, m.SetSummary]] = {}
         self._asked: dict[tuple[Stream, int], tuple[float, str]] = {}
         self._failures: dict[str, int] = {}
         self._given = Given()
@@ -163,8 +163,8 @@ class PeerNode:
             for sequence in range(max(fed, 0), share.count):
                 yield from (member.message for member in share.parcel(sequence))
             self._fed[stream] = share.count
-        told, self._new_messages = self._new_messages, []
-        yield from told
+        messages, self._new_messages = self._new_messages, []
+        yield from messages
 
     def again(self) -> None:
         """Give everything to the fold again, which begins anew."""
@@ -187,8 +187,8 @@ class PeerNode:
         if summary.node not in self._known:
             self._refuse(f"a summary of {summary.node[:80]}, not in this team")
             return []
-        self._heard[summary.node] = self._now_s, summary
-        if self._said is not None and summary.digest != self._said:
+        self._summaries[summary.node] = self._now_s, summary
+        if self._announced_digest is not None and summary.digest != self._announced_digest:
             self.greet()
         return self._ask(summary)
 
@@ -201,17 +201,17 @@ class PeerNode:
         self._now_s = now_s
         self._forget_questions()
         out: list[Outgoing] = []
-        by_trust = sorted(self._heard, key=lambda node: self._failures.get(node, 0))
-        for heard_s, summary in [self._heard[node] for node in by_trust]:
-            if now_s - heard_s < FRESH_S and summary.digest != self.replica.digest:
+        by_trust = sorted(self._summaries, key=lambda node: self._failures.get(node, 0))
+        for received_s, summary in [self._summaries[node] for node in by_trust]:
+            if now_s - received_s < FRESH_S and summary.digest != self.replica.digest:
                 out += self._ask(summary)
-        since_s = now_s - self._said_s
+        since_s = now_s - self._announced_s
         over = self.replica.concluded.keys() >= set(self.replica.robots)
         if since_s < (LAST_S if over else SUMMARY_S):
             return out
         digest = self.replica.digest
-        if digest != self._said or self._answer_s is not None or since_s >= REPEAT_S:
-            self._said, self._said_s, self._answer_s = digest, now_s, None
+        if digest != self._announced_digest or self._answer_s is not None or since_s >= REPEAT_S:
+            self._announced_digest, self._announced_s, self._answer_s = digest, now_s, None
             summary = self.replica.summary(self.node, self._serial, self.stamp_ns)
             self._serial += 1
             out.append(Outgoing(ch.SET_SUMMARY, self.node, summary))
@@ -229,8 +229,8 @@ class PeerNode:
 
     def more_of(self, node: str) -> list[Outgoing]:
         """Request the rest from a node that has answered."""
-        heard = self._heard.get(node)
-        return [] if heard is None else self._ask(heard[1])
+        received = self._summaries.get(node)
+        return [] if received is None else self._ask(received[1])
 
     def _ask(self, summary: m.SetSummary) -> list[Outgoing]:
         request = request_for(self.replica, summary, self._asked)
@@ -248,12 +248,12 @@ class PeerNode:
 
     def answer(self, request: bytes) -> list[bytes]:
         """The answer to a `MembersRequest`; raises WireError."""
-        wanted_of_us = decoded(request, m.MembersRequest)
-        asker = wanted_of_us.node
+        query = decoded(request, m.MembersRequest)
+        asker = query.node
         if not self._given.allows(asker, self._now_s):
             self._refuse(f"{asker[:80]} asks for more than {GIVEN_BYTES} bytes a second")
             return []
-        batches = [encoded(batch) for batch in self._answered(wanted_of_us)]
+        batches = [encoded(batch) for batch in self._answered(query)]
         self._given.note(asker, sum(map(len, batches)))
         return batches
 
@@ -265,4 +265,4 @@ class PeerNode:
     def agrees(self) -> dict[str, bool]:
         """For each node with a summary, whether its set equals this one."""
         digest = self.replica.digest
-        return {n: s.digest == digest for n, (_, s) in sorted(self._heard.items())}
+        return {n: s.digest == digest for n, (_, s) in sorted(self._summaries.items())}

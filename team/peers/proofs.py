@@ -57,13 +57,15 @@ class Proofs:
             signature=signature,
         )
 
-    def hear(self, said: m.Signature, publisher: str) -> None:
+    def hear(self, signature: m.Signature, publisher: str) -> None:
         """Keep a signature that a robot or an operator publishes on its own key, of its own
         members only.
         """
-        kept = self._signatures.setdefault(publisher, {})
-        if len(kept) < MOST_SIGNATURES and (publisher == OPERATOR or publisher == said.robot):
-            kept[said.member] = said.signature
+        signatures = self._signatures.setdefault(publisher, {})
+        if len(signatures) < MOST_SIGNATURES and (
+            publisher == OPERATOR or publisher == signature.robot
+        ):
+            signatures[signature.member] = signature.signature
 
     def of(self, member: Member) -> bytes:
         """A member's signature; empty where there is none yet, and for a certificate, which the
@@ -72,10 +74,10 @@ class Proofs:
         if isinstance(member.message, m.Certificate):
             return b""
         publisher = signed_by(member)
-        kept = self._signatures.setdefault(publisher, {})
-        found = member.signature or kept.get(member.hash, b"")
+        signatures = self._signatures.setdefault(publisher, {})
+        found = member.signature or signatures.get(member.hash, b"")
         if not found and publisher == self._robot:
-            found = kept[member.hash] = self._signer.sign(member.hash)
+            found = signatures[member.hash] = self._signer.sign(member.hash)
         return found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:

@@ -119,7 +119,7 @@ class Replica:
         self.replacements = 0
         self._holdings: dict[Stream, m.Holding] = {}
         self._statements: dict[str, m.Statements] = {}
-        self._told: _Announced | None = None
+        self._announced: _Announced | None = None
 
     def add(self, member: Member) -> Outcome:
         """Take a member. Raises RefusedError where it can not be of this team or exceeds a
@@ -141,7 +141,7 @@ class Replica:
             self._statements.pop(robot, None)
         if outcome != "known":
             self._bytes[robot] += member.size
-            self._told = None
+            self._announced = None
         return outcome
 
     def _add_streamed(self, member: Member, stream: Stream) -> Outcome:
@@ -256,14 +256,14 @@ class Replica:
             newest_ns=share.newest_ns,
         )
 
-    def _held(self, stream: Stream) -> m.Holding | None:
+    def _holding_of(self, stream: Stream) -> m.Holding | None:
         """As `holding`, cached until a member of the stream arrives."""
-        held = self._holdings.get(stream) or self.holding(stream)
-        if held is not None:
-            self._holdings[stream] = held
-        return held
+        holding = self._holdings.get(stream) or self.holding(stream)
+        if holding is not None:
+            self._holdings[stream] = holding
+        return holding
 
-    def _said_of(self, robot: str) -> m.Statements:
+    def _statements_of(self, robot: str) -> m.Statements:
         found = self.statements[robot]
         if robot not in self._statements:
             self._statements[robot] = m.Statements(
@@ -274,35 +274,35 @@ class Replica:
     @property
     def digest(self) -> bytes:
         """Digest of the summary: equal digests mean equal sets."""
-        return self._telling.digest
+        return self._announcement.digest
 
     def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
         """A summary of the set, small enough to be published again and again."""
-        told = self._telling
+        announced = self._announcement
         return m.SetSummary(
             stamp_ns=stamp_ns,
             node=node,
             serial=serial,
-            digest=told.digest,
-            holdings=tuple(told.holdings.values()),
-            statements=tuple(told.statements.values()),
+            digest=announced.digest,
+            holdings=tuple(announced.holdings.values()),
+            statements=tuple(announced.statements.values()),
         )
 
     def announced_of(self, stream: Stream) -> m.Holding | None:
         """A stream's holding in the summary."""
-        return self._telling.holdings.get(stream)
+        return self._announcement.holdings.get(stream)
 
     def stated_of(self, robot: str) -> m.Statements | None:
         """The summary of the statements about a robot."""
-        return self._telling.statements.get(robot)
+        return self._announcement.statements.get(robot)
 
     @property
-    def _telling(self) -> "_Announced":
-        if self._told is None:
-            held = ((stream, self._held(stream)) for stream in sorted(self.streams))
-            holdings = {stream: each for stream, each in held if each is not None}
+    def _announcement(self) -> "_Announced":
+        if self._announced is None:
+            found = ((stream, self._holding_of(stream)) for stream in sorted(self.streams))
+            holdings = {stream: each for stream, each in found if each is not None}
             statements = {
-                robot: self._said_of(robot)
+                robot: self._statements_of(robot)
                 for robot, found in sorted(self.statements.items())
                 if found
             }
@@ -311,8 +311,8 @@ class Replica:
                 whole.update(digest)
             for digest in (s.digest for s in statements.values()):
                 whole.update(digest)
-            self._told = _Announced(whole.digest(), holdings, statements)
-        return self._told
+            self._announced = _Announced(whole.digest(), holdings, statements)
+        return self._announced
 
 
 class _Announced(NamedTuple):
@@ -337,8 +337,8 @@ def _stated(message: m.Message) -> tuple[str, int]:
         case m.Certificate():
             return "certificate", 0
         case m.Verdict():
-            said = f"{message.judgement} {message.withdrawn}".encode()
-            return "verdict", int.from_bytes(hashlib.blake2b(said, digest_size=16).digest())
+            text = f"{message.judgement} {message.withdrawn}".encode()
+            return "verdict", int.from_bytes(hashlib.blake2b(text, digest_size=16).digest())
         case _:
             raise RefusedError(f"a {type(message).__name__} is no member of the set")
 

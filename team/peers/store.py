@@ -59,7 +59,7 @@ class Store:
             if content and content[: len(MAGIC)] != MAGIC[: len(content)]:
                 raise StoreError(f"{path} is no set of a peer: give --set another file")
             found = list(records_in(content))
-            self.kept = [member for _, member in found]
+            self.members = [member for _, member in found]
             whole = found[-1][0] if found else len(MAGIC)
             self._file = path.open("r+b" if content else "w+b", buffering=0)
             if len(content) < len(MAGIC):
@@ -87,12 +87,12 @@ class Store:
 class Keeper:
     """Keeps a set in its file as long as this can be written; without a path nowhere.
 
-    kept: the members in it when it was opened. Raises StoreError where the file can not be used.
+    members: those in it when it was opened. Raises StoreError where the file can not be used.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._store = None if path is None else Store(path)
-        self.kept = [] if self._store is None else self._store.kept
+        self.members = [] if self._store is None else self._store.members
 
     def append(self, members: Sequence[Member]) -> None:
         """Append members; an error of the file is logged, and nothing more is kept."""

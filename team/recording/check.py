@@ -91,14 +91,14 @@ class _Evidence:
     tallies: dict[str, list[TallyCount]] = field(default_factory=lambda: defaultdict(list))
     last_words: LastWords = field(default_factory=LastWords)
     last_word: tuple[str, ...] = ()
-    heard: set[ch.Channel] = field(default_factory=set)
+    channels: set[ch.Channel] = field(default_factory=set)
 
     def take(self, sample: Sample) -> None:
         self.counters[sample.key].take(sample)
         self.inventory.take(sample)
         row = ch.channel_of(sample.key)
         if row is not None and row[0] in (ch.END, ch.HEAD, ch.ROBOT_HEAD, *_OF_AN_END):
-            self.heard.add(row[0])
+            self.channels.add(row[0])
         if row is None or row[0] not in (ch.TALLY, ch.STATUS):
             return
         try:
@@ -125,19 +125,19 @@ class _Evidence:
             if row is not None and not row[0].recorded:
                 continue
             numbered = not self.part and row is not None and row[0] in _NUMBERED
-            told = self.tallies.get(key, ())
+            counts = self.tallies.get(key, ())
             for line in self.counters[key].findings(
-                part=self.part, numbered=numbered, tallies=told
+                part=self.part, numbered=numbered, tallies=counts
             ):
                 yield Finding(key, line + (DRAWN if ch.VIEW.owner(key) is not None else ""))
         if not self.part:
             for key, line in (*self.inventory.findings(), *self.last_words.findings()):
                 yield Finding(key, line)
-            if self.heard and not self.heard & {ch.END, ch.HEAD, ch.ROBOT_HEAD}:
+            if self.channels and not self.channels & {ch.END, ch.HEAD, ch.ROBOT_HEAD}:
                 yield Finding(ch.END.key(), NO_END)
-        for said in self.last_word:
-            if said.startswith(MISSING):
-                yield Finding("recorder", said)
+        for note in self.last_word:
+            if note.startswith(MISSING):
+                yield Finding("recorder", note)
 
 
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)

@@ -64,10 +64,12 @@ class Counters:
         order = order[~again]
         in_order = counters[order]
         gaps = [] if numbered else _gaps(in_order[in_order != NO_COUNTER], part=part)
-        for told in () if part or numbered else tallies:
-            within = (walls >= told.since_ns) & (walls <= told.until_ns) & (counters != NO_COUNTER)
+        for tally in () if part or numbered else tallies:
+            within = (
+                (walls >= tally.since_ns) & (walls <= tally.until_ns) & (counters != NO_COUNTER)
+            )
             behind = int(counters[within].max(initial=-1)) + 1
-            gaps += [(behind, told.published - 1)] if behind < told.published else []
+            gaps += [(behind, tally.published - 1)] if behind < tally.published else []
         if gaps:
             lost = sum(last - first + 1 for first, last in gaps)
             found.append(f"{_messages(lost)} missing: {intervals(gaps)}")

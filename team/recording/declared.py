@@ -59,8 +59,8 @@ def misdeclared(of: Declared) -> str | None:
         return None if VIEW.owner(of.key) is not None else "no channel has this key"
     kind = row[0].kind_of(of.schema)
     if (of.encoding, of.schema) != ("msgpack", tag_of(kind)):
-        said = f"{of.encoding or 'no encoding'}, {of.schema or 'no schema'}"
-        return f"declared as {said}; its messages are msgpack, {tag_of(kind)}"
+        stated = f"{of.encoding or 'no encoding'}, {of.schema or 'no schema'}"
+        return f"declared as {stated}; its messages are msgpack, {tag_of(kind)}"
     ours, theirs = _fields(schema_of(kind), kind), _fields(of.text, kind)
     shared = min(len(ours), len(theirs))
     if not theirs or ours[:shared] != theirs[:shared]:
@@ -79,16 +79,16 @@ def _fields(text: bytes, kind: type[Message]) -> list[Any]:
 
 def _declarations(log: Log) -> Iterator[Frame]:
     """The schema and channel records, in chunks or in the index behind them."""
-    wanted = (Opcode.SCHEMA, Opcode.CHANNEL)
+    opcodes = (Opcode.SCHEMA, Opcode.CHANNEL)
     with log.path.open("rb") as file:
         try:
             for frame in frames(file, log.path):
-                if frame.opcode in wanted:
+                if frame.opcode in opcodes:
                     yield frame
                 elif frame.opcode == Opcode.CHUNK:
                     try:
                         every = records(expanded(frame.body))
-                        inside = [each for each in every if each.opcode in wanted]
+                        inside = [each for each in every if each.opcode in opcodes]
                     except (*MALFORMED, ValueError, zstandard.ZstdError):
                         continue
                     yield from inside

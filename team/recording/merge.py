@@ -57,9 +57,9 @@ def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
         values = {
             f"{name}@{file}": log.metadata.get(name) for file, log in zip(files, logs, strict=True)
         }
-        said = {value for value in values.values() if value is not None}
-        if len(said) == 1:
-            merged[name] = said.pop()
+        distinct = {value for value in values.values() if value is not None}
+        if len(distinct) == 1:
+            merged[name] = distinct.pop()
         else:
             merged |= {at: value for at, value in values.items() if value is not None}
     return {**merged, MERGED: ", ".join(files)}

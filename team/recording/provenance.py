@@ -70,8 +70,8 @@ def _cpu() -> tuple[str, str]:
         return cpu()
     code = f"from {__name__} import cpu; print(*cpu(), sep='\\n')"
     asked = [sys.executable, "-P", "-c", code]
-    told = subprocess.run(asked, capture_output=True, check=True, text=True).stdout  # noqa: S603 - our own program
-    name, features = told.splitlines()
+    output = subprocess.run(asked, capture_output=True, check=True, text=True).stdout  # noqa: S603 - our own program
+    name, features = output.splitlines()
     return name, features
 
 

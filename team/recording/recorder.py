@@ -175,14 +175,16 @@ class Recorder:
         return tag_in(sample.payload)
 
     def _register(self, key: str, tag: str) -> int:
-        said = declaration_of(key, tag)
-        if said is None:  # of no row: kept as it is, verified by nobody
+        declaration = declaration_of(key, tag)
+        if declaration is None:  # of no row: kept as it is, verified by nobody
             return self._writer.register_channel(self._prefix + key, "", 0)
-        if said.schema not in self._schemas:
-            number = self._writer.register_schema(said.schema, said.schema_encoding, said.text)
-            self._schemas[said.schema] = number
-        number = self._schemas[said.schema]
-        return self._writer.register_channel(self._prefix + key, said.encoding, number)
+        if declaration.schema not in self._schemas:
+            number = self._writer.register_schema(
+                declaration.schema, declaration.schema_encoding, declaration.text
+            )
+            self._schemas[declaration.schema] = number
+        number = self._schemas[declaration.schema]
+        return self._writer.register_channel(self._prefix + key, declaration.encoding, number)
 
 
 def _opened_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:

@@ -135,10 +135,10 @@ def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterat
 def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
     """Position of the next chunk record, recognised by the bytes of its head."""
     file.seek(start)
-    kept, begin, ahead = b"", start, _AHEAD
+    tail, begin, ahead = b"", start, _AHEAD
     while block := file.read(ahead):
         ahead = min(2 * ahead, _BLOCK)
-        data = kept + block
+        data = tail + block
         at = data.find(_COMPRESSION)
         while at >= 0:
             found = begin + at - _TO_COMPRESSION
@@ -147,8 +147,8 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
                 if opcode == Opcode.CHUNK and found + _FRAME.size + length <= size:
                     return found
             at = data.find(_COMPRESSION, at + 1)
-        kept = data[-_TO_COMPRESSION - len(_COMPRESSION) :]
-        begin += len(data) - len(kept)
+        tail = data[-_TO_COMPRESSION - len(_COMPRESSION) :]
+        begin += len(data) - len(tail)
     return None
 
 

@@ -114,7 +114,7 @@ class RecordLoop:
         is credit: while the writing thread is far behind, nothing is reported.
         """
         noted = [(sample, self._noted(sample)) for sample in samples]
-        self._write([said for sample, said in noted if self._inventory.is_new(sample)])
+        self._write([own for sample, own in noted if self._inventory.is_new(sample)])
         if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
             return
         every = PROGRESS_EVERY if samples else 1
@@ -169,8 +169,8 @@ class RecordLoop:
 
     def tell(self, scenario: Sequence[Configuration]) -> None:
         """Writes the messages that a world would have published, where there is none."""
-        said = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
-        self._write([each for each in said if self._inventory.is_new(each)])
+        announced = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
+        self._write([each for each in announced if self._inventory.is_new(each)])
 
     def close(self) -> None:
         """Completes the log; raises `RecorderError` if it can not be written."""

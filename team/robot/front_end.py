@@ -74,11 +74,11 @@ class FrontEnd:
         """Whether it waits for the map that it localises in."""
         return self._known is None
 
-    def know(self, told: m.KnownMap) -> None:
+    def know(self, message: m.KnownMap) -> None:
         """Take the map to localise in; of two the newer one by its stamp."""
-        if self._known_ns is None or told.stamp_ns > self._known_ns:
-            self._known_ns = told.stamp_ns
-            self._known = self._sensible(KnownMap(*translate.landmarks_of(told)))
+        if self._known_ns is None or message.stamp_ns > self._known_ns:
+            self._known_ns = message.stamp_ns
+            self._known = self._sensible(KnownMap(*translate.landmarks_of(message)))
 
     def _sensible(self, known: KnownMap) -> KnownMap:
         """A known map without the landmarks beyond the bounds."""

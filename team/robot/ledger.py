@@ -19,7 +19,7 @@ it.
 """
 
 
-def unheard(_number: int, _disposition: str) -> None:
+def no_listener(_number: int, _disposition: str) -> None:
     """Ignores the dispositions of single measurements."""
 
 
@@ -32,10 +32,12 @@ class Ledger:
         disposition of each.
     """
 
-    def __init__(self, used: str, resumed: int = 0, said: OnDisposition = unheard) -> None:
+    def __init__(
+        self, used: str, resumed: int = 0, on_disposition: OnDisposition = no_listener
+    ) -> None:
         self.used = used
         self.counts = Counter({used: resumed} if resumed else {})
-        self._said = said
+        self._on_disposition = on_disposition
         self._scans: dict[int, int] = {}
         self._detections: dict[int, int] = {}
         self._sighted: set[int] = set()
@@ -59,14 +61,14 @@ class Ledger:
                     pass
         disposition = taken if rejected is None else rejected.disposition
         self.counts[disposition] += 1
-        self._said(number, disposition)
+        self._on_disposition(number, disposition)
 
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
         """Recounts measurements that were counted as used and were not, for this reason."""
         for number in numbers:
             self.counts[used] -= 1
             self.counts[reason.disposition] += 1
-            self._said(number, reason.disposition)
+            self._on_disposition(number, reason.disposition)
             self._scans.pop(number, None)
             self._detections.pop(number, None)
 

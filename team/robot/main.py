@@ -149,9 +149,9 @@ class RobotShell:
             for sample in samples:
                 if sample.key == ch.RECORDER_PROGRESS.key(self.node.robot):
                     with suppress(WireError):
-                        said = decoded(sample.payload, m.Progress)
-                        recorded[said.incarnation] = max(
-                            recorded.get(said.incarnation, 0), said.submaps
+                        progress = decoded(sample.payload, m.Progress)
+                        recorded[progress.incarnation] = max(
+                            recorded.get(progress.incarnation, 0), progress.submaps
                         )
 
         self.bus.subscribe(ch.RECORDER_PROGRESS, self.node.robot)
@@ -276,7 +276,7 @@ class RobotShell:
         self._doubts_due_s = time.monotonic() + CONFIRMED_S
         doubted, self._doubted = self._doubted, {}
         for (incarnation, count), sample in doubted.items():
-            wanted = m.MeasurementsRequest(
+            request = m.MeasurementsRequest(
                 stamp_ns=0,
                 robot=self.node.robot,
                 incarnation=incarnation,
@@ -285,7 +285,7 @@ class RobotShell:
                 only=True,
             )
             try:
-                replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, wanted, ASK_TIMEOUT_S)
+                replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, request, ASK_TIMEOUT_S)
                 numbers = {reply_of(each, m.Measurement).number for each in replies}
             except (BusError, WireError) as error:
                 _LOG.warning("%s", error)

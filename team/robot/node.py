@@ -25,7 +25,7 @@ from team.pairs import FEEDBACK, PAIRS
 from team.rejection import UNMEASURED, Rejection
 from team.robot.estimator import Estimates
 from team.robot.front_end import FrontEnd
-from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition, unheard
+from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition, no_listener
 from team.robot.maps import RunningMaps
 from team.robot.outbox import Outbox
 from team.robot.pace import Pace
@@ -77,7 +77,7 @@ class RobotNode:
         poses: RunningPoses | None = None,
         replaced: Replaced | None = None,
         on_window: Callable[[ClosedWindow], None] = lambda _: None,
-        on_disposition: OnDisposition = unheard,
+        on_disposition: OnDisposition = no_listener,
     ) -> None:
         self.config = config
         self.robot = config.id
@@ -91,7 +91,7 @@ class RobotNode:
         self._inbox = Inbox()
         self._stream_end = EndOfStream(config.id, self._inbox)
         self._front = FrontEnd(config, self.warnings)
-        self.ledger = Ledger(self._front.estimator.used, said=self._on_disposition)
+        self.ledger = Ledger(self._front.estimator.used, on_disposition=self._on_disposition)
         """Law 1's account of the incarnation that is being consumed."""
         self._outbox = Outbox(config.id, exchange)
         submaps = PAIRS[config.estimator, config.fusion] == "submap"
@@ -108,7 +108,7 @@ class RobotNode:
         self._passed_ns = 0
         self._pending: list[Outgoing] = []
         self._done = False
-        self._has_said_done = False
+        self._has_sent_done = False
         self._dones: list[m.Done] = []
         self._withdrawn: set[str] = set()
         self.finished = False
@@ -156,16 +156,18 @@ class RobotNode:
         """The first messages of the node: its configuration."""
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
 
-    def take_over(self, kept: Sequence[m.Message]) -> None:
+    def take_over(self, stored: Sequence[m.Message]) -> None:
         """Continue where the centre's set of this robot ends; the latest incarnation comes first.
 
         The submaps of an earlier process can then be requested from this one, too.
         """
-        start = kept[0]
+        start = stored[0]
         assert isinstance(start, m.InitialPose)
-        of_it = (s for s in kept if isinstance(s, m.Submap) and s.incarnation == start.incarnation)
+        of_it = (
+            s for s in stored if isinstance(s, m.Submap) and s.incarnation == start.incarnation
+        )
         self.resume(start, list(of_it))
-        for message in kept:
+        for message in stored:
             self._outbox.keep(message)
 
     def answer_submaps(self, request: bytes) -> list[bytes]:
@@ -265,7 +267,7 @@ class RobotNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
-        return self._sound([*self._heard(message), *self._go_on()])
+        return self._sound([*self._handled(message), *self._go_on()])
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue behind a measurement whose handling raised an exception, as if it had not come.
@@ -277,7 +279,7 @@ class RobotNode:
             self.ledger.count(self._taking, Rejection.SET_ASIDE)
             self._taking = None
             self._front.put_back()
-        if self._done and not self._has_said_done:
+        if self._done and not self._has_sent_done:
             self._pending += self._last_words()
         return self._sound(self._go_on())
 
@@ -293,7 +295,7 @@ class RobotNode:
                 self.warnings.append(f"withheld: {each.key}, {why}")
         return sound
 
-    def _heard(self, message: m.Message) -> list[Outgoing]:
+    def _handled(self, message: m.Message) -> list[Outgoing]:
         """Handle a message at once; returns what to publish before further measurements are
         taken.
         """
@@ -346,14 +348,14 @@ class RobotNode:
         if order.robot in self._withdrawn:
             return []
         self._withdrawn.add(order.robot)
-        heard = m.WithdrawalHeard(
+        received = m.WithdrawalHeard(
             stamp_ns=order.stamp_ns,
             robot=self.robot,
             withdrawn=order.robot,
             by=order.by,
             reason=order.reason,
         )
-        return [Outgoing(ch.WITHDRAWALS_HEARD, self.robot, heard)]
+        return [Outgoing(ch.WITHDRAWALS_HEARD, self.robot, received)]
 
     # The stream.
 
@@ -404,7 +406,7 @@ class RobotNode:
             case m.Odometry() | m.Increment() | m.Steering():
                 self._steps += 1
                 estimates, self._rejected = self._front.drive(measurement)
-                out += self._said_of(estimates)
+                out += self._messages_of(estimates)
             case m.Observations() | m.Points() | m.Detections():
                 self.ledger.count(measurement, self._front.observe(measurement))
             case m.Sightings():
@@ -426,7 +428,7 @@ class RobotNode:
             self._front.keep(self._taking)
             self._taking = None
 
-    def _said_of(self, estimates: Estimates) -> list[Outgoing]:
+    def _messages_of(self, estimates: Estimates) -> list[Outgoing]:
         """The messages for what the estimator has produced."""
         closed, writer = estimates.closed, self._writer
         if closed is not None:
@@ -497,7 +499,7 @@ class RobotNode:
 
     def _begin_incarnation(self, start: m.InitialPose) -> None:
         self._front.begin(start)
-        self.ledger = Ledger(self._front.estimator.used, said=self._on_disposition)
+        self.ledger = Ledger(self._front.estimator.used, on_disposition=self._on_disposition)
         self._outbox.keep(start)
         self._maps.begin_incarnation()
         self._pace.begin_incarnation()
@@ -513,7 +515,7 @@ class RobotNode:
             return []
         self._passed_ns = self._now_ns
         if self._done:  # the driver had ended, and has come back: its last word is not the last
-            self._done = self._has_said_done = False
+            self._done = self._has_sent_done = False
             self._dones.append(self._incarnation_done())
             return []
         out = self._close_incarnation()
@@ -523,7 +525,7 @@ class RobotNode:
 
     def _close_incarnation(self) -> list[Outgoing]:
         estimates, uncovered = self._front.estimator.finish()
-        out = self._said_of(estimates)
+        out = self._messages_of(estimates)
         if estimates.closed is None:
             self.ledger.leave_out(set())
         self.ledger.uncover(uncovered)
@@ -542,7 +544,7 @@ class RobotNode:
     def _last_words(self) -> list[Outgoing]:
         out = self._release(())
         dones = [self._incarnation_done(), *self._dones]
-        self._has_said_done = True
+        self._has_sent_done = True
         return [*out, self._progress(), *(Outgoing(ch.ROBOT_DONE, self.robot, d) for d in dones)]
 
     def _counted(self) -> int:

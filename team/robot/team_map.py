@@ -69,13 +69,14 @@ class TeamMap:
         submaps have no joint solution, that is found once and raised again at every keyframe.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
-            told = translate.prior_of(prior)
+            robot_prior = translate.prior_of(prior)
             pending = [
-                told.shared.taken(each.named) for each in submaps[max(0, prior.sequence + 1) :]
+                robot_prior.shared.taken(each.named)
+                for each in submaps[max(0, prior.sequence + 1) :]
             ]
-            self._prior, self._shared, self._submaps = prior, told.shared, len(submaps)
+            self._prior, self._shared, self._submaps = prior, robot_prior.shared, len(submaps)
             try:
-                self._followed = followed(told.whole, pending)
+                self._followed = followed(robot_prior.whole, pending)
             except UNSOLVABLE as error:
                 self._followed = error
         if isinstance(self._followed, Exception):

@@ -165,10 +165,10 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     robot = getattr(message, "robot", name)
     if "{robot}" in channel.template and robot != name:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
-    said_by = _said_by(channel, message)
-    if said_by not in (None, channel.publisher(name)):
+    sender = _sender_of(channel, message)
+    if sender not in (None, channel.publisher(name)):
         raise WireError(
-            "wrong field", f"a message of {str(said_by)[:80]!r} on the key {sample.key!r}"
+            "wrong field", f"a message of {str(sender)[:80]!r} on the key {sample.key!r}"
         )
     return channel, name, message
 
@@ -186,7 +186,7 @@ def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
             _LOG.debug("dropped %s: %s", sample.key[:80], error)
 
 
-def _said_by(channel: Channel, message: Message) -> str | None:
+def _sender_of(channel: Channel, message: Message) -> str | None:
     """The node that a message gives as its sender; None where it gives none."""
     match message:
         case Configuration() | Progress() | Status() | Liveliness() | Fault():
@@ -222,30 +222,30 @@ never.
 """
 
 
-LATEST_KEPT = 8_192
+LATEST_CACHE = 8_192
 """Number of publications of a `latest` key that its publisher stores: a robot may be 4096
 measurements ahead.
 """
-CLOUDS_KEPT = 1_024
+CLOUDS_CACHE = 1_024
 """The same for particles, of kilobytes each."""
-MAPS_KEPT = 256
+MAPS_CACHE = 256
 """The same for maps, of tens of kilobytes each; a joint covariance is larger."""
-VIEWS_KEPT = 256
+VIEWS_CACHE = 256
 """The same for views, of tens of kilobytes each."""
-ALL_KEPT = 1_000_000
+WHOLE_CACHE = 1_000_000
 
 
-def kept_of(channel: Channel) -> int:
+def cache_size(channel: Channel) -> int:
     """Number of publications of a key that its publisher stores for late joiners and after a
     cut.
     """
     if channel.delivery == "all":
-        return ALL_KEPT
+        return WHOLE_CACHE
     if channel.message in (FusedMap, MapEstimate, Prior):
-        return MAPS_KEPT
+        return MAPS_CACHE
     if channel is VIEW:
-        return VIEWS_KEPT
-    return CLOUDS_KEPT if channel.message is ParticleCloud else LATEST_KEPT
+        return VIEWS_CACHE
+    return CLOUDS_CACHE if channel.message is ParticleCloud else LATEST_CACHE
 
 
 @dataclass
@@ -256,7 +256,7 @@ class MemoryNetwork:
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
-    kept: dict[str, deque[tuple["MemoryBus", Sample]]] = field(default_factory=dict)
+    stored: dict[str, deque[tuple["MemoryBus", Sample]]] = field(default_factory=dict)
     answers: list[tuple[Channel, str, Answer]] = field(default_factory=list)
     alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
 
@@ -264,8 +264,8 @@ class MemoryNetwork:
         """Delivers a sample to every other bus that subscribed, and stores it for late joiners."""
         found = channel_of(sample.key)
         if found is not None and found[0].delivery != "stream":
-            kept = self.kept.setdefault(sample.key, deque(maxlen=kept_of(found[0])))
-            kept.append((source, sample))
+            stored = self.stored.setdefault(sample.key, deque(maxlen=cache_size(found[0])))
+            stored.append((source, sample))
         for bus in self.buses:
             if bus is not source:
                 bus.offer(sample)
@@ -297,9 +297,9 @@ class MemoryBus:
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
         """Subscribes to this channel; the samples stored for late joiners come first."""
-        for key, kept in self._network.kept.items():
+        for key, stored in self._network.stored.items():
             if _is_of(channel, name, key) and not self._subscribed(key):
-                requested = list(kept) if whole or channel.delivery == "all" else [kept[-1]]
+                requested = list(stored) if whole or channel.delivery == "all" else [stored[-1]]
                 self._arrived.extend(sample for source, sample in requested if source is not self)
         if whole:
             self._whole.add(channel.name)
@@ -348,12 +348,12 @@ class MemoryBus:
 
     def again(self) -> None:
         """Delivers the stored samples of whole subscriptions and of `all` channels once more."""
-        for key, kept in self._network.kept.items():
+        for key, stored in self._network.stored.items():
             found = channel_of(key)
             if found is None or not self._subscribed(key):
                 continue
             if found[0].delivery == "all" or found[0].name in self._whole:
-                self._arrived.extend(sample for source, sample in kept if source is not self)
+                self._arrived.extend(sample for source, sample in stored if source is not self)
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
         """Nothing is lost in memory: an empty table."""

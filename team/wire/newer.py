@@ -13,7 +13,7 @@ from team.wire import messages as m
 SetOrder = tuple[int, int, tuple[tuple[str, int, int], ...]]
 
 
-def set_order(heard: int, members: Sequence[m.VersionEntry]) -> SetOrder:
+def set_order(received: int, members: Sequence[m.VersionEntry]) -> SetOrder:
     """Sort key of a set: first the number of submaps that the centre had received, then the set's
     size.
 
@@ -21,19 +21,19 @@ def set_order(heard: int, members: Sequence[m.VersionEntry]) -> SetOrder:
     with the same number the larger one contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
-    return heard, sum(each.sequence + 1 for each in members), vector
+    return received, sum(each.sequence + 1 for each in members), vector
 
 
-def is_newer_prior(new: m.Prior, held: m.Prior | None) -> bool:
+def is_newer_prior(new: m.Prior, known: m.Prior | None) -> bool:
     """Compares incarnation, then set, then the robot's own number of submaps in the set."""
 
     def order(prior: m.Prior) -> tuple[int, SetOrder, int]:
         return prior.incarnation, set_order(prior.heard, prior.members), prior.sequence
 
-    return held is None or order(new) > order(held)
+    return known is None or order(new) > order(known)
 
 
-def is_newer_map(new: m.FusedMap, held: m.FusedMap | None) -> bool:
+def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
     """Compares: a final map is the newest; then exchange, then set, and a complete map before a
     provisional one.
     """
@@ -42,37 +42,37 @@ def is_newer_map(new: m.FusedMap, held: m.FusedMap | None) -> bool:
         members = set_order(fused.heard, fused.members)
         return fused.final, fused.exchange, members, not fused.provisional
 
-    return held is None or order(new) > order(held)
+    return known is None or order(new) > order(known)
 
 
-def further(new: m.Progress, held: m.Progress | None) -> m.Progress:
+def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
     """The robot's progress as the larger numbers of both messages; of a newer incarnation, that
     message.
 
     A restarted process first reports smaller numbers than in its earlier life. The larger ones
     remain true: the same measurements give the same submaps.
     """
-    if held is None or new.incarnation > held.incarnation:
+    if known is None or new.incarnation > known.incarnation:
         return new
-    if new.incarnation < held.incarnation:
-        return held
+    if new.incarnation < known.incarnation:
+        return known
     return m.Progress(
-        stamp_ns=max(new.stamp_ns, held.stamp_ns),
+        stamp_ns=max(new.stamp_ns, known.stamp_ns),
         node=new.node,
         robot=new.robot,
         incarnation=new.incarnation,
-        measurements=max(new.measurements, held.measurements),
-        submaps=max(new.submaps, held.submaps),
+        measurements=max(new.measurements, known.measurements),
+        submaps=max(new.submaps, known.submaps),
     )
 
 
-def later_end(new: m.End, held: m.End | None) -> m.End:
+def later_end(new: m.End, known: m.End | None) -> m.End:
     """The end of the streams by the larger counter of each stream in both messages; notes of
     `new`.
     """
-    if held is None:
+    if known is None:
         return new
-    streams = {each.robot: each for each in held.streams}
+    streams = {each.robot: each for each in known.streams}
     for each in new.streams:
         before = streams.get(each.robot)
         if before is None or (each.incarnation, each.measurements) > (
@@ -81,10 +81,10 @@ def later_end(new: m.End, held: m.End | None) -> m.End:
         ):
             streams[each.robot] = each
     ordered = tuple(streams[robot] for robot in sorted(streams))
-    return m.End(stamp_ns=max(new.stamp_ns, held.stamp_ns), streams=ordered, notes=new.notes)
+    return m.End(stamp_ns=max(new.stamp_ns, known.stamp_ns), streams=ordered, notes=new.notes)
 
 
-def later_head(new: m.StreamHead, held: m.StreamHead | None) -> m.StreamHead:
+def later_head(new: m.StreamHead, known: m.StreamHead | None) -> m.StreamHead:
     """The message with the larger counter; of equal ones the newer, unless only the other says
     "ended".
     """
@@ -92,4 +92,4 @@ def later_head(new: m.StreamHead, held: m.StreamHead | None) -> m.StreamHead:
     def order(head: m.StreamHead) -> tuple[int, int, bool]:
         return head.incarnation, head.measurements, head.state == "ended"
 
-    return new if held is None or order(new) >= order(held) else held
+    return new if known is None or order(new) >= order(known) else known

@@ -15,7 +15,7 @@ def kept_in(path: Path, content: bytes) -> int:
     path.write_bytes(content)
     store = Store(path)
     store.close()
-    return len(store.kept)
+    return len(store.members)
 
 
 def test_what_was_appended_is_there_again_and_goes_on(tmp_path: Path) -> None:
@@ -24,13 +24,13 @@ def test_what_was_appended_is_there_again_and_goes_on(tmp_path: Path) -> None:
     store.append(MEMBERS[:3])
     store.close()
     again = Store(path)
-    assert again.kept == MEMBERS[:3]
+    assert again.members == MEMBERS[:3]
     again.append(MEMBERS[3:])
     again.close()
     found = Replica(["r1", "r2"])
     last = Store(path)
     last.close()
-    for each in last.kept:
+    for each in last.members:
         found.add(each)
     assert found.submaps == 4
 

@@ -5,7 +5,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire.zenoh.arrivals import HELD_S, PATIENCE_S, Arrivals
+from team.wire.zenoh.arrivals import DELAY_S, PATIENCE_S, Arrivals
 
 
 @given(st.permutations(range(8)), st.lists(st.integers(0, 7), max_size=8))
@@ -56,8 +56,8 @@ def test_what_waits_behind_a_gap_goes_on_after_a_while() -> None:
     arrivals: Arrivals[int] = Arrivals(0)
     assert arrivals.take(1, 1) == arrivals.take(2, 2) == []
     arrivals.due(0.0)
-    assert arrivals.overdue(HELD_S - 0.1) == []
-    assert arrivals.overdue(HELD_S) == [1, 2]
+    assert arrivals.overdue(DELAY_S - 0.1) == []
+    assert arrivals.overdue(DELAY_S) == [1, 2]
     assert arrivals.take(3, 3) == [3]
     assert arrivals.take(0, 0) == [0]
 

@@ -15,7 +15,7 @@ from team import the_end
 from team.the_end import TheEnd
 from team.wire import channels as c
 from team.wire import messages as m
-from team.wire.bus import MAPS_KEPT, BusError, Outgoing, Sample, opened
+from team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from team.wire.zenoh import bus as zenoh_bus
 from team.wire.zenoh.bus import ZenohBus
@@ -113,7 +113,7 @@ def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint: s
         ZenohBus("t", link.endpoint) as sink,
     ):
         flowing(source, sink, c.FUSED_MAP)
-        for i in range(10 + MORE + MAPS_KEPT):
+        for i in range(10 + MORE + MAPS_CACHE):
             if i == 10:
                 arrived = received(sink, 10)
                 link.cut()

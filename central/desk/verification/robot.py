@@ -8,7 +8,7 @@ from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
 from team.robot.front_end import FrontEnd
-from team.robot.ledger import OnDisposition, unheard
+from team.robot.ledger import OnDisposition, no_listener
 from team.robot.node import RobotNode
 from team.robot.poses import RunningPoses
 from team.robot.statements import MessageWriter
@@ -52,7 +52,7 @@ class RecomputedRobot:
         config: RobotConfig,
         digest: bytes,
         recorded: PriorsNamed,
-        on_disposition: OnDisposition = unheard,
+        on_disposition: OnDisposition = no_listener,
     ) -> None:
         self.node = RobotNode(
             config,

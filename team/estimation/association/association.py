@@ -53,9 +53,9 @@ def associated(scans: Scans, settings: Association) -> Associated:
     now = smoothed(scans, landmark_of, now.poses, points)
     landmark_of = _certain(scans, landmark_of, names, now, settings)
     confirmed = _confirmed(landmark_of, names, settings)
-    clutter = _looked_in_vain(scans, landmark_of, confirmed, now, settings)
-    kept = np.where(np.append(confirmed, False)[landmark_of], landmark_of, NOBODY)
-    landmark_of, names, _ = _renumbered(kept, names, now.landmarks)
+    clutter = _missed_too_often(scans, landmark_of, confirmed, now, settings)
+    remaining = np.where(np.append(confirmed, False)[landmark_of], landmark_of, NOBODY)
+    landmark_of, names, _ = _renumbered(remaining, names, now.landmarks)
     seen = _seen(scans, landmark_of, len(names))
     counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
     return Associated(landmark_of, names, counts, seen, tuple(first.slips), clutter)
@@ -83,13 +83,13 @@ def _renumbered(
     points: Float[np.ndarray, "before 2"],
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     """Renumber the landmarks that have a detection: by name, then by their first detection."""
-    kept, first = np.unique(landmark_of, return_index=True)
-    kept, first = kept[kept != NOBODY], first[kept != NOBODY]
-    unnamed = names[kept] == NOBODY
-    kept = kept[np.lexsort((np.where(unnamed, first, names[kept]), unnamed))]
+    remaining, first = np.unique(landmark_of, return_index=True)
+    remaining, first = remaining[remaining != NOBODY], first[remaining != NOBODY]
+    unnamed = names[remaining] == NOBODY
+    remaining = remaining[np.lexsort((np.where(unnamed, first, names[remaining]), unnamed))]
     number = np.full(len(names) + 1, NOBODY)  # the last one is that of NOBODY
-    number[kept] = np.arange(len(kept))
-    return number[landmark_of], names[kept], points[kept]
+    number[remaining] = np.arange(len(remaining))
+    return number[landmark_of], names[remaining], points[remaining]
 
 
 def _again(
@@ -184,7 +184,7 @@ def _confirmed(
     return np.asarray((counts >= settings.least_seen) | (names != NOBODY))
 
 
-def _looked_in_vain(
+def _missed_too_often(
     scans: Scans,
     landmark_of: Int64[np.ndarray, " N"],
     confirmed: Bool[np.ndarray, " L"],

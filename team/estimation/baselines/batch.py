@@ -98,11 +98,15 @@ class Batch(Point):
 
     def cost_of(self, other: "Batch") -> float:
         """Σ w χ² of another estimate with this one's noise and weights: what a step lowers."""
-        told, _ = factors_of.start_residuals(self.factors.starts, other.poses)
+        start_residual, _ = factors_of.start_residuals(self.factors.starts, other.poses)
         moved = factors_of.motion_residuals(self.factors.motions, other.poses).residual
         chi2 = np.sum(other.seen.residual**2 * self._precision, axis=1)
         return (
-            float(np.einsum("ni,nij,nj->", told, self.factors.starts.information, told))
+            float(
+                np.einsum(
+                    "ni,nij,nj->", start_residual, self.factors.starts.information, start_residual
+                )
+            )
             + float(np.einsum("ni,nij,nj->", moved, self.factors.motions.information, moved))
             + float(self._weight @ chi2)
         )
@@ -126,7 +130,7 @@ class Batch(Point):
         Unknowns: ξ of each pose, then the landmarks.
         """
         starts, motions = self.factors.starts, self.factors.motions
-        told, of_start = factors_of.start_residuals(starts, self.poses)
+        start_residual, of_start = factors_of.start_residuals(starts, self.poses)
         moved, before, after = factors_of.motion_residuals(motions, self.poses)
         seen, of_pose, of_landmark = self.seen
         start = of_start.transpose(0, 2, 1) @ starts.information
@@ -147,7 +151,7 @@ class Batch(Point):
         )
         gradient = self.factors.gathered(
             (
-                start @ told[:, :, None],
+                start @ start_residual[:, :, None],
                 before_ @ moved[:, :, None],
                 after_ @ moved[:, :, None],
                 pose_ @ seen[:, :, None],
@@ -213,12 +217,14 @@ def initial_state(
     """The robots' start poses with their covariances in (x, y, θ); None: exactly known."""
     mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
     order = np.arange(len(starts))
-    told = np.array([_start_information(*start) for start in starts.values()]).reshape(-1, 3, 3)
+    information = np.array([_start_information(*start) for start in starts.values()]).reshape(
+        -1, 3, 3
+    )
     none, nothing = np.empty(0, np.int64), np.empty(0)
     factors = Factors(
         len(starts),
         0,
-        Starts(order, mean, told),
+        Starts(order, mean, information),
         Motions(none, none, np.empty((0, 3)), np.empty((0, 3, 3))),
         Measurements(none, none, nothing, nothing, np.empty((0, 3))),
     )

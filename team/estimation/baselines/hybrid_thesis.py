@@ -84,14 +84,14 @@ def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> 
 
     Nothing in it depends on anything else, and of the pose's covariance nothing is left.
     """
-    kept = np.isin(state.ids, ids)
-    blocks = state.covariances[kept]
+    observed = np.isin(state.ids, ids)
+    blocks = state.covariances[observed]
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
     return Particles(
         poses=np.tile(state.pose, (particles, 1)),
         log_weights=np.full(particles, -np.log(particles)),
-        ids=state.ids[kept],
-        means=np.tile(state.landmarks[kept], (particles, 1, 1)),
+        ids=state.ids[observed],
+        means=np.tile(state.landmarks[observed], (particles, 1, 1)),
         covariances=np.tile(triangles, (particles, 1, 1)),
     )
 
@@ -107,13 +107,13 @@ def absorbed(
     This is the feedback of the thesis' fused map (section 5.2): what is fused from this state again
     counts its measurements again.
     """
-    kept = ~np.isin(state.ids, ids)
-    merged = np.concatenate((state.ids[kept], ids))
+    others = ~np.isin(state.ids, ids)
+    merged = np.concatenate((state.ids[others], ids))
     order = np.argsort(merged)
     return ThesisState(
         state.pose,
         state.pose_covariance,
         merged[order],
-        np.concatenate((state.landmarks[kept], landmarks))[order],
-        np.concatenate((state.covariances[kept], covariances))[order],
+        np.concatenate((state.landmarks[others], landmarks))[order],
+        np.concatenate((state.covariances[others], covariances))[order],
     )

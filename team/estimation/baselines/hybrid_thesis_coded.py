@@ -117,14 +117,14 @@ def absorbed(
 ) -> CodedState:
     """Every particle takes over these landmarks and covariances (`recieve_information`)."""
     old, count = state.particles, len(state.particles.poses)
-    kept = ~np.isin(old.ids, ids)
+    others = ~np.isin(old.ids, ids)
     triangles = np.stack((covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]), axis=1)
     after = replace(
         old,
-        ids=np.concatenate((old.ids[kept], ids)),
-        means=np.concatenate((old.means[:, kept], np.tile(landmarks, (count, 1, 1))), axis=1),
+        ids=np.concatenate((old.ids[others], ids)),
+        means=np.concatenate((old.means[:, others], np.tile(landmarks, (count, 1, 1))), axis=1),
         covariances=np.concatenate(
-            (old.covariances[:, kept], np.tile(triangles, (count, 1, 1))), axis=1
+            (old.covariances[:, others], np.tile(triangles, (count, 1, 1))), axis=1
         ),
     )
     return CodedState(replace(after, poses=state.drawn.poses), after)

@@ -198,8 +198,8 @@ def _judged(window: _Measurements, odds: Float[np.ndarray, " N"], before: Taken)
     Each of k measurements is predicted by the k − 1 others, so their odds are weighted by (k −
     1)/k. A landmark that has lost all its measurements stays out.
     """
-    held = np.bincount(window.slots[before], minlength=window.landmarks)
-    taken = (odds > 0.0) & (held[window.slots] > 0)
+    earlier = np.bincount(window.slots[before], minlength=window.landmarks)
+    taken = (odds > 0.0) & (earlier[window.slots] > 0)
     count = np.bincount(window.slots[taken], minlength=window.landmarks)
     total = np.bincount(window.slots[taken], odds[taken], minlength=window.landmarks)
     evidence = window.prior + total * (count - 1) / np.maximum(count, 1)

@@ -64,11 +64,11 @@ def settled(
     found = associated(scans, settings)
     is_detection = scans.names == NOBODY
     order = np.argsort(-found.counts, kind="stable")[:most]
-    kept = np.isin(found.landmark_of, order) & (found.landmark_of != NOBODY)
+    has_number = np.isin(found.landmark_of, order) & (found.landmark_of != NOBODY)
     local = np.nonzero((found.names == NOBODY) & np.isin(np.arange(len(found.names)), order))[0]
     number = np.zeros(len(found.names) + 1, np.int64)  # the last is that of NOBODY
     number[local] = UNNAMED + np.arange(len(local))
-    numbers = np.where(kept, number[found.landmark_of], 0)[is_detection]
+    numbers = np.where(has_number, number[found.landmark_of], 0)[is_detection]
     with_detections = np.array([each.look is not None for each in events], np.bool_)
     became = _became(events, numbers, found.clutter[is_detection])
     return Settled(
@@ -171,13 +171,13 @@ def _keyframes(
 
 def _only(look: Look, numbers: Int64[np.ndarray, " n"]) -> Look:
     """The detections of a scan that have a number, under it."""
-    kept = numbers > 0
+    has_number = numbers > 0
     return replace(
         look,
-        ids=numbers[kept].astype(np.uint32),
-        ranges=look.ranges[kept],
-        bearings=look.bearings[kept],
-        own=look.own[kept],
+        ids=numbers[has_number].astype(np.uint32),
+        ranges=look.ranges[has_number],
+        bearings=look.bearings[has_number],
+        own=look.own[has_number],
     )
 
 

@@ -305,8 +305,8 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
         poses = base_shifts(poses, path, mount)
         landmarks = base_points(landmarks, np.array([0.0, 0.0, mount[2]]))
     end = poses[:, -1:] if len(path) else np.zeros((len(biases), 1, 3))
-    kept = np.concatenate((end, poses[:, window.node_keyframes]), axis=1)
-    rows = (kept.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
+    submap_poses = np.concatenate((end, poses[:, window.node_keyframes]), axis=1)
+    rows = (submap_poses.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
     return replace(local, biases=biases, sensitivity=np.concatenate(rows, axis=1))
 
 

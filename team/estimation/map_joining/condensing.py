@@ -88,13 +88,13 @@ def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
     narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c
     leaving = np.zeros(len(graph.submaps), np.bool_)
-    held = set[Stream]()
+    blocked = set[Stream]()
     for f, (contribution, *_) in enumerate(graph.submaps):
         stream = contribution.stream
-        if contribution.sequence < last[stream] and narrow[f] and stream not in held:
+        if contribution.sequence < last[stream] and narrow[f] and stream not in blocked:
             leaving[f] = True
         else:
-            held.add(stream)
+            blocked.add(stream)
     return leaving
 
 
@@ -116,12 +116,12 @@ def _condensed(island: Island, leaving: Bool[np.ndarray, " F"]) -> Island:
     out = np.repeat(eliminated[union], np.diff(graph.offset)[union])
     gain, slope, information = _schur(H, g, out)
     left, node_of = without_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
-    kept = union[~eliminated[union]]
-    numbers = places(graph.offset, kept)
+    remaining = union[~eliminated[union]]
+    numbers = places(graph.offset, remaining)
     measured = int(graph.dimensions[leaving].sum()) + 2 * int(seen.sum())
     measured += sum(len(graph.priors[k].mean) for k in np.flatnonzero(prior))
     made = Condensed(
-        nodes=node_of[kept],
+        nodes=node_of[remaining],
         at=island.state[numbers],
         headings=np.isin(numbers, graph.headings),
         information=information,
@@ -214,12 +214,12 @@ def _schur(
     """
     if not out.any():
         return 0.0, g, H
-    kept = ~out
-    cross = H[np.ix_(out, kept)]
+    remaining = ~out
+    cross = H[np.ix_(out, remaining)]
     right = np.column_stack([cross, g[out]])
     solved = cho_solve(cho_factor(H[np.ix_(out, out)], lower=True), right)
-    information = H[np.ix_(kept, kept)] - cross.T @ solved[:, :-1]
-    slope: Values = g[kept] - cross.T @ solved[:, -1]
+    information = H[np.ix_(remaining, remaining)] - cross.T @ solved[:, :-1]
+    slope: Values = g[remaining] - cross.T @ solved[:, -1]
     return float(g[out] @ solved[:, -1]), slope, 0.5 * (information + information.T)
 
 
@@ -290,9 +290,9 @@ def _chosen(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
 def _newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
     """The costs of the last HISTORY submaps of each stream, in their order."""
     counts: dict[Stream, int] = defaultdict(int)
-    kept = []
+    newest = []
     for each in reversed(submaps):
         counts[each.stream] += 1
         if counts[each.stream] <= HISTORY:
-            kept.append(each)
-    return tuple(reversed(kept))
+            newest.append(each)
+    return tuple(reversed(newest))

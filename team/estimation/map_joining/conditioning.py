@@ -156,8 +156,8 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
         beyond = _beyond_gate(doubted)
         refused = tuple(int(each.sum()) for each in beyond)
         if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
-            kept = [_without(*pair) for pair in zip(submaps, beyond, strict=True)]
-            island, _, _ = settled(_island(whole, kept, TRUSTING))
+            reduced = [_without(*pair) for pair in zip(submaps, beyond, strict=True)]
+            island, _, _ = settled(_island(whole, reduced, TRUSTING))
     cost, dof = float(island.chi2.sum()), _degrees(island)
     disputed = cost > _most(dof) or any(
         is_majority(*pair) for pair in zip(refused, known, strict=True)

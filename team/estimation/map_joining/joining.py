@@ -144,7 +144,7 @@ class Fold:
         order.
     judged: number of submaps of two islands at their last failed merge attempt, and the reason for
         the failure.
-    looked: number of submaps of an island at its last failed search for a lower minimum.
+    searched_at: number of submaps of an island at its last failed search for a lower minimum.
     iterations, change: the number of iterations and the last step [m, rad] of the main island's
         last full solution.
     refused: submaps that were received and are not in the map, in canonical order, with the reason
@@ -167,7 +167,7 @@ class Fold:
     joined: Mapping[Stream, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
-    looked: Mapping[Stream, int] = field(default_factory=dict)
+    searched_at: Mapping[Stream, int] = field(default_factory=dict)
     refused: Mapping[Key, str] = field(default_factory=dict)
     set_aside: tuple[str, ...] = ()
     landmarks: Landmarks = NO_LANDMARKS
@@ -270,7 +270,7 @@ def folded(
         waiting=waiting,
         landmarks=landmarks,
     )
-    return _with_merges(_looked(grown))
+    return _with_merges(_with_searches(grown))
 
 
 def compacted(fold: Fold) -> Fold:
@@ -340,10 +340,10 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
     expected: dict[Stream, int] = {}
     for contribution in contributions:
         stream = contribution.stream
-        wanted = expected.get(stream, fold.next_sequence(stream))
-        if contribution.sequence != wanted:
-            raise GapError(contribution, wanted)
-        expected[stream] = wanted + 1
+        sequence = expected.get(stream, fold.next_sequence(stream))
+        if contribution.sequence != sequence:
+            raise GapError(contribution, sequence)
+        expected[stream] = sequence + 1
 
 
 def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
@@ -393,23 +393,23 @@ def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> 
         home={stream: key if at == other_key else at for stream, at in fold.home.items()},
         waiting=found.waiting,
         joined={**fold.joined, gone: found.words},
-        judged={pair: said for pair, said in fold.judged.items() if not gone_keys & {*pair}},
+        judged={pair: record for pair, record in fold.judged.items() if not gone_keys & {*pair}},
         iterations=found.best.iterations,
         change=found.best.change,
     )
 
 
-def _looked(fold: Fold) -> Fold:
+def _with_searches(fold: Fold) -> Fold:
     """Searches islands of suspicious cost for a lower minimum, each time they have grown by
     PATIENCE.
     """
-    islands, looked = dict(fold.islands), dict(fold.looked)
+    islands, searched_at = dict(fold.islands), dict(fold.searched_at)
     for key, island in fold.islands.items():
         size = len(island.graph.submaps)
-        if size < PATIENCE * looked.get(key, 0) or island.graph.condensed is not None:
+        if size < PATIENCE * searched_at.get(key, 0) or island.graph.condensed is not None:
             continue
         if not suspicious(island, final_cost(island)):
             continue
-        looked[key] = size
+        searched_at[key] = size
         islands[key] = _search(island).best.island
-    return replace(fold, islands=islands, looked=looked)
+    return replace(fold, islands=islands, searched_at=searched_at)

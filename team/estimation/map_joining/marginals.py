@@ -195,24 +195,26 @@ def main_priors(
     return _priors_in(island, nearest)
 
 
-def _priors_in(island: Island, wanted: Mapping[Stream, Sequence[int]]) -> dict[Stream, RobotPrior]:
+def _priors_in(
+    island: Island, landmarks_of: Mapping[Stream, Sequence[int]]
+) -> dict[Stream, RobotPrior]:
     """A prior of each stream with the given landmarks, ascending; one solve for all of them."""
-    chosen = sorted({id_ for ids in wanted.values() for id_ in ids})
-    poses = [island.graph.streams[stream][-1] for stream in wanted]
+    chosen = sorted({id_ for ids in landmarks_of.values() for id_ in ids})
+    poses = [island.graph.streams[stream][-1] for stream in landmarks_of]
     mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
     place = {id_: 3 * len(poses) + 2 * k for k, id_ in enumerate(chosen)}
     biases = _biases_in(island)
     priors = {}
-    for k, (stream, ids) in enumerate(wanted.items()):
+    for k, (stream, ids) in enumerate(landmarks_of.items()):
         points = np.array([place[id_] for id_ in ids], dtype=np.int64)
         shared = (points[:, None] + np.arange(2)).ravel()
-        kept = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
+        columns = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
         own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
         priors[stream] = RobotPrior(
-            mean[kept[:3]],
+            mean[columns[:3]],
             np.array(ids, dtype=np.uint32),
             mean[shared].reshape(-1, 2),
-            covariance[np.ix_(kept, kept)],
+            covariance[np.ix_(columns, columns)],
             Shared(island.settings.covariance_factor, own),
         )
     return priors

@@ -110,14 +110,14 @@ def nonlinearity_warnings(island: Island) -> list[str]:
 
     Examines every stream without a given initial pose: profile cost against chi-square.
     """
-    said = []
+    texts = []
     for stream, where, node in ends(island):
         found = understated_uncertainty(island, node)
         given = island.graph.fixed[island.graph.streams[stream][0]]
         if found is not None and not given:
-            said.append(
+            texts.append(
                 f"{named(stream)} may have {where} farther off than its covariance says: "
                 f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
                 f"covariance {found.chi2:.0f}"
             )
-    return said
+    return texts

@@ -136,15 +136,15 @@ class _OneByOne:
         def after(some: Sequence[Sighting]) -> Fold | None:
             return _attempt(base, self._members, self._of(self._members), some, self._settings)
 
-        kept, bad = _greatest(candidates, lambda some: after(some) is not None)
+        accepted, bad = _greatest(candidates, lambda some: after(some) is not None)
         self._set_aside += [
             f"an inter-robot measurement of {each.teammate} by {named(each.stream)} at "
             f"{each.stamp_ns * 1e-9:.1f} s refused: with it the map has no solution"
             for each in bad
         ]
-        found = after(kept)
+        found = after(accepted)
         if found is None:  # none of the members: the fold as it was, with its measurements
-            found = replace(base, waiting=tuple(kept))
+            found = replace(base, waiting=tuple(accepted))
         return replace(found, set_aside=tuple(self._set_aside))
 
     def _of(self, members: Sequence[Contribution]) -> list[InitialPoseFactor]:
@@ -201,12 +201,12 @@ def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple
     """Adds items one after the other while `works`, by halves; returns the accepted and the
     rejected ones.
     """
-    kept: list[T] = []
+    accepted: list[T] = []
     bad: list[T] = []
 
     def add(block: Sequence[T]) -> None:
-        if not block or works([*kept, *block]):
-            kept.extend(block)
+        if not block or works([*accepted, *block]):
+            accepted.extend(block)
         elif len(block) == 1:
             bad.extend(block)
         else:
@@ -215,4 +215,4 @@ def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple
             add(block[half:])
 
     add(items)
-    return kept, bad
+    return accepted, bad

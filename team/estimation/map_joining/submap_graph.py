@@ -542,13 +542,13 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
         node of the first of them, at its value.
     """
     first: dict[int, int] = {}
-    kept = np.ones(len(graph.fixed), np.bool_)
+    remaining = np.ones(len(graph.fixed), np.bool_)
     stands_for = np.arange(len(graph.fixed))
     for id_, node in sorted(graph.landmarks.items(), key=lambda each: each[1]):
         number = becomes.get(id_, id_)
         stands_for[node] = first.setdefault(number, node)
-        kept[node] = stands_for[node] == node
-    node_of = (np.cumsum(kept) - 1)[stands_for]
+        remaining[node] = stands_for[node] == node
+    node_of = (np.cumsum(remaining) - 1)[stands_for]
     sizes = np.diff(graph.offset)
     renamed = replace(
         graph,
@@ -557,8 +557,8 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
         poses={key: int(node_of[node]) for key, node in graph.poses.items()},
         biases={key: int(node_of[node]) for key, node in graph.biases.items()},
         common={bias: int(node_of[node]) for bias, node in graph.common.items()},
-        offset=_starts(sizes[kept].tolist()),
-        fixed=graph.fixed[kept],
+        offset=_starts(sizes[remaining].tolist()),
+        fixed=graph.fixed[remaining],
         submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
         sightings=tuple(
             Encounter(seen, int(node_of[observer]), int(node_of[teammate]))
@@ -566,7 +566,7 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
         ),
         priors=tuple(each._replace(node=int(node_of[each.node])) for each in graph.priors),
     )
-    return renamed, state[np.repeat(kept, sizes)]
+    return renamed, state[np.repeat(remaining, sizes)]
 
 
 def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:

@@ -32,11 +32,11 @@ def _panel(
 
 
 @compiled
-def _places(wanted: Indices, present: Indices, place: Indices) -> None:
+def _places(requested: Indices, present: Indices, place: Indices) -> None:
     """place[i] := index of wanted[i] in `present`; both ascending, all wanted are present."""
     at = 0
-    for i in range(len(wanted)):
-        while present[at] != wanted[i]:
+    for i in range(len(requested)):
+        while present[at] != requested[i]:
             at += 1
         place[i] = at
 
@@ -252,7 +252,7 @@ def _first_columns(structure: Structure) -> Indices:
 
 @compiled
 def inverse_among(
-    structure: Structure, panels: Values, wanted: Indices
+    structure: Structure, panels: Values, requested: Indices
 ) -> Float[np.ndarray, "k k"]:
     """(L Lᵀ)⁻¹ among ascending unknowns: Wᵀ W with L W = their unit vectors.
 
@@ -261,13 +261,13 @@ def inverse_among(
     """
     columns_of, _, _, _, _ = structure
     first = _first_columns(structure)
-    solution = np.zeros((columns_of[-1], len(wanted)))
-    for c in range(len(wanted)):
-        solution[wanted[c], c] = 1.0
-    result = np.zeros((len(wanted), len(wanted)))
+    solution = np.zeros((columns_of[-1], len(requested)))
+    for c in range(len(requested)):
+        solution[requested[c], c] = 1.0
+    result = np.zeros((len(requested), len(requested)))
     for s in range(len(columns_of) - 1):
-        begin = np.searchsorted(wanted, first[s])
-        end = np.searchsorted(wanted, columns_of[s + 1])
+        begin = np.searchsorted(requested, first[s])
+        end = np.searchsorted(requested, columns_of[s + 1])
         if begin == end:
             continue
         rows, panel = _panel(structure, panels, s)

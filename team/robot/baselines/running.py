@@ -128,8 +128,10 @@ class RunningEstimator:
         judged, self._unsaid = self._unsaid, NOTHING
         self._innovation = self._innovation.plus(judged)
         map_ns = now_ns if self._filter.maps else None
-        said = (judged, now_ns) if judged.dof else None
-        return Estimates(pose_ns=pose_ns, map_ns=map_ns, cloud=self._cloud(map_ns), judged=said)
+        innovation = (judged, now_ns) if judged.dof else None
+        return Estimates(
+            pose_ns=pose_ns, map_ns=map_ns, cloud=self._cloud(map_ns), judged=innovation
+        )
 
     def _cloud(self, map_ns: int | None) -> Cloud | None:
         """The particles, where there are any and a map is published."""

@@ -13,7 +13,7 @@ PATIENCE_S = 0.5
 """Time [s] for which a publication is missing before it is requested from its publisher."""
 LONGEST_S = 8.0
 """Longest interval [s] between two requests; intervals double up to it."""
-HELD_S = 2.0
+DELAY_S = 2.0
 """Longest time [s] for which publications after a gap are delayed."""
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ class Arrivals(Generic[T]):
     gone: list[tuple[int, int]] = field(default_factory=list)
     _whole: int = field(init=False)
     _beyond: set[int] = field(default_factory=set, init=False)
-    _held: dict[int, T] = field(default_factory=dict, init=False)
+    _delayed: dict[int, T] = field(default_factory=dict, init=False)
     _since_s: float | None = field(default=None, init=False)
     _due_s: float = field(default=0.0, init=False)
     _asked: int = field(default=0, init=False)
@@ -57,7 +57,7 @@ class Arrivals(Generic[T]):
         self._advance()
         if self._loose or not self.in_order:
             return [item]
-        self._held[number] = item
+        self._delayed[number] = item
         return self._released(self._whole)
 
     def know(self, newest: int) -> None:
@@ -101,7 +101,7 @@ class Arrivals(Generic[T]):
         """The items delayed too long by a gap, in order; until the gap is closed nothing more is
         delayed.
         """
-        if self._since_s is None or now_s - self._since_s < HELD_S:
+        if self._since_s is None or now_s - self._since_s < DELAY_S:
             return []
         self._loose = True
         return self._released(self.newest + 1)
@@ -131,4 +131,4 @@ class Arrivals(Generic[T]):
             self._whole += 1
 
     def _released(self, end: int) -> list[T]:
-        return [self._held.pop(n) for n in sorted(self._held) if n < end]
+        return [self._delayed.pop(n) for n in sorted(self._delayed) if n < end]

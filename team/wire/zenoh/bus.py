@@ -243,7 +243,7 @@ class ZenohBus:
                     payload = encoded(Liveliness(stamp_ns=0, node=node, alive=alive))
                     samples.append(Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0))
             case Heartbeat():
-                self._recovery.heard(item)
+                self._recovery.take_heartbeat(item)
             case CacheAnswer():
                 samples += self._recovery.answered(item)
             case Reply():

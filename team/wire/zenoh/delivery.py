@@ -12,7 +12,7 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from team.wire.bus import ALL_KEPT, kept_of
+from team.wire.bus import WHOLE_CACHE, cache_size
 from team.wire.channels import Channel, row_of
 
 _HEARTBEAT_S = 0.25
@@ -41,7 +41,7 @@ def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
         congestion_control=_BLOCK,
         priority=_PRIORITY,
         reliability=_RELIABLE,
-        cache=ext.CacheConfig(max_samples=kept_of(row), replies_config=_REPLIES),
+        cache=ext.CacheConfig(max_samples=cache_size(row), replies_config=_REPLIES),
         # Periodic, not sporadic: a sporadic heartbeat that falls into a cut is never repeated.
         sample_miss_detection=ext.MissDetectionConfig(
             heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
@@ -81,4 +81,4 @@ def _history(channel: Channel, *, whole: bool) -> ext.HistoryConfig:
     # late, and a query for one sample would take the place of the recovery of all.
     if channel.delivery == "latest" and not whole:
         return ext.HistoryConfig(max_samples=1, detect_late_publishers=False)
-    return ext.HistoryConfig(max_samples=ALL_KEPT, detect_late_publishers=True)
+    return ext.HistoryConfig(max_samples=WHOLE_CACHE, detect_late_publishers=True)

@@ -89,7 +89,7 @@ class Recovery:
             publisher = "/".join(rest.split("/")[:2])
             self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
 
-    def heard(self, beat: Heartbeat) -> None:
+    def take_heartbeat(self, beat: Heartbeat) -> None:
         """Records a publisher's last number."""
         self._arrivals_of(beat.key, beat.publisher, beat.newest).know(beat.newest)
         self._incomplete.add((beat.key, beat.publisher))
@@ -112,7 +112,7 @@ class Recovery:
             self._incomplete.add((sample.key, publisher))
         return delivered
 
-    def _arrivals_of(self, key: str, publisher: str, heard: int) -> Arrivals[Sample]:
+    def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample]:
         """The arrivals of one publisher on one key; on a `latest` channel nothing older than the
         first known number is requested.
         """
@@ -120,7 +120,7 @@ class Recovery:
         if found is None:
             row = row_of(key)
             whole = row is None or row.delivery == "all" or row.name in self._whole
-            found = Arrivals(0 if whole else heard, in_order=whole)
+            found = Arrivals(0 if whole else first_known, in_order=whole)
             self._arrivals[key, publisher] = found
         return found
 

@@ -26,8 +26,8 @@ from team.wire.channels import (
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FinalMapRequest
 from team.wire.zenoh.access import access_control
-from team.wire.zenoh.kept import Kept
 from team.wire.zenoh.session import DOOR, opened
+from team.wire.zenoh.stored import StoredMessages
 
 if TYPE_CHECKING:  # a router without keys needs none of it
     from team.keys.credentials import Credentials
@@ -81,7 +81,7 @@ class _Keeper:
     """
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._teams: defaultdict[str, Kept] = defaultdict(Kept)
+        self._teams: defaultdict[str, StoredMessages] = defaultdict(StoredMessages)
         for channel in (FINAL_MAP, TEAM_FINAL, TALLY, *REPLIES[ORDERS_KEPT]):
             key = f"team/*/{channel.key('**')}"
             session.declare_subscriber(key, Callback(self._take, indirect=False))
@@ -92,27 +92,27 @@ class _Keeper:
             key = f"team/*/{channel.key()}"
             session.declare_queryable(key, Callback(answer, indirect=False))
 
-    def _of(self, key: zenoh.KeyExpr) -> tuple[Kept, str]:
+    def _of(self, key: zenoh.KeyExpr) -> tuple[StoredMessages, str]:
         """The stored messages of a key's team, and the key within the team."""
         _, team, rest = str(key).split("/", 2)
         return self._teams[team], rest
 
     def _take(self, sample: zenoh.Sample) -> None:
-        kept, key = self._of(sample.key_expr)
+        stored, key = self._of(sample.key_expr)
         if key == FINAL_MAP.key() or TEAM_FINAL.owner(key) is not None:
-            kept.end(sample.payload.to_bytes(), time.monotonic())
+            stored.end(sample.payload.to_bytes(), time.monotonic())
         elif any(channel.owner(key) is not None for channel in REPLIES[ORDERS_KEPT]):
             with suppress(WireError):  # what nobody would follow is no order
                 order = Sample(key, sample.payload.to_bytes(), 0, 0, 0)
                 opened_order(order)
-                kept.order(order.payload)
+                stored.order(order.payload)
         elif (node := TALLY.owner(key)) is not None:
-            kept.last_word(node)
+            stored.last_word(node)
 
     def _token(self, sample: zenoh.Sample) -> None:
-        kept, key = self._of(sample.key_expr)
+        stored, key = self._of(sample.key_expr)
         node = ALIVE.owner(key)
-        if node is not None and kept.token(node, alive=sample.kind == zenoh.SampleKind.PUT):
+        if node is not None and stored.token(node, alive=sample.kind == zenoh.SampleKind.PUT):
             _LOG.warning(
                 "%s of %s has gone without a last word: it was killed or cut off, or its "
                 "certificate has ended or is revoked",
@@ -122,8 +122,8 @@ class _Keeper:
 
     def _final(self, query: zenoh.Query) -> None:
         with query:
-            kept, _ = self._of(query.key_expr)
-            found = kept.answer(_asker(query), time.monotonic())
+            stored, _ = self._of(query.key_expr)
+            found = stored.answer(_asker(query), time.monotonic())
             if found is not None:
                 query.reply(query.key_expr, encoded(found))
 

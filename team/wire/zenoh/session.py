@@ -109,9 +109,9 @@ class Door:
         self._session = session
         self._connect = connect
         self._keys = keys
-        self._due = self._heard_at = 0.0
+        self._due = self._answered_at = 0.0
         self._router_ends = router_ends(connect, keys)
-        self._heard = True
+        self._answered = True
         self._deaf = 0
 
     def look(self, now_s: float) -> None:
@@ -120,11 +120,11 @@ class Door:
             return
         self._due = now_s + LINK_S
         linked = bool(self._session.info.routers_zid())
-        self._deaf = 0 if self._heard or not linked else self._deaf + 1
-        self._heard_at = now_s if self._heard else self._heard_at
+        self._deaf = 0 if self._answered or not linked else self._deaf + 1
+        self._answered_at = now_s if self._answered else self._answered_at
         # A link that comes up again just before the end Zenoh may keep behind it.
         ended = self._router_ends is not None and time.time() > self._router_ends
-        if ended or now_s - self._heard_at > FIRST_LOOK_S:
+        if ended or now_s - self._answered_at > FIRST_LOOK_S:
             refused = why_refused(self._connect, self._keys)
             if refused is not None:
                 raise BusError(refused)
@@ -136,10 +136,10 @@ class Door:
                 f"newest {self._keys.node}.pem and .key, and roster.json to the router, and start "
                 "both again"
             )
-        self._heard = False
+        self._answered = False
 
         def hear(reply: zenoh.Reply) -> None:
-            self._heard = self._heard or reply.ok is not None
+            self._answered = self._answered or reply.ok is not None
 
         key = f"team/{self._keys.team}/{DOOR}"
         self._session.liveliness().get(key, Callback(hear, indirect=False), timeout=LINK_S)

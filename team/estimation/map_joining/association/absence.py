@@ -28,8 +28,8 @@ def renumbered(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
     if not views.size:
         return views
     now = np.where(views >= 0, to[views], -1)
-    kept: Views = now[(now >= 0).sum(axis=1) >= 3]
-    return kept
+    polygons: Views = now[(now >= 0).sum(axis=1) >= 3]
+    return polygons
 
 
 def covered(

@@ -23,7 +23,7 @@ BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""
 WEAK = 2
 """An alignment with this many times fewer votes than the best one has pairs is no rival of it."""
-LOOKED_AT = 120
+EXAMINED = 120
 """Number of alignments that are examined: those with the most matched points."""
 TRIED = 8
 """Number of them that are grown: those with the fewest absent landmarks for their matched ones."""
@@ -113,7 +113,7 @@ def aligned(
         target that is in it.
     """
     votes = voted(patch.points, target.points, tolerance(profile), reach(profile), patch.parts)[
-        :LOOKED_AT
+        :EXAMINED
     ]
     votes.sort(key=lambda vote: -_promise(vote, patch, target, profile))
     found: list[Alignment] = []
@@ -294,16 +294,16 @@ def free_joint(
     away = np.hypot(*(moved(vote.motion, local)[:, None] - target.mean[None]).transpose(2, 0, 1))
     near = away.min(axis=0) < BEND * profile.same
     near[vote.second] = True
-    kept = np.flatnonzero(near)
+    nearby = np.flatnonzero(near)
     target = Joint(
-        target.mean[kept],
-        target.covariance.reshape(len(near), 2, len(near), 2)[kept][:, :, kept].reshape(
-            2 * len(kept), 2 * len(kept)
+        target.mean[nearby],
+        target.covariance.reshape(len(near), 2, len(near), 2)[nearby][:, :, nearby].reshape(
+            2 * len(nearby), 2 * len(nearby)
         ),
-        target.apart[np.ix_(kept, kept)],
+        target.apart[np.ix_(nearby, nearby)],
         target.crowd,
     )
-    m = len(kept)
+    m = len(nearby)
     c, s = np.cos(vote.motion[2]), np.sin(vote.motion[2])
     R = np.kron(np.eye(n), np.array([[c, -s], [s, c]]))
     there = moved(vote.motion, local)
@@ -318,7 +318,7 @@ def free_joint(
     apart = np.zeros((n + m, n + m), np.bool_)
     apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
     both = Joint(np.concatenate([there, target.mean]), covariance, apart, target.crowd)
-    return both, Side(n + np.arange(m), side.points, side.names[kept], kept, side.views)
+    return both, Side(n + np.arange(m), side.points, side.names[nearby], nearby, side.views)
 
 
 def _grown(

@@ -55,17 +55,17 @@ def jointly(
         return Grown((), joint, 0)
     order = _order(first, sd)
     taken = np.isin(first, order)
-    kept = np.unique(np.concatenate((first[taken], second[taken])))
+    involved = np.unique(np.concatenate((first[taken], second[taken])))
     part = Joint(
-        joint.mean[kept],
-        joint.covariance.reshape(len(joint.mean), 2, -1, 2)[kept][:, :, kept].reshape(
-            2 * len(kept), -1
+        joint.mean[involved],
+        joint.covariance.reshape(len(joint.mean), 2, -1, 2)[involved][:, :, involved].reshape(
+            2 * len(involved), -1
         ),
-        joint.apart[np.ix_(kept, kept)],
+        joint.apart[np.ix_(involved, involved)],
         joint.crowd,
-        None if joint.unseen is None else joint.unseen[kept],
+        None if joint.unseen is None else joint.unseen[involved],
     )
-    place = {int(each): k for k, each in enumerate(kept)}
+    place = {int(each): k for k, each in enumerate(involved)}
     assigned, lost = [_Assignment(0.0, (), part)], 0.0
     for each in order:
         own = place[each]
@@ -75,7 +75,7 @@ def jointly(
         best = longer[0].weight
         lost += sum(float(np.exp(one.weight - best)) for one in longer[BEAM:])
         assigned = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
-    return _agreed(joint, assigned, kept, profile, lost)
+    return _agreed(joint, assigned, involved, profile, lost)
 
 
 def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
@@ -91,11 +91,11 @@ def _of_each(joint: Joint, first: int, others: list[int], profile: AssociationPr
     likeliest one.
     """
     at = likelihoods(joint, np.full(len(others), first), np.array(others), profile)
-    kept: list[int] = []
+    distinct: list[int] = []
     for k in np.argsort(-at.llr, kind="stable").tolist():
-        if not _fragments(joint, others[k], profile).intersection(kept):
-            kept.append(others[k])
-    return np.array(kept, np.int64)
+        if not _fragments(joint, others[k], profile).intersection(distinct):
+            distinct.append(others[k])
+    return np.array(distinct, np.int64)
 
 
 def _with(
@@ -129,7 +129,7 @@ def _fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[
 def _agreed(
     joint: Joint,
     assigned: list[_Assignment],
-    kept: Indices,
+    involved: Indices,
     profile: AssociationProfile,
     lost: float,
 ) -> Grown:
@@ -152,7 +152,7 @@ def _agreed(
         sure = []
     pairs = []
     for pair in sure:
-        own = pair._replace(first=int(kept[pair.first]), second=int(kept[pair.second]))
+        own = pair._replace(first=int(involved[pair.first]), second=int(involved[pair.second]))
         joint = conditioned(joint, own.first, own.second, profile)
         pairs.append(own)
     return Grown(tuple(pairs), joint, 0)

@@ -16,7 +16,7 @@ from team.estimation.contribution import Contribution, Key, Stream, named
 
 OPEN = 2**62
 """The last submap of a side that all later submaps belong to."""
-KEPT = 400
+MOST_DECISIONS = 400
 """Number of newest decisions that are stored."""
 
 
@@ -122,14 +122,14 @@ class Landmarks:
 
     def decided(self, *decisions: Decision) -> "Landmarks":
         """The landmarks with further decisions, of which the newest are stored."""
-        return replace(self, decisions=(*self.decisions, *decisions)[-KEPT:])
+        return replace(self, decisions=(*self.decisions, *decisions)[-MOST_DECISIONS:])
 
     def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
         """Whether a closure was undone that has a third or more of these pairs of identities."""
-        wanted = {frozenset(pair) for pair in pairs}
+        proposed = {frozenset(pair) for pair in pairs}
         for each in self.undone:
             old = {frozenset((self.identity(one), self.identity(two))) for one, two in each.pairs}
-            if 3 * len(wanted & old) >= len(wanted):
+            if 3 * len(proposed & old) >= len(proposed):
                 return True
         return False
 
@@ -194,7 +194,7 @@ def united(
         the number of its smallest member; where that is the identity to be given up, the tie is
         recorded in the other direction.
     """
-    sets, told = dict(landmarks.sets), dict(landmarks.ties)
+    sets, all_ties = dict(landmarks.sets), dict(landmarks.ties)
     becomes: dict[int, int] = {}
 
     def now(number: int) -> int:
@@ -209,8 +209,8 @@ def united(
         stays, goes = sorted((one, two), key=lambda each: (each >= UNNAMED, sets.get(each, ())))
         sets[stays] = tuple(sorted((*sets.get(stays, ()), *sets.pop(goes, ()))))
         becomes[goes] = stays
-        told[goes] = tie._replace(into=stays)
-    return replace(landmarks, sets=sets, ties=told), {each: now(each) for each in becomes}
+        all_ties[goes] = tie._replace(into=stays)
+    return replace(landmarks, sets=sets, ties=all_ties), {each: now(each) for each in becomes}
 
 
 def between(one: Stream, two: Stream) -> str:

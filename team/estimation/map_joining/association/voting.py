@@ -129,8 +129,8 @@ def _baselines(
     """Pairs of points with a distance in this interval, and their distances."""
     i, j = np.triu_indices(len(points), 1)
     length = np.hypot(*(points[i] - points[j]).T)
-    kept = (length >= shortest) & (length <= longest)
-    return i[kept], j[kept], length[kept]
+    chosen = (length >= shortest) & (length <= longest)
+    return i[chosen], j[chosen], length[chosen]
 
 
 def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndarray, "3"]]:

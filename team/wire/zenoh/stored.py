@@ -20,7 +20,7 @@ others.
 
 
 @dataclass
-class Kept:
+class StoredMessages:
     """The stored messages of one team. Calls may come from any thread; times are a monotonic
     clock's [s].
     """
