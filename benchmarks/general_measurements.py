@@ -147,7 +147,7 @@ def closed_windows(robot: RobotConfig, stream: RobotStream) -> Iterator[ClosedWi
             told = stream.observations(counter)
             slam.observe(told.stamp_ns, scan_of(told))
         elif stream.kinds[counter] == ODOMETRY:
-            closed = slam.drive(*interval_of(stream.odometry(counter), robot.motion))
+            closed = slam.drive(interval_of(stream.odometry(counter), robot.motion))
             if closed is not None:
                 yield closed
 

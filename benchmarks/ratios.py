@@ -22,6 +22,7 @@ from team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_ste
 from team.estimation.hybrid_slam.innovation import innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment, increment_of
+from team.estimation.odometry import OdometryInterval
 
 MOTION = MotionModel(forward=MotionNoise(per_m=0.03), turn=MotionNoise(per_rad=0.1))
 SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)
@@ -54,7 +55,7 @@ def composed_in_a_run() -> None:
     segmenter = Segmenter(MOTION, Sensor(), 0.0)
     segmenter.begin(0)
     for k in range(1, INTERVALS + 1):
-        segmenter.drive(k * INTERVAL_NS, INTERVAL_NS, 0.3, 0.1)
+        segmenter.drive(OdometryInterval(k * INTERVAL_NS, INTERVAL_NS, 0.3, 0.1))
     segmenter.cut(INTERVALS * INTERVAL_NS)
 
 

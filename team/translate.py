@@ -11,7 +11,7 @@ from team.config import UNNAMED, RobotConfig
 from team.estimation.gaussian import Matrix, packed, unpacked
 from team.estimation.map_joining.conditioning import RobotPrior, Shared
 from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
-from team.estimation.odometry import Interval, moved, steered
+from team.estimation.odometry import OdometryInterval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
 from team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
 from team.wire import messages as m
@@ -71,21 +71,21 @@ def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
     return message.stamp_ns + round(offset_s * 1e9)
 
 
-def motion_of(message: m.AnyOdometry, config: RobotConfig) -> Interval:
+def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval:
     """One odometry interval, in the form that the robot's motion model takes."""
     end_ns, duration_ns = team_time_of(message, config.clock_offset_s), message.duration_ns
     match message:
         case m.Odometry():
-            return Interval(end_ns, duration_ns, message.forward, message.yaw_rate)
+            return OdometryInterval(end_ns, duration_ns, message.forward, message.yaw_rate)
         case m.Steering():
             speeds = steered(config.motion, message.wheel_speed, message.steering)
-            return Interval(end_ns, duration_ns, *speeds)
+            return OdometryInterval(end_ns, duration_ns, *speeds)
         case m.Increment():
             covariance = floats(message.covariance, "covariance").astype(np.float64).reshape(-1, 3)
             increment = floats(message.increment, "increment").astype(np.float64)
             motion = moved(increment, covariance if message.covariance else None)
             rates = motion.twist / max(duration_ns * 1e-9, 1e-9)
-            return Interval(end_ns, duration_ns, float(rates[0]), float(rates[2]), motion)
+            return OdometryInterval(end_ns, duration_ns, float(rates[0]), float(rates[2]), motion)
 
 
 def detections_of(

@@ -80,16 +80,15 @@ class _Stream:
                 if self.judge.time(measurement.stamp_ns) is None and (near.any() or not len(near)):
                     self.segmenter.observe(measurement.stamp_ns, *scan.only(near))
             case m.Odometry() | m.Increment() | m.Steering() if self.segmenter is not None:
-                motion = translate.motion_of(measurement, config)
-                reason = self.judge.odometry(*motion)
+                interval = translate.interval_of(measurement, config)
+                reason = self.judge.odometry(interval)
                 if reason not in UNMEASURED:
                     return
-                end_ns, duration_ns = motion[:2]
                 if self.segmenter.now_ns is None:
-                    self.segmenter.begin(end_ns - duration_ns)
-                keyframes = self.segmenter.drive(*motion, measured=reason is None)
+                    self.segmenter.begin(interval.end_ns - interval.duration_ns)
+                keyframes = self.segmenter.drive(interval, measured=reason is None)
                 self._file(keyframes, measurement.number)
-                self.covered_ns = end_ns
+                self.covered_ns = interval.end_ns
             case _:
                 pass
 

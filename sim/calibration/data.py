@@ -16,7 +16,7 @@ from sim.world.streams import (
     WorldStreams,
 )
 from team.config import MotionModel, RobotConfig
-from team.estimation.odometry import Interval, moved, steered
+from team.estimation.odometry import OdometryInterval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
 
 LARGEST_TURN_RAD = 0.35
@@ -96,17 +96,17 @@ def scan_of(seen: ObservationMeasurement) -> Scan:
     return polar_scan(seen.ids, seen.ranges, seen.bearings, seen.covariances)
 
 
-def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> Interval:
+def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> OdometryInterval:
     """The interval of odometry as a robot's front end receives it."""
     if measurement.increment is not None:
         motions = moved(measurement.increment, measurement.covariance)
         rates = motions.twist / (measurement.duration_ns * 1e-9)
         speeds = float(rates[0]), float(rates[2])
-        return Interval(measurement.stamp_ns, measurement.duration_ns, *speeds, motions)
+        return OdometryInterval(measurement.stamp_ns, measurement.duration_ns, *speeds, motions)
     speeds = measurement.forward, measurement.yaw_rate
     if measurement.steered:
         speeds = steered(motion, *speeds)
-    return Interval(measurement.stamp_ns, measurement.duration_ns, *speeds)
+    return OdometryInterval(measurement.stamp_ns, measurement.duration_ns, *speeds)
 
 
 def poses_at(

@@ -119,7 +119,7 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
         if isinstance(measurement, ObservationMeasurement):
             slam.observe(measurement.stamp_ns, scan_of(measurement))
             continue
-        closed = slam.drive(*interval_of(measurement, config.motion))
+        closed = slam.drive(interval_of(measurement, config.motion))
         if closed is not None:
             tracks.append(_track(closed, stamps, window))
             stamps = []

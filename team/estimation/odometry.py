@@ -26,7 +26,7 @@ class Moved(NamedTuple):
     covariance: Float[np.ndarray, "3 3"] | None = None
 
 
-class Interval(NamedTuple):
+class OdometryInterval(NamedTuple):
     """One odometry interval that ends at end_ns: mean forward speed [m/s] and yaw rate [rad/s].
 
     moved: the motion, where odometry tells it as one; the speeds are then those of its twist.
@@ -45,7 +45,7 @@ class Interval(NamedTuple):
         share, rest = duration_ns / self.duration_ns, rest_ns / self.duration_ns
         return part_of(motion, self.moved, self.duration_ns * 1e-9, share, rest)
 
-    def gone_on(self, end_ns: int, duration_ns: int) -> "Interval":
+    def gone_on(self, end_ns: int, duration_ns: int) -> "OdometryInterval":
         """A later interval at the same speeds."""
         if self.moved is None:
             return self._replace(end_ns=end_ns, duration_ns=duration_ns)
@@ -73,7 +73,7 @@ class Interval(NamedTuple):
         return column
 
 
-STANDING = Interval(0, 1, 0.0, 0.0)
+STANDING = OdometryInterval(0, 1, 0.0, 0.0)
 """What was measured before anything was."""
 
 

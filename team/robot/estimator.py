@@ -16,7 +16,7 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import Looks
-from team.estimation.odometry import Moved
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.estimation.submap import Became, LocalMap
 from team.pairs import ESTIMATORS
@@ -103,16 +103,7 @@ class RobotEstimator(Protocol):
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""
 
-    def drive(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-        *,
-        measured: bool = True,
-    ) -> Estimates:
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Take one odometry interval, or only its duration (not measured); returns what it led
         to.
         """

@@ -203,11 +203,11 @@ class FrontEnd:
     def drive(self, measurement: m.AnyOdometry) -> Driven:
         """Take one odometry interval, or only its duration where its motion is rejected."""
         self._goes_in(measurement)
-        motion = translate.motion_of(measurement, self._config)
-        rejected = self._judge.odometry(*motion)
+        interval = translate.interval_of(measurement, self._config)
+        rejected = self._judge.odometry(interval)
         if rejected not in UNMEASURED:
             return Driven(NOTHING_NEW, rejected)
-        return Driven(self.estimator.drive(*motion, measured=rejected is None), rejected)
+        return Driven(self.estimator.drive(interval, measured=rejected is None), rejected)
 
     def observe(self, measurement: m.AnyScan | m.Detections) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""

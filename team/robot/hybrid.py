@@ -18,7 +18,7 @@ from team.estimation.hybrid_slam.pose_grid import Looks
 from team.estimation.map_joining.conditioning import pose_now
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.map_joining.whole_map import WholeMap, absorbed, initial_map, joined
-from team.estimation.odometry import Moved
+from team.estimation.odometry import OdometryInterval
 from team.estimation.plausible import are_landmarks
 from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
@@ -83,20 +83,10 @@ class HybridEstimator:
         """Take inter-robot measurements; returns the reason if they are rejected."""
         return self._slam.sight(stamp_ns, measurement, looks)
 
-    def drive(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-        *,
-        measured: bool = True,
-    ) -> Estimates:
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Take one odometry interval; returns the submap that it closes, if any."""
         self._open, before_ns = None, self._slam.last_keyframe_ns
-        interval = stamp_ns, duration_ns, forward, yaw_rate, moved
-        closed = self._slam.drive(*interval, measured=measured)
+        closed = self._slam.drive(interval, measured=measured)
         if closed is not None:
             return self._with_submap(closed)
         now_ns = self._slam.last_keyframe_ns

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from team.config import Bounds
-from team.estimation.odometry import Interval, Moved
+from team.estimation.odometry import OdometryInterval
 from team.estimation.plausible import is_motion_spread as _spread
 from team.rejection import Rejection
 
@@ -24,17 +24,11 @@ class StreamJudge:
         self._now_ns = now_ns
         self._jumped_ns: int | None = None
 
-    def odometry(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-    ) -> Rejection | None:
+    def odometry(self, interval: OdometryInterval) -> Rejection | None:
         """Why an interval is refused: for `Rejection.SPEED` only its motion, otherwise all of
         it.
         """
+        stamp_ns, duration_ns = interval.end_ns, interval.duration_ns
         if duration_ns == 0:
             return Rejection.NO_TIME
         if self._now_ns is not None:
@@ -46,15 +40,15 @@ class StreamJudge:
                 self._jumped_ns = stamp_ns
                 return Rejection.TIME
         self._now_ns, self._jumped_ns = stamp_ns, None
-        bounds = self._bounds
-        interval = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
-        if math.isnan(forward):
+        bounds, moved = self._bounds, interval.moved
+        claimed = None if moved is None else moved.covariance
+        if math.isnan(interval.forward):
             return Rejection.STEERING
         sensible = (
             duration_ns <= bounds.interval_s * 1e9
             and abs(interval.speed) <= bounds.speed_m_s
-            and abs(yaw_rate) <= bounds.yaw_rate_rad_s
-            and (moved is None or moved.covariance is None or _spread(moved.covariance, bounds))
+            and abs(interval.yaw_rate) <= bounds.yaw_rate_rad_s
+            and (claimed is None or _spread(claimed, bounds))
         )
         return None if sensible else Rejection.SPEED
 

@@ -8,7 +8,7 @@ import pytest
 from team.config import MotionModel, MotionNoise
 from team.estimation.geometry import between, compose, exponential, logarithm
 from team.estimation.models import Increment, increment_of
-from team.estimation.odometry import Interval, moved, part_of, steered
+from team.estimation.odometry import OdometryInterval, moved, part_of, steered
 
 SECOND = 1_000_000_000
 NOISY = MotionModel(
@@ -21,8 +21,8 @@ NOISY = MotionModel(
 CLAIM = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.004], [0.002, -0.004, 0.01]])
 
 
-def interval(increment: list[float], claim: np.ndarray | None = None) -> Interval:
-    return Interval(SECOND, SECOND, 0.0, 0.0, moved(np.array(increment), claim))
+def interval(increment: list[float], claim: np.ndarray | None = None) -> OdometryInterval:
+    return OdometryInterval(SECOND, SECOND, 0.0, 0.0, moved(np.array(increment), claim))
 
 
 @pytest.mark.parametrize("claim", [None, CLAIM])

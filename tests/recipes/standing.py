@@ -5,7 +5,7 @@ import numpy as np
 from team.config import RobotConfig
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
-from team.estimation.odometry import Moved
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.rejection import Rejection
 from team.robot.estimator import NOTHING_NEW, Estimates, InitialPose, KnownMap
@@ -28,18 +28,9 @@ class Standing:
         """It has no use for landmarks."""
         return Rejection.NO_LANDMARKS
 
-    def drive(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-        *,
-        measured: bool = True,
-    ) -> Estimates:
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Each interval ends with a pose."""
-        return Estimates(pose_ns=stamp_ns)
+        return Estimates(pose_ns=interval.end_ns)
 
     def finish(self) -> tuple[Estimates, int]:
         """Nothing was waited for."""

@@ -15,6 +15,7 @@ from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.odometry import OdometryInterval
 from team.robot.estimator import InitialPose, estimator_of
 from team.robot.hybrid import HybridEstimator
 from team.wire import messages as m
@@ -32,10 +33,12 @@ def fed(member, measurements):
             member.observe(measurement.stamp_ns, translate.scan_of(measurement))
         if isinstance(measurement, m.Odometry):
             window = member.drive(
-                measurement.stamp_ns,
-                measurement.duration_ns,
-                measurement.forward,
-                measurement.yaw_rate,
+                OdometryInterval(
+                    measurement.stamp_ns,
+                    measurement.duration_ns,
+                    measurement.forward,
+                    measurement.yaw_rate,
+                )
             ).closed
             closed += [] if window is None else [window]
     return closed
@@ -188,7 +191,9 @@ def standing(window_m):
         looks = ("r2",), np.array([2.0]), np.array([0.1])
         if second % 5 == 0:
             assert member.sight(second * 10**9 - 1, second, looks) is None
-        driven = member.drive(second * 10**9, 10**9, 0.1 if second > 45 else 0.0, 0.0)
+        driven = member.drive(
+            OdometryInterval(second * 10**9, 10**9, 0.1 if second > 45 else 0.0, 0.0)
+        )
         closed += [] if driven.closed is None else [driven.closed]
     return closed
 

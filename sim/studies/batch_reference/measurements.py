@@ -156,7 +156,7 @@ def _chain(
                     measurement.stamp_ns, measurement.number, translate.detections_of(measurement)
                 )
             case m.Odometry() | m.Increment() | m.Steering():
-                keyframes += segmenter.drive(*translate.motion_of(measurement, config))
+                keyframes += segmenter.drive(translate.interval_of(measurement, config))
     last, rest = segmenter.cut(last_ns)
     keyframes += last
     if rest.mean.any() or rest.covariance.any():

@@ -17,7 +17,7 @@ from team.estimation.hybrid_slam.reduction import Look, reduced
 from team.estimation.hybrid_slam.sensitivity import carried_on
 from team.estimation.models import Increment, acceptable, corrected
 from team.estimation.mount import of_sensor
-from team.estimation.odometry import STANDING, Interval, Moved
+from team.estimation.odometry import STANDING, OdometryInterval
 from team.estimation.scans import Own, calibrated, unclaimed
 from team.rejection import Rejection
 
@@ -134,25 +134,17 @@ class Segmenter:
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 
-    def drive(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-        *,
-        measured: bool = True,
-    ) -> list[Keyframe]:
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> list[Keyframe]:
         """Integrate one odometry interval; returns the keyframes in it, in order.
 
         Where its motion could not be measured, the last speeds are assumed, with standard
         deviations as large as the motion, at least UNMEASURED, and below a full rotation in
         heading.
         """
-        over = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
+        stamp_ns, duration_ns = interval.end_ns, interval.duration_ns
         if measured:
-            self._last, self._unmeasured = over, None
+            self._last, self._unmeasured = interval, None
+            over = interval
         else:
             over = self._last.gone_on(stamp_ns, duration_ns)
             self._unmeasured = _unmeasured(duration_ns * 1e-9, over.speed, over.yaw_rate)
@@ -209,7 +201,7 @@ class Segmenter:
         """Number of scans that wait for odometry to cover their time."""
         return len(self._waiting)
 
-    def _nodes(self, until_ns: int, over: Interval) -> list[Keyframe]:
+    def _nodes(self, until_ns: int, over: OdometryInterval) -> list[Keyframe]:
         """The grid times up to until_ns as keyframes; inter-robot measurements up to there reach
         their node.
         """
@@ -221,7 +213,7 @@ class Segmenter:
                 keyframes.append(replace(self._keyframe_at(next_ns, *NOTHING), is_node=True))
         return keyframes
 
-    def _go_to(self, stamp_ns: int, over: Interval) -> int:
+    def _go_to(self, stamp_ns: int, over: OdometryInterval) -> int:
         """Integrate up to a stamp; a stamp before the interval's start is taken as its start."""
         at_ns = max(stamp_ns, self._here_ns)
         self._integrate(at_ns - self._here_ns, over.end_ns - at_ns, over)
@@ -229,7 +221,7 @@ class Segmenter:
         self._here_ns = at_ns
         return at_ns
 
-    def _integrate(self, duration_ns: int, rest_ns: int, over: Interval) -> None:
+    def _integrate(self, duration_ns: int, rest_ns: int, over: OdometryInterval) -> None:
         if duration_ns <= 0:
             return
         if self._is_plain(over):
@@ -255,7 +247,7 @@ class Segmenter:
         if self._since_look is not None:
             self._since_look = self._since_look.then(step)
 
-    def _is_plain(self, over: Interval) -> bool:
+    def _is_plain(self, over: OdometryInterval) -> bool:
         """Whether an interval's motion follows from its speeds alone and no inter-robot
         measurement waits for it.
         """

@@ -15,7 +15,7 @@ from team.estimation.compiled import compiled
 from team.estimation.geometry import Pose, compose
 from team.estimation.hybrid_slam.sensitivity import carried_on
 from team.estimation.models import Increment, arc, composed, course_of, turn_then_drive
-from team.estimation.odometry import Interval
+from team.estimation.odometry import OdometryInterval
 
 Spread = Float[np.ndarray, "3 3"]
 
@@ -66,7 +66,7 @@ class OdometryRun:
         """Whether there are any."""
         return bool(self._rows)
 
-    def add(self, over: Interval, duration_ns: int) -> None:
+    def add(self, over: OdometryInterval, duration_ns: int) -> None:
         """The part of an interval that comes next."""
         course = course_of(self._motion, duration_ns * 1e-9, over.forward, over.yaw_rate)
         self._rows.append((*course, *over.forward_column(self._motion, duration_ns).tolist()))

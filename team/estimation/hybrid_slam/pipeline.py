@@ -22,7 +22,7 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.open_window import OpenWindow
 from team.estimation.hybrid_slam.pose_grid import Looks, PoseGrid
 from team.estimation.hybrid_slam.window import Window
-from team.estimation.odometry import Interval, Moved
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
 from team.rejection import Rejection
@@ -70,23 +70,14 @@ class HybridSlam:
             return Rejection.OLDER
         return self._grid.observe(stamp_ns, measurement, looks)
 
-    def drive(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-        *,
-        measured: bool = True,
-    ) -> ClosedWindow | None:
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> ClosedWindow | None:
         """Take one odometry interval; returns the window that it closes, if any."""
+        stamp_ns = interval.end_ns
         if self._start_ns is None:
-            self._start_ns = stamp_ns - duration_ns
+            self._start_ns = stamp_ns - interval.duration_ns
             self._segmenter.begin(self._start_ns)
-        interval = Interval(stamp_ns, duration_ns, forward, yaw_rate, moved)
-        self._driven_m += abs(interval.speed) * duration_ns * 1e-9
-        for keyframe in self._segmenter.drive(*interval, measured=measured):
+        self._driven_m += abs(interval.speed) * interval.duration_ns * 1e-9
+        for keyframe in self._segmenter.drive(interval, measured=measured):
             self._open.advance(keyframe)
         if self._is_full(stamp_ns - self._start_ns):
             return self._close(self._start_ns, stamp_ns, self._segmenter.leave())

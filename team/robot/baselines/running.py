@@ -18,7 +18,7 @@ from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.reduction import Look
 from team.estimation.models import Increment
 from team.estimation.mount import moved_by
-from team.estimation.odometry import Moved
+from team.estimation.odometry import OdometryInterval
 from team.estimation.randomness import generator
 from team.estimation.scans import Scan, unclaimed
 from team.estimation.submap import Became
@@ -89,23 +89,14 @@ class RunningEstimator:
             return Rejection.CLAIMS
         return self._segmenter.observe(stamp_ns, *scan)
 
-    def drive(
-        self,
-        stamp_ns: int,
-        duration_ns: int,
-        forward: float,
-        yaw_rate: float,
-        moved: Moved | None = None,
-        *,
-        measured: bool = True,
-    ) -> Estimates:
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Takes one odometry interval and runs the keyframes that lie in it."""
+        stamp_ns, begin_ns = interval.end_ns, interval.end_ns - interval.duration_ns
         if self._segmenter.now_ns is None:
-            self._segmenter.begin(stamp_ns - duration_ns)
-            self._map_ns = stamp_ns - duration_ns
+            self._segmenter.begin(begin_ns)
+            self._map_ns = begin_ns
         before = self.sequence
-        motion = stamp_ns, duration_ns, forward, yaw_rate, moved
-        for keyframe in self._segmenter.drive(*motion, measured=measured):
+        for keyframe in self._segmenter.drive(interval, measured=measured):
             self._take(keyframe)
         if not self._filter.looks:
             _, rest = self._segmenter.cut(stamp_ns)

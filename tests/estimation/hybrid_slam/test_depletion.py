@@ -40,7 +40,7 @@ def nees_of_the_window():
             seen = stream.observations(counter)
             slam.observe(seen.stamp_ns, scan_of(seen))
         elif stream.kinds[counter] == ODOMETRY:
-            closed = slam.drive(*interval_of(stream.odometry(counter), config.motion))
+            closed = slam.drive(interval_of(stream.odometry(counter), config.motion))
             if closed is not None:
                 break
     at = np.searchsorted(stream.truth_ns, [closed.start_ns, closed.end_ns])

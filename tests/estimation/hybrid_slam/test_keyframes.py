@@ -12,7 +12,7 @@ from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.sensitivity import carried_on
 from team.estimation.models import Increment, increment_of
-from team.estimation.odometry import forward_column
+from team.estimation.odometry import OdometryInterval, forward_column
 
 SECOND = 1_000_000_000
 WHITE = MotionModel(
@@ -65,8 +65,8 @@ def test_observations_within_an_interval_split_its_mean_exactly(cuts, forward, y
         segmenter.begin(0)
     for cut in sorted(cuts):
         assert split.observe(cut, *NOTHING) is None
-    keyframes = split.drive(SECOND, SECOND, forward, yaw_rate)
-    whole.drive(SECOND, SECOND, forward, yaw_rate)
+    keyframes = split.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
+    whole.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
     assert [keyframe.stamp_ns for keyframe in keyframes] == sorted(cuts)
     motion, expected = total(keyframes, split.cut(SECOND)[1]), whole.cut(SECOND)[1]
     np.testing.assert_allclose(motion.mean, expected.mean, atol=1e-9)
@@ -82,7 +82,7 @@ def test_splitting_a_straight_interval_keeps_the_covariance_of_white_noise_forwa
         segmenter.begin(0)
         for cut in sorted(cuts):
             segmenter.observe(cut, *NOTHING)
-        keyframes = segmenter.drive(SECOND, SECOND, forward, 0.0)
+        keyframes = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, 0.0))
         found = total(keyframes, segmenter.cut(SECOND)[1]).covariance
         density = motion.forward if row == 0 else motion.final_turn
         expected = density.per_s**2 + density.per_m**2 * abs(forward)
@@ -102,7 +102,7 @@ def test_the_finer_the_split_the_nearer_to_noise_that_is_white_within_the_interv
         segmenter.begin(0)
         for k in range(1, pieces):
             segmenter.observe(k * SECOND // pieces, *NOTHING)
-        keyframes = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
+        keyframes = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
         found = total(keyframes, segmenter.cut(SECOND)[1])
         np.testing.assert_allclose(found.mean, mean, atol=1e-8)
         errors.append(np.abs(found.covariance - covariance).max())
@@ -120,10 +120,10 @@ def test_the_motion_does_not_depend_on_how_the_odometry_is_cut(cuts):
     one, many = (Segmenter(motion, Sensor(), 0.0) for _ in range(2))
     for segmenter in (one, many):
         segmenter.begin(0)
-    one.drive(SECOND, SECOND, 1.2, 0.0)
+    one.drive(OdometryInterval(SECOND, SECOND, 1.2, 0.0))
     ends = [0, *sorted(cuts), SECOND]
     for begin, end in pairwise(ends):
-        many.drive(end, end - begin, 1.2, 0.0)
+        many.drive(OdometryInterval(end, end - begin, 1.2, 0.0))
     expected, found = one.cut(SECOND)[1], many.cut(SECOND)[1]
     np.testing.assert_allclose(found.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-9)
@@ -133,9 +133,9 @@ def test_an_observation_waits_for_the_odometry_that_covers_it():
     segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
     segmenter.begin(0)
     segmenter.observe(3 * SECOND // 2, *scan((4, 2.0, 0.0)))
-    assert segmenter.drive(SECOND, SECOND, 1.0, 0.0) == []
+    assert segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0)) == []
     assert segmenter.uncovered == 1
-    (keyframe,) = segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0)
+    (keyframe,) = segmenter.drive(OdometryInterval(2 * SECOND, SECOND, 1.0, 0.0))
     assert (keyframe.stamp_ns, segmenter.uncovered) == (3 * SECOND // 2, 0)
     np.testing.assert_allclose(keyframe.increment.mean, [1.5, 0.0, 0.0], atol=1e-12)
 
@@ -144,7 +144,7 @@ def test_an_observation_before_the_odometry_is_taken_where_the_robot_stood():
     segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
     assert segmenter.observe(-SECOND, *scan((4, 2.0, 0.0))) is None
     segmenter.begin(0)
-    (keyframe,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0))
     assert keyframe.stamp_ns == 0
     assert not keyframe.increment.mean.any()
 
@@ -152,7 +152,7 @@ def test_an_observation_before_the_odometry_is_taken_where_the_robot_stood():
 def test_an_observation_of_a_time_that_is_past_is_rejected_with_its_reason():
     segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
     segmenter.begin(0)
-    segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0))
     assert segmenter.observe(SECOND - 1, *scan((4, 2.0, 0.0))) == "older than the odometry"
     assert segmenter.observe(SECOND, *scan((4, 2.0, 0.0))) is None
 
@@ -164,7 +164,7 @@ def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
     outside = segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 9.1, 0.0)))
     assert outside == "outside the sensor's limits"
     segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 4.5, 0.25)))
-    (keyframe,) = segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0))
     assert (keyframe.ids.tolist(), keyframe.ranges.tolist(), keyframe.bearings.tolist()) == (
         [2],
         [2.0],
@@ -178,7 +178,7 @@ def keyframe(scans, forward=0.0, yaw_rate=0.0):
     segmenter.begin(0)
     for stamp_ns, rows in scans:
         segmenter.observe(stamp_ns, *rows)
-    (keyframe,) = segmenter.drive(SECOND, SECOND, forward, yaw_rate)
+    (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
     return keyframe
 
 
@@ -232,12 +232,12 @@ def test_a_cut_closes_the_keyframe_and_the_next_window_starts_clean():
     segmenter = Segmenter(MotionModel(), Sensor(), 5.0)
     segmenter.begin(0)
     segmenter.observe(SECOND // 2, *scan((7, 5.0, 0.0)))
-    assert segmenter.drive(SECOND, SECOND, 1.0, 0.0) == []
+    assert segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0)) == []
     (keyframe,), rest = segmenter.cut(SECOND)
     assert (keyframe.stamp_ns, keyframe.ids.tolist()) == (SECOND, [7])
     np.testing.assert_allclose(keyframe.ranges, [4.5])
     assert not rest.mean.any()
-    assert segmenter.drive(2 * SECOND, SECOND, 1.0, 0.0) == []
+    assert segmenter.drive(OdometryInterval(2 * SECOND, SECOND, 1.0, 0.0)) == []
     keyframes, rest = segmenter.cut(2 * SECOND)
     assert keyframes == []
     np.testing.assert_allclose(rest.mean, [1.0, 0.0, 0.0])
@@ -250,7 +250,7 @@ def test_a_run_of_intervals_is_one_after_the_other_to_the_bit(kind):
     segmenter.begin(0)
     for k in range(1, 30):
         speeds = 0.7 * np.sin(0.3 * k), np.cos(0.7 * k) * (k % 5 > 0)
-        segmenter.drive(k * SECOND, SECOND, *map(float, speeds))
+        segmenter.drive(OdometryInterval(k * SECOND, SECOND, *map(float, speeds)))
         step = increment_of(motion, 1.0, *map(float, speeds))
         shift = carried_on(shift, step.mean) + forward_column(motion, 1.0, *map(float, speeds))
         expected = expected.then(step)

@@ -9,6 +9,7 @@ from team.estimation.geometry import compose, inverse, transformed
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.models import Increment, increment_of, predicted
 from team.estimation.mount import base_points, base_poses, base_shifts, of_base, of_sensor
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import polar_scan
 
 MOUNT = (3.78, 0.5, -0.6)
@@ -30,7 +31,7 @@ def closed(mount=MOUNT, sensor_mount=MOUNT, biases=(), shift: float = 0.0):
         z = np.array([predicted(compose(pose, np.array(mount)), p) for p in PLACES])
         scan = polar_scan(np.arange(3, dtype=np.uint32), z[:, 0], z[:, 1] + shift)
         slam.observe(k * SECOND, scan)
-        slam.drive(k * SECOND, SECOND, 1.0, 0.2)
+        slam.drive(OdometryInterval(k * SECOND, SECOND, 1.0, 0.2))
     return slam.finish()[0].local, pose
 
 

@@ -11,6 +11,7 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.models import Increment
+from team.estimation.odometry import OdometryInterval
 from team.rejection import Rejection
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
@@ -35,7 +36,7 @@ def drive(segmenter, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
     keyframes, now = [], segmenter.now_ns
     while now < round(until_s * SECOND):
         now += step_ns
-        keyframes += segmenter.drive(now, step_ns, forward, yaw_rate)
+        keyframes += segmenter.drive(OdometryInterval(now, step_ns, forward, yaw_rate))
     return keyframes
 
 
@@ -157,7 +158,7 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
         if k > 1:
             reason = slam.sight(k * SECOND - 500_000_000, k, look())
             assert reason == ("no pose node near it" if k == 4 else None), "its node was the end"
-        window = slam.drive(k * SECOND, SECOND, 0.5, 0.1)
+        window = slam.drive(OdometryInterval(k * SECOND, SECOND, 0.5, 0.1))
         closed += [] if window is None else [window]
     assert [w.local.node_stamps.tolist() for w in closed] == [
         [1_500_000_000, 3 * SECOND],

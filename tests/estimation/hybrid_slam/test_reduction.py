@@ -6,6 +6,7 @@ import pytest
 from team.config import UNNAMED, Association, MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.unnamed import events_of, settled
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import unclaimed
 
 TICK = 10**8
@@ -39,7 +40,7 @@ def keyframes(keyframe_s: float, *, hidden: bool, tagged: int = 0) -> list[Keyfr
                 some = called[chosen], ranges[chosen], bearings[chosen]
                 segmenter.observe(tick * TICK - 1, *some, unclaimed(int(chosen.sum())))
         for end in (2 * tick - 1, 2 * tick):  # odometry comes more often than scans
-            out += segmenter.drive(end * TICK // 2, TICK // 2, 0.2, 0.4)
+            out += segmenter.drive(OdometryInterval(end * TICK // 2, TICK // 2, 0.2, 0.4))
     return out + segmenter.cut(10 * TICK)[0]
 
 

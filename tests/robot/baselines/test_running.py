@@ -8,6 +8,7 @@ from team import translate
 from team.estimation.baselines import dead_reckoning, ekf_slam, localisation, plain_fastslam
 from team.estimation.gaussian import NO_LANDMARKS
 from team.estimation.models import Increment, corrected, increment_of
+from team.estimation.odometry import OdometryInterval
 from team.estimation.randomness import generator
 from team.pairs import PAIRS, rules_for
 from team.robot.baselines.running import POSE_FLOOR
@@ -46,13 +47,13 @@ def fed(member, measurements=MEASUREMENTS):
         if isinstance(measurement, m.Observations):
             member.observe(measurement.stamp_ns, translate.scan_of(measurement))
         if isinstance(measurement, m.Odometry):
-            interval = (
+            interval = OdometryInterval(
                 measurement.stamp_ns,
                 measurement.duration_ns,
                 measurement.forward,
                 measurement.yaw_rate,
             )
-            driven.append(member.drive(*interval))
+            driven.append(member.drive(interval))
     return driven
 
 
