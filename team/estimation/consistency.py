@@ -1,4 +1,4 @@
-"""Does a covariance tell the truth? Normalised squared errors and the intervals they belong in.
+"""Consistency tests of covariances: normalised squared errors, and the intervals that they lie in.
 
 Bar-Shalom, Li and Kirubarajan 2001, section 5.4.
 """
@@ -14,7 +14,7 @@ from scipy.special import chdtri, gammaincinv
 from team.estimation.gaussian import cholesky_factor
 
 MEDIAN_PRICE = 1.3
-"""The median of χ² of a few degrees of freedom scatters so many times as much as their mean."""
+"""Ratio of the scatter of a χ² median of a few degrees of freedom to that of its mean."""
 
 
 def state_error(
@@ -39,10 +39,10 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 def chi2_quantile(
     probability: float, dof: Float[np.ndarray, " n"] | float | int
 ) -> Float[np.ndarray, " n"] | float:
-    """What χ² of `dof` degrees of freedom stays below with this probability.
+    """The value that χ² of `dof` degrees of freedom does not exceed with this probability.
 
     Twice the inverse of the regularised incomplete gamma function of dof/2: the bits of
-    `scipy.stats`, which takes half a second of every process's start.
+    `scipy.stats`, whose import would add half a second to every process's start.
     """
     quantile = 2.0 * gammaincinv(0.5 * dof, probability)
     return cast(Float[np.ndarray, " n"] | float, quantile)
@@ -66,10 +66,10 @@ def coverage(
 
 
 class Scale(NamedTuple):
-    """How many times the covariances have to be taken to be those of the errors that are seen.
+    """The factor that the covariances need to agree with the observed errors.
 
-    value: 1 is right, 2: they claim half of what they ought to. log_sigma: about one standard
-    deviation of its logarithm.
+    value: 1 for correct covariances; 2: they are half as large as the errors require.
+    log_sigma: about one standard deviation of its logarithm.
     """
 
     value: float
@@ -82,8 +82,8 @@ def covariance_scale(
     """The scale s where half of the terms, by degrees of freedom, lie below s times their median.
 
     Each term is s χ² with dof degrees of freedom, so median_k(squared_k / median χ²(dof_k)) is s.
-    It moves with all covariances alike and not with the few terms that are outliers, whatever their
-    size. None without a term of one degree of freedom or more; others do not count.
+    It changes with all covariances alike and is insensitive to a few outliers, however large. None
+    where no term has one degree of freedom or more; terms with fewer are left out.
     """
     judged = dof >= 1.0
     if not judged.any():

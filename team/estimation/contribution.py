@@ -1,4 +1,4 @@
-"""What the team's map is made of: submaps with their place in the set, and known starts."""
+"""The contents of the team's map: submaps with their place in the set, and initial poses."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -56,7 +56,7 @@ class Contribution:
 
 @dataclass(frozen=True, eq=False)
 class InitialPoseFactor:
-    """Where a stream starts in the common frame: exactly (covariance None) or N(pose, covariance).
+    """A stream's initial pose in the common frame: exact (covariance None) or N(pose, covariance).
 
     The covariance is of (x [m], y [m], theta [rad]) in the common frame.
     """
@@ -73,7 +73,7 @@ class InitialPoseFactor:
 
     @cached_property
     def information(self) -> Float[np.ndarray, "3 3"] | None:
-        """P⁻¹, None for an exact start."""
+        """P⁻¹, None for an exact initial pose."""
         if self.covariance is None:
             return None
         return information(self.covariance, f"the start of {named(self.stream)}")

@@ -23,8 +23,8 @@ from team.estimation.models import NEAREST_M, Increment, noise
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Submap `sequence` of (robot, incarnation) has a pose node at stamp_ns, from where a teammate
-    is.
+    """An inter-robot measurement: from the pose node at stamp_ns of submap `sequence` of (robot,
+    incarnation).
 
     measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
     covariance: of the measurement, [m², m·rad, rad²].
@@ -63,10 +63,11 @@ class Carried(NamedTuple):
 
 
 def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) -> Carried:
-    """A teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the node.
+    """A teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the node's
+    time.
 
-    The variances along and across are the sensor's, that of where the marker is on the teammate
-    (marker_sigma) and that of the drift.
+    Its covariance is the sum of the sensor's variances along and across the ray, of that of the
+    marker's position on the teammate (marker_sigma) and of that of the drift.
     """
     range_variance, bearing_variance = noise(sensor, distance)
     own = sensor.marker_sigma**2 + drift * drift
@@ -82,7 +83,9 @@ def of_base(seen: Carried, mount: Pose) -> Carried:
 
 
 def carried_back(seen: Carried, node_from_here: Increment) -> Carried:
-    """The point in the frame of the node, which the observer has left."""
+    """The point in the frame of a later node: the observer has moved by node_from_here before
+    reaching it.
+    """
     T = node_from_here.mean
     turn = _turn(float(T[2]))
     J = turn @ np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]])
@@ -91,7 +94,9 @@ def carried_back(seen: Carried, node_from_here: Increment) -> Carried:
 
 
 def carried_on(seen: Carried, here_from_node: Increment) -> Carried:
-    """The point in the frame of the node, which the observer has come to since."""
+    """The point in the frame of an earlier node, from which the observer has moved by
+    here_from_node.
+    """
     T = inverse(here_from_node.mean)
     point = transformed(T, seen.point)
     turn = _turn(float(T[2]))
@@ -108,10 +113,10 @@ def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
 def reduced(
     carried: Sequence[Carried],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """One (range, bearing) and its covariance of several looks at a teammate from one node.
+    """One (range, bearing) and its covariance for several measurements of a teammate from one node.
 
-    The median of each, bearings about the first one's; the covariance is the mean of theirs, as of
-    one look: a camera mismeasures a marker alike from one moment to the next.
+    The median of each, bearings relative to the first one; the covariance is the mean of theirs, as
+    for one measurement: a camera repeats its error on a marker from one moment to the next.
     """
     ranges = [max(math.hypot(*each.point), NEAREST_M) for each in carried]
     bearings = [math.atan2(each.point[1], each.point[0]) for each in carried]

@@ -77,7 +77,7 @@ def base_covariances(
 def base_shifts(
     shifts: Float[np.ndarray, "*b n 3"], poses: Float[np.ndarray, "n 3"], mount: Pose
 ) -> Float[np.ndarray, "*b n 3"]:
-    """What shifts (dx, dy, dθ) of the sensor's poses are of the base's."""
+    """The shifts (dx, dy, dθ) of the base's poses that follow from those of the sensor's poses."""
     away = inverse(mount)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x = shifts[..., 0] - (s * away[0] + c * away[1]) * shifts[..., 2]

@@ -1,7 +1,7 @@
-"""What odometry measures of one interval, and any part of it as a Gaussian on SE(2).
+"""One interval of odometry, and any part of it as a Gaussian on SE(2).
 
-Odometry tells mean speeds (`models.increment_of`), a car's wheel speed and steering, or a motion on
-SE(2) with a part to the left, with or without a covariance of its own.
+Odometry reports mean speeds (`models.increment_of`), a car's wheel speed and steering angle, or a
+motion on SE(2) with a part to the left, with or without a covariance of its own.
 """
 
 import math
@@ -19,7 +19,7 @@ from team.estimation.models import Increment, increment_of, motion_variances
 class Moved(NamedTuple):
     """A measured motion Exp(twist), twist = (forward [m], left [m], turn [rad]) of the interval.
 
-    covariance: of the error in the tangent space of its end, as its source claims it.
+    covariance: the source's own covariance of the error, in the tangent space of the motion's end.
     """
 
     twist: Pose
@@ -29,7 +29,7 @@ class Moved(NamedTuple):
 class OdometryInterval(NamedTuple):
     """One odometry interval that ends at end_ns: mean forward speed [m/s] and yaw rate [rad/s].
 
-    moved: the motion, where odometry tells it as one; the speeds are then those of its twist.
+    moved: the motion, where the odometry reports one; the speeds are then those of its twist.
     """
 
     end_ns: int
@@ -54,7 +54,9 @@ class OdometryInterval(NamedTuple):
 
     @property
     def speed(self) -> float:
-        """In whichever direction [m/s]."""
+        """Magnitude of the velocity [m/s], or the signed forward speed where no motion was
+        reported.
+        """
         if self.moved is None:
             return self.forward
         return math.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
@@ -74,16 +76,16 @@ class OdometryInterval(NamedTuple):
 
 
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)
-"""What was measured before anything was."""
+"""The interval that is assumed before the first measurement."""
 
 
 def forward_column(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Float[np.ndarray, "3"]:
-    """d/db at 0 of the interval's motion if the logged way is (1 + b) times as long.
+    """d/db at 0 of the interval's motion if the true way is (1 + b) times the measured one.
 
-    In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale
-    is known, and without such a range.
+    In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale is
+    known, and without such a range.
     """
     column = np.zeros(3)
     speeds = motion.calibrated_speed
@@ -100,11 +102,11 @@ def forward_column(
 
 
 def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:
-    """(forward [m/s], yaw rate [rad/s]) of a car, of whose wheel and steering encoders say this.
+    """(forward [m/s], yaw rate [rad/s]) of a car, from its wheel and steering encoders.
 
-    With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at
-    (0, h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). Two NaN where the
-    model is no car's, or the wheel stands in the centre of the turn.
+    With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at (0,
+    h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). Two NaN where the
+    model is not a car's, or the wheel is at the centre of the turn.
     """
     if motion.kind != "ackermann" or motion.wheel_base is None:
         return math.nan, math.nan
@@ -142,10 +144,10 @@ def part_of(
 ) -> Increment:
     """A share of a measured motion at constant twist, which is followed by the share `rest`.
 
-    Without a claimed covariance the noise is the model's over this way, turn and time. A claimed
-    one, C, is of all the interval: a share f of it is f Ad C Adᵀ, with Ad of the motion that
-    follows. Seen from the interval's end the error then grows evenly, so however the interval is
-    split, its parts compose to C: Σ Ad⁻¹ (f Ad C Adᵀ) Ad⁻ᵀ = C.
+    Without a covariance of the source the noise is the model's over this way, turn and time. The
+    source's covariance C is of the whole interval: a share f of it is f Ad C Adᵀ, with Ad of the
+    motion that follows. Seen from the interval's end the error then grows evenly, so however the
+    interval is split, its parts compose to C: Σ Ad⁻¹ (f Ad C Adᵀ) Ad⁻ᵀ = C.
     """
     twist = calibrated(motion, whole.twist, duration_s)
     xi = share * twist

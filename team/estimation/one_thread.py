@@ -1,9 +1,10 @@
-"""One thread of BLAS in this process, whoever began it: a map's bits must not depend on the entry.
+"""Limits BLAS to one thread in this process, so that a map's bits do not depend on how it was
+started.
 
-A BLAS that cuts a product among threads sums it in another order, so two threads give other bits
-than one. Variables of the environment are heard only before NumPy is loaded, which a user's own
-script may have done long ago; so the libraries themselves are told, when estimation is imported.
-NumPy and SciPy bring one each, the kernels use SciPy's, and only what is loaded can be told.
+A BLAS that divides a product among threads sums it in another order, so two threads give other bits
+than one. Environment variables are read only when NumPy is loaded, which a user's own script may
+have done long ago; the loaded libraries are therefore configured directly when estimation is
+imported. NumPy and SciPy bring one each, and the kernels use SciPy's.
 """
 
 import numpy  # noqa: F401

@@ -1,7 +1,7 @@
-"""What lies beyond the bounds of what is physically sensible, and by what, in words.
+"""Checks values against the bounds of what is physically sensible, and describes what exceeds them.
 
-The wire's door asks whether a message can be what it says; this asks whether it can be of a robot
-on the ground. What is refused here is no error of the program: it is a value, with its reason.
+The wire checks whether a message is well formed; this module checks whether it can be true of a
+robot on the ground. A refusal is not an error of the program: it is a value, with its reason.
 """
 
 import numpy as np
@@ -61,7 +61,7 @@ def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None
 
 
 def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
-    """Whether a motion on SE(2) is claimed to be no more uncertain than the bounds allow."""
+    """Whether the covariance of a motion on SE(2) is within the bounds."""
     most = np.array([bounds.sigma_m[1], bounds.sigma_m[1], bounds.sigma_rad[1]])
     return bool((np.sqrt(np.diag(covariance)) <= most).all())
 

@@ -1,10 +1,10 @@
-"""Scans of landmarks, each measurement with the noise that it claims itself or the sensor's.
+"""Scans of landmarks, each measurement with its own covariance or with the sensor's.
 
-`own` holds a row for each measurement: of length 0 where none of them claims a covariance, else
-(rr [m²], rb [m·rad], bb [rad²], form). form POLAR: range and bearing have this covariance.
-form POINT: they are those of a point in the sensor's frame, whose noise is Gaussian in the plane
-with this covariance to first order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured
-bearing, from which S comes back exactly. form SENSOR: the sensor's noise, at the predicted range.
+`own` has a row for each measurement: of length 0 where none of them brings a covariance, else (rr
+[m²], rb [m·rad], bb [rad²], form). form POLAR: range and bearing have this covariance. form POINT:
+they are those of a point in the sensor's frame, whose noise is Gaussian in the plane with this
+covariance to first order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured bearing,
+from which S can be recovered exactly. form SENSOR: the sensor's noise, at the predicted range.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ Own = Float[np.ndarray, "_ _"]
 
 
 def unclaimed(count: int) -> Own:
-    """Of measurements none of which claims a covariance."""
+    """The rows of measurements none of which brings a covariance."""
     return np.empty((count, 0))
 
 
@@ -33,7 +33,7 @@ class Scan(NamedTuple):
     own: Own
 
     def only(self, taken: Bool[np.ndarray, " n"]) -> "Scan":
-        """Those measurements of it."""
+        """The scan with only these of its measurements."""
         return Scan(self.ids[taken], self.ranges[taken], self.bearings[taken], self.own[taken])
 
 
@@ -43,7 +43,7 @@ def polar_scan(
     bearings: Float[np.ndarray, " n"],
     covariances: Float[np.ndarray, "n 3"] | None = None,
 ) -> Scan:
-    """Ranges and bearings, each with its covariance (rr, rb, bb) if they claim any."""
+    """Ranges and bearings, each with its covariance (rr, rb, bb) if they bring any."""
     if covariances is None:
         return Scan(ids, ranges, bearings, unclaimed(len(ids)))
     form = np.full((len(ids), 1), POLAR)
@@ -55,7 +55,7 @@ def point_scan(
     points: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 3"] | None = None,
 ) -> Scan:
-    """Points (x, y) in the sensor's frame, each with its covariance (xx, xy, yy) if they claim any.
+    """Points (x, y) in the sensor's frame, each with its covariance (xx, xy, yy) if they bring any.
 
     (r, b) = (‖p‖, atan2(y, x)) and J S Jᵀ with J = ∂(r, b)/∂p.
     """
@@ -74,7 +74,7 @@ def point_scan(
 
 
 def calibrated(own: Own, sensor: Sensor) -> Own:
-    """What measurements claim, of the measurements that the calibration has corrected."""
+    """The covariances of measurements after the sensor's calibration."""
     if not own.size or sensor.range_scale == sensor.covariance_factor == 1.0:
         return own
     scale, factor = sensor.range_scale, sensor.covariance_factor
@@ -83,7 +83,9 @@ def calibrated(own: Own, sensor: Sensor) -> Own:
 
 
 def together(parts: list[tuple[int, Own]]) -> Own:
-    """The rows of several scans by count and rows; where only some claim, the others' say so."""
+    """The rows of several scans, given by count and rows; where only some bring covariances, the
+    others have form SENSOR.
+    """
     if not any(own.size for _, own in parts):
         return unclaimed(sum(count for count, _ in parts))
     sensors = np.array([0.0, 0.0, 0.0, SENSOR])
@@ -93,14 +95,16 @@ def together(parts: list[tuple[int, Own]]) -> Own:
 
 
 def of_each(parts: list[tuple[int, Own]]) -> Float[np.ndarray, "_ 4"]:
-    """The rows of several scans by count and rows; what claims nothing says so."""
+    """The rows of several scans, given by count and rows; without a covariance of its own a row has
+    form SENSOR.
+    """
     found = together(parts)
     sensors = np.array([0.0, 0.0, 0.0, SENSOR])
     return found if found.shape[1] else np.tile(sensors, (len(found), 1))
 
 
 def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[np.ndarray, " n"]:
-    """Which measurements claim standard deviations within the bounds, if they claim any."""
+    """Marks measurements whose standard deviations are within the bounds, where they bring any."""
     if not own.size:
         return np.ones(len(own), dtype=np.bool_)
     (least_m, most_m), (least_rad, most_rad) = bounds.sigma_m, bounds.sigma_rad
@@ -118,10 +122,10 @@ def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[
 def carried(
     own: Float[np.ndarray, " own"], distance: float, direction: float, to: Float[np.ndarray, "2"]
 ) -> Own:
-    """The row of a measurement that is seen from another pose, as the point `to` there.
+    """The row of a measurement as seen from another pose, where its point lies at `to`.
 
     direction: of the measurement's ray, in that pose's frame. Its covariance in the plane, along
-    and across the ray, is turned into the point's own range and bearing.
+        and across the ray, is converted to the point's range and bearing there.
     """
     if own[3] == SENSOR:
         return own[None]
@@ -136,9 +140,9 @@ def carried(
 
 
 def mean_claim(claims: list[Own]) -> Own:
-    """One row for the median of several looks: the mean of theirs, as of one look.
+    """One row for the median of several measurements: the mean of their covariances.
 
-    What mismeasures a landmark once does so again a moment later.
+    It is not divided by their number: an error on a landmark is repeated a moment later.
     """
     if not claims:
         return unclaimed(1)

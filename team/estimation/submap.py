@@ -1,4 +1,6 @@
-"""What a robot sends: one Gaussian over poses and landmarks in the submap's own frame."""
+"""The submap that a robot sends: one Gaussian over poses and landmarks in the submap's own
+frame.
+"""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,10 +17,11 @@ NO_COLUMNS = np.empty((0, 0))
 
 @dataclass(frozen=True)
 class Unnamed:
-    """What a window knows of its U landmarks without names, by ascending number.
+    """A window's knowledge of its U unnamed landmarks, by ascending number.
 
-    counts: by how many measurements each was seen, at least 1. seen: by which of the window's
-    keyframes with detections; two that one keyframe saw are two landmarks.
+    counts: number of measurements of each, at least 1.
+    seen: which of the window's keyframes with detections observed it; two landmarks that one
+        keyframe observed are distinct.
     """
 
     counts: UInt32[np.ndarray, " U"]
@@ -36,7 +39,9 @@ class Unnamed:
 
 
 class Slipped(NamedTuple):
-    """Up to the keyframe at stamp_ns the odometry missed about this (forward, left, turn)."""
+    """A slip of about (forward, left, turn) that the odometry missed before the keyframe at
+    stamp_ns.
+    """
 
     stamp_ns: int
     by: Float[np.ndarray, "3"]
@@ -44,10 +49,11 @@ class Slipped(NamedTuple):
 
 @dataclass(frozen=True)
 class Became:
-    """What became of a window's detections without identities.
+    """The outcomes of a window's detections without identities.
 
-    stamps: of M scans [ns]; counts: the detections of each; by detection: rows, its place in its
-    scan's message; landmarks, its number in the submap, 0 of what is in none; clutter: it is none.
+    stamps: of M scans [ns]; counts: number of detections of each.
+    By detection: rows, its index in its scan's message; landmarks, its number in the submap, 0
+    where it is in none; clutter, whether it is a false detection.
     """
 
     stamps: Int64[np.ndarray, " M"]
@@ -58,7 +64,9 @@ class Became:
 
     @property
     def silent(self) -> list[tuple[int, bool]]:
-        """The stamps of the scans that are not in the submap at all; whether they are clutter."""
+        """The stamps of the scans of which nothing is in the submap, and whether they are
+        clutter.
+        """
         k = len(self.counts)
         scan = np.repeat(np.arange(k), self.counts)
         used = np.bincount(scan[self.landmarks > 0], minlength=k)
@@ -122,7 +130,7 @@ class LocalMap:
 
     @property
     def named(self) -> "LocalMap":
-        """The marginal without the landmarks that have no name: what another window can know."""
+        """The marginal without the unnamed landmarks, which have no meaning in another window."""
         named = int(np.searchsorted(self.ids, UNNAMED))
         if named == len(self.ids):
             return self
@@ -143,7 +151,7 @@ class LocalMap:
 
     @property
     def without_biases(self) -> "LocalMap":
-        """The same, the errors that the robot's submaps share taken as zero."""
+        """The same submap with the errors that the robot's submaps share taken as zero."""
         return LocalMap(
             self.ids, self.mean, self.covariance, self.node_stamps, unnamed=self.unnamed
         )

@@ -50,7 +50,7 @@ def records_in(content: bytes) -> Iterator[tuple[int, Member]]:
 
 
 class Store:
-    """The file of one peer; `kept`: the members in it when it was opened. Raises StoreError."""
+    """The file of one peer; `members`: those in it when it was opened. Raises StoreError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,7 +1,8 @@
-"""The arithmetic of `consensus`: measurements of one window held against each other.
+"""Compiled kernels of `consensus`: compare the measurements of one window with each other.
 
 Poses are K keyframes, the first at zero; a measurement is (range [m], bearing [rad]); all variances
-of a measurement are its whole ones, since what persists of its error is much the same in a window.
+of a measurement are its whole ones, since the persistent part of its error is nearly constant
+within a window.
 """
 
 import math

@@ -41,11 +41,11 @@ class Particles:
 
 @dataclass(frozen=True)
 class StepInfo:
-    """What one step showed.
+    """Statistics of one step.
 
     effective_sample_size: 1/Σ w² after the step, in [1, M].
-    parents:               the particle each particle was copied from before the step, or None.
-    log_evidence:          log p(z | earlier z) as the particles see it; 0 without a re-observation.
+    parents: the particle that each particle was copied from before the step, or None.
+    log_evidence: log p(z | earlier z) by the particles; 0 without a re-observation.
     """
 
     effective_sample_size: float
@@ -136,13 +136,13 @@ def propagated_and_updated(
     generator: np.random.Generator,
     own: Own | None = None,
 ) -> tuple[Particles, StepInfo]:
-    """One step: resample if the particles are thin, move, then take the measurements (`step`).
+    """One step: resamples if the particles are thin, moves, then takes the measurements (`step`).
 
-    Resampling comes first, when the effective sample size that the last step left is below
-    `resample_below`·M: so the particles of a window's last step keep their weights. ranges [m] and
-    bearings [rad] are corrected by the calibration, own are the noises that they claim
-    (`team.estimation.scans`); an id may occur twice. Draws one uniform number
-    if it resamples and M × 3 normal ones.
+    Resampling comes first, when the effective sample size of the last step is below
+    `resample_below`·M, so that the particles of a window's last step keep their weights. ranges [m]
+    and bearings [rad] are corrected by the calibration, own are the measurements' own covariances
+    (`team.estimation.scans`); an id may occur twice. Draws one uniform number if it resamples, and
+    M × 3 normal ones.
     Raises NotACovarianceError if the motion's covariance is not positive semi-definite.
     """
     parents = None
@@ -166,7 +166,7 @@ def filter_step(
     *,
     own: Own | None = None,
 ) -> tuple[Particles, float]:
-    """As `propagated_and_updated` without resampling; the log evidence beside the particles."""
+    """As `propagated_and_updated` without resampling; returns also the log evidence."""
     count, known = len(particles.poses), len(particles.ids)
     L = fastslam_kernel.semidefinite_factor(increment.covariance)
     if not np.isfinite(L).all():
@@ -202,7 +202,9 @@ def filter_step(
 def propagated(
     particles: Particles, increment: Increment, generator: np.random.Generator
 ) -> Particles:
-    """Motion without measurements: pose ∘ mean ∘ Exp(xi), weights and landmarks as they were."""
+    """Moves the particles without measurements: pose ∘ mean ∘ Exp(xi); weights and landmarks
+    stay.
+    """
     nothing = np.empty(0)
     ids = np.empty(0, np.uint32)
     moved, _ = filter_step(

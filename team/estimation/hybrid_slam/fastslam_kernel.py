@@ -1,7 +1,7 @@
-"""The FastSLAM step of all particles in one compiled pass.
+"""Compiled kernel of the FastSLAM step of all particles.
 
-Arrays of structures by particle: poses (M, 3), landmark means (M, L, 2), landmark covariances as
-(xx, xy, yy) in (M, L, 3). The kernel writes into arrays that its caller just made.
+Arrays by particle: poses (M, 3), landmark means (M, L, 2), landmark covariances as (xx, xy, yy) in
+(M, L, 3). The kernel writes into arrays that its caller has just allocated.
 """
 
 import math
@@ -26,8 +26,8 @@ Ids = UInt32[np.ndarray, " L"]
 def slots_of(
     known: Ids, observed: UInt32[np.ndarray, " n"]
 ) -> tuple[Ids, Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """The ids after the measurements, each measurement's slot in them, and whether it is a first
-    sight.
+    """The ids after the measurements, each measurement's slot in them, and whether its landmark is
+    new.
     """
     ids = np.empty(len(known) + len(observed), np.uint32)
     ids[: len(known)] = known
@@ -47,17 +47,17 @@ def slots_of(
 
 
 SMALLEST_VARIANCE = 1e-200
-"""A variance of motion below this is none [m², rad²]."""
+"""A variance of motion below this is taken as zero [m², rad²]."""
 
 
 @compiled
 def semidefinite_factor(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Lower L with L Lᵀ = covariance, of any rank; NaN where there is none.
+    """Lower L with L Lᵀ = covariance, of any rank; NaN where the matrix is indefinite.
 
-    A pivot within 1e-9 of its diagonal entry is taken for what rounding leaves of zero: its column
-    is zero, and rounding grows by 1e9 at the most until the next pivot. So is one below
-    SMALLEST_VARIANCE, whose quotients are not numbers any more. A pivot below −1e-6 of its diagonal
-    entry says that the matrix is indefinite.
+    A pivot within 1e-9 of its diagonal entry is taken for rounding of zero: its column is zero, and
+    rounding grows by 1e9 at the most until the next pivot. So is one below SMALLEST_VARIANCE, whose
+    quotients would not be finite. A pivot below −1e-6 of its diagonal entry means that the matrix
+    is indefinite.
     """
     L = np.zeros((3, 3))
     for j in range(3):

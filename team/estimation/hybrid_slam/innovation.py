@@ -1,7 +1,7 @@
-"""Were the measurements as the particles expected them? The normalised innovation squared (NIS).
+"""The innovations of a window's measurements, and their normalised squares (NIS).
 
-What a filter predicts can be held against what it then reads, so this check needs no truth.
-Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+A filter's predictions are compared with its later measurements, so this consistency check needs no
+ground truth. Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
 """
 
 import math
@@ -39,12 +39,14 @@ class Innovation(NamedTuple):
     dof: int
 
     def plus(self, other: "Innovation") -> "Innovation":
-        """Of both."""
+        """The sum of both."""
         return Innovation(self.squared + other.squared, self.dof + other.dof)
 
     @property
     def per_dof(self) -> float | None:
-        """Near 1 where the models are right, above where the noise is larger; None without any."""
+        """About 1 where the models are right, larger where the noise is larger; None without
+        measurements.
+        """
         return self.squared / self.dof if self.dof else None
 
 

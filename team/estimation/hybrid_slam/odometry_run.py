@@ -1,8 +1,8 @@
-"""Odometry intervals one behind the other, composed in one compiled call.
+"""Consecutive odometry intervals, composed in one compiled call.
 
-Odometry comes tens of times between two looks at where it has led. Each interval is one row here;
-the motion since the last keyframe, since the last pose node and since the first scan of a keyframe
-are brought up to date when somebody asks.
+Odometry arrives tens of times between two uses of the resulting motion. Each interval is one row
+here; the motions since the last keyframe, since the last pose node and since the first scan of a
+keyframe are updated when they are needed.
 """
 
 from typing import NamedTuple
@@ -21,9 +21,11 @@ Spread = Float[np.ndarray, "3 3"]
 
 
 class Since(NamedTuple):
-    """Motions up to now: `motion` and its `covariance` since the last keyframe, `shift` of it by an
-    error of the scale of speed; the same since the last pose node, without the shift; `of_scan`
-    since a keyframe of several scans began, without noise.
+    """Motions up to now.
+
+    motion, covariance, shift: since the last keyframe; shift: by an error of the scale of speed.
+    node_motion, node_covariance: since the last pose node.
+    of_scan: since the first scan of a keyframe of several scans, without noise.
     """
 
     motion: Pose
@@ -36,7 +38,7 @@ class Since(NamedTuple):
 
 @compiled
 def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) -> Since:
-    """All of them after further intervals, in order: what `Increment.then` and `compose` give.
+    """All motions after further intervals, in order: equal to `Increment.then` and `compose`.
 
     rows: `models.course_of` of each interval, then its `odometry.forward_column`.
     """
@@ -56,7 +58,7 @@ def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) ->
 
 
 class OdometryRun:
-    """Parts of intervals whose motion follows from their speeds, until somebody asks."""
+    """Parts of intervals whose motion follows from their speeds, stored until it is needed."""
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion = motion
@@ -67,12 +69,12 @@ class OdometryRun:
         return bool(self._rows)
 
     def add(self, over: OdometryInterval, duration_ns: int) -> None:
-        """The part of an interval that comes next."""
+        """Adds the next part of an interval."""
         course = course_of(self._motion, duration_ns * 1e-9, over.forward, over.yaw_rate)
         self._rows.append((*course, *over.forward_column(self._motion, duration_ns).tolist()))
 
     def behind(self, motion: Increment) -> Increment:
-        """A motion with all of them behind it; they stay."""
+        """A motion followed by all stored parts, which remain stored."""
         none = np.zeros(3)
         still = none, np.zeros((3, 3))
         since = Since(motion.mean, motion.covariance, none, *still, none)
@@ -86,7 +88,7 @@ class OdometryRun:
         shift: Float[np.ndarray, "3"],
         of_scan: Pose,
     ) -> Since:
-        """The motions up to now with all of them; there are none any more."""
+        """The motions up to now with all stored parts, which are removed."""
         rows, self._rows = np.array(self._rows), []
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)

@@ -1,11 +1,11 @@
-"""How a window's Gaussian would move if an error that many windows share were taken out of it.
+"""The derivative of a window's Gaussian by errors that many windows share.
 
-A calibration that is a little wrong, b, shifts every submap of a robot alike. With S = ∂mean/∂b a
-submap says r = h(x) − (mean + S b) ~ N(0, P), and the centre estimates b with the map. The
-mean of the particles has no derivative in closed form; S is that of the window's smoother,
-linearised about the particles' mean path: with J, W over the motions and the measurements and g the
-derivative of their residuals, S = −(JᵀWJ)⁻¹ Jᵀ W g. As in the window itself the path takes the
-measurements as independent, and the landmarks are solved for given the path.
+A small calibration error b shifts every submap of a robot alike. With S = ∂mean/∂b a submap is r =
+h(x) − (mean + S b) ~ N(0, P), and the centre estimates b together with the map. The mean of the
+particles has no derivative in closed form; S is that of the window's smoother, linearised about the
+particles' mean path: with J, W over the motions and the measurements and g the derivative of their
+residuals, S = −(JᵀWJ)⁻¹ Jᵀ W g. As in the window itself the path takes the measurements as
+independent, and the landmarks are solved for given the path.
 """
 
 import math
@@ -23,7 +23,7 @@ from team.estimation.geometry import adjoint, between
 from team.estimation.models import NEAREST_M
 
 BIASES: tuple[Bias, ...] = get_args(Bias)
-"""In the order of the columns."""
+"""The biases in the order of the columns."""
 BEARING, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE = range(len(BIASES))
 MOTION_JITTER = (1e-7, 1e-7, 1e-9)
 """Added to each motion's variances [m², m², rad²]: noise of rank 2 has no information matrix."""
@@ -53,7 +53,7 @@ class Motion(NamedTuple):
 def carried_on(
     column: Float[np.ndarray, "3"], motion: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """A shift of what came before, seen at the end of a further motion: Ad(motion⁻¹) column."""
+    """A shift of the earlier motion, seen at the end of a further motion: Ad(motion⁻¹) column."""
     c, s = math.cos(motion[2]), math.sin(motion[2])
     x = column[0] - motion[1] * column[2]
     y = column[1] + motion[0] * column[2]

@@ -25,10 +25,11 @@ from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 
 @dataclass(frozen=True)
 class Settled:
-    """A window's keyframes with their associated detections, and the detections that stay out.
+    """A window's keyframes with their associated detections, and the detections that are left out.
 
-    gated: detections that stay
-    out. slips: motions that the odometry missed. became: what became of each detection.
+    gated: number of detections that are left out.
+    slips: motions that the odometry missed.
+    became: the outcome of each detection.
     """
 
     keyframes: tuple[Keyframe, ...]

@@ -1,8 +1,8 @@
 """The path within a closed window, given the pose at its end.
 
-A submap keeps the pose at its window's end. What the particles know of the poses before it is here
-a linear Gaussian given that end, so a map that moves the two ends of a window moves the path
-between them, and the path has a covariance.
+A submap contains the pose at its window's end. The particles' knowledge of the earlier poses is
+represented here as a linear Gaussian given that end, so that a map that moves the two ends of a
+window moves the path between them, and the path has a covariance.
 """
 
 from collections.abc import Sequence
