@@ -133,7 +133,7 @@ def _chain(
 ) -> Chain | None:
     """None for a stream without odometry: it has no motion that links its poses."""
     odometry = [
-        translate.motion_of(measurement, config)
+        translate.interval_of(measurement, config)
         for measurement in measurements
         if isinstance(measurement, m.AnyOdometry)
     ]
