@@ -54,7 +54,7 @@ class RobotShell:
         self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
         self._doubted: dict[tuple[int, int], Sample] = {}
-        self._doubts_due_s = 0.0
+        self._ends_due_s = 0.0
         self._log_due_s = 0.0
         self._log_look_s = LOG_LOOK_S
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
@@ -100,7 +100,7 @@ class RobotShell:
         """Ask the source for missing measurements of the stream."""
         requested = self.node.request()
         self._missing.look(() if requested is None else (requested,))
-        if self._doubted and time.monotonic() >= self._doubts_due_s:
+        if self._doubted and time.monotonic() >= self._ends_due_s:
             self._ask_about_ends()
         if time.monotonic() >= self._log_due_s:
             lost = self._complete_log()
@@ -273,7 +273,7 @@ class RobotShell:
 
         Where no source answers (a replayed log) the message alone counts.
         """
-        self._doubts_due_s = time.monotonic() + CONFIRMED_S
+        self._ends_due_s = time.monotonic() + CONFIRMED_S
         doubted, self._doubted = self._doubted, {}
         for (incarnation, count), sample in doubted.items():
             request = m.MeasurementsRequest(
