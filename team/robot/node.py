@@ -18,7 +18,7 @@ import msgspec
 
 from team import translate
 from team.config import Exchange, RobotConfig
-from team.door import absurd
+from team.door import absurd, another_time
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, PAIRS
@@ -106,6 +106,7 @@ class RobotNode:
         self._rejected: Rejection | None = None
         self._now_ns = 0
         self._passed_ns = 0
+        self._began_ns = 0
         self._pending: list[Outgoing] = []
         self._done = False
         self._has_sent_done = False
@@ -396,10 +397,12 @@ class RobotNode:
         self._taking, self._rejected = measurement, None
         self._consumed = measurement.number + 1
         stamp_ns = translate.team_time_of(measurement, self.config.clock_offset_s)
-        self._now_ns = max(self._now_ns, stamp_ns)
-        # What was seen at a stamp comes before the odometry that ends there, and may end a window.
-        ahead = 0 if isinstance(measurement, m.AnyOdometry) else 1
-        self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
+        if another_time(stamp_ns, self._began_ns) is None:  # the centre would refuse the last word
+            self._now_ns = max(self._now_ns, stamp_ns)
+            # What was seen at a stamp comes before the odometry that ends there, and may end a
+            # window.
+            ahead = 0 if isinstance(measurement, m.AnyOdometry) else 1
+            self._passed_ns = max(self._passed_ns, stamp_ns - ahead)
         match measurement:
             case m.InitialPose():
                 self.ledger.count(measurement, None, INITIAL_POSE)
@@ -508,6 +511,7 @@ class RobotNode:
         self._steps_before, self._steps = self._steps_before + self._steps, 0
         self._now_ns = max(self._now_ns, start.stamp_ns)
         self._passed_ns = start.stamp_ns - 1
+        self._began_ns = start.stamp_ns
 
     def _leave_incarnation(self) -> list[Outgoing]:
         """Close the current incarnation, if there is one, because a later one begins."""

@@ -65,11 +65,6 @@ class Inbox:
             return another_time(measurement.stamp_ns, self._began_ns)
         return None
 
-    def _is_of_another_time(self, measurement: Measurement) -> bool:
-        if isinstance(measurement, InitialPose) or self._began_ns is None:
-            return False
-        return another_time(measurement.stamp_ns, self._began_ns) is not None
-
     def contradicts(self, end: End, robot: str) -> str | None:
         """Why an announced end can not be the end of the robot's stream, in words."""
         ends = {
@@ -91,8 +86,6 @@ class Inbox:
         """Yield the measurements whose turn has come, one by one."""
         while True:
             measurement = self._waiting.pop(self.next_measurement, None)
-            if measurement is not None and self._is_of_another_time(measurement):
-                continue  # it came before the stream began; what is the source's is asked for
             if measurement is not None:
                 self.next_measurement += 1
                 if isinstance(measurement, InitialPose):

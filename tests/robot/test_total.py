@@ -157,7 +157,8 @@ def test_time_that_stands_goes_back_or_leaps_is_rejected():
             yaw_rate=0.1,
         ),
     }
-    _, submaps, ledger = lived(drive(40, odd))
+    node, submaps, ledger = lived(drive(40, odd))
+    assert node.status().stamp_ns == 40 * S, "a last word 30 years away is refused by the centre"
     assert ledger[Rejection.OLDER.disposition] == 2
     assert ledger[Rejection.TIME.disposition] == 1
     assert submaps[-1].stamp_ns == 40 * S

@@ -132,19 +132,3 @@ def test_the_tail_is_asked_for_whatever_a_stranger_has_published_behind_it():
     inbox.put(measurement(40))
     assert inbox.missing(end) == (0, 3, 39)
     assert inbox.missing(m.StreamEnd(robot="r1", incarnation=9, measurements=5)) == (0, 3, 39)
-
-
-def test_what_came_before_the_stream_began_and_is_years_away_is_not_its_own():
-    """The robot's clock went on by 30 years with it, and the centre refused its last word."""
-    inbox = Inbox()
-    start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
-    forged = m.Odometry(
-        stamp_ns=10**18, robot="r1", incarnation=1, number=1, duration_ns=1, forward=0.0,
-        yaw_rate=0.0,
-    )  # fmt: skip
-    for each in (forged, measurement(2, 1), start):
-        inbox.put(each)
-    assert names(inbox.taken()) == [(1, 0)]
-    assert inbox.gap == (1, 1, 1), "the source is asked for its own"
-    inbox.put(measurement(1, 1))
-    assert names(inbox.taken()) == [(1, 1), (1, 2)]
