@@ -262,13 +262,15 @@ def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Tr
 
 
 def _log_scale(axis: "Axes") -> None:
-    """A logarithmic scale with plain numbers: 1, 2, 5, 10 where it spans few powers of ten."""
+    """A logarithmic scale with plain numbers: 1, 2, 5, 10 where it spans few powers of ten, and
+    more where it spans less than one.
+    """
     from matplotlib.ticker import LogLocator, NullFormatter
 
     axis.set_yscale("log")
     low, high = axis.get_ylim()
-    few = high < 200.0 * low
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+    few = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < 8.0 * low else (1.0, 2.0, 5.0)
+    axis.yaxis.set_major_locator(LogLocator(subs=few if high < 200.0 * low else (1.0,)))
     axis.yaxis.set_major_formatter("{x:,g}")
     axis.yaxis.set_minor_formatter(NullFormatter())
 
