@@ -15,6 +15,7 @@ from sim.cli.options import (
     LogArgument,
     SpeedText,
     connected,
+    counted,
     fail,
     parsed_speed,
     refuse_existing,
@@ -172,10 +173,18 @@ def repair(
     log: LogArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="The new, complete log.")],
 ) -> None:
-    """Complete a log whose recorder was killed: everything up to its last flush."""
+    """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
+    from sim.importing.source import is_own_log
+    from team.recording.bag_repair import bag_repaired
     from team.recording.repair import repaired
 
     refuse_existing(output)
+    if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
+        bag = bag_repaired(log, output)
+        typer.echo(f"{output}: {counted(bag.messages, 'message')}")
+        for damage in bag.damaged:
+            typer.echo(f"lost: {damage}", err=True)
+        return
     result = repaired(log, output)
     until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
     typer.echo(f"{output}: {result.messages} messages{until}")

@@ -67,18 +67,30 @@ _FAULTS = (AnyReaderError, OSError, ValueError, KeyError, AssertionError)
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the name says that it is one."""
-    return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
+    """Whether the name says that it is one, or what is in a folder."""
+    return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file() or bool(_parts(path))
+
+
+def _parts(path: Path) -> list[Path]:
+    """The files of a bag whose recorder was killed before it wrote metadata.yaml."""
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return []
+    files = [each for each in path.iterdir() if each.is_file()]
+    return sorted(files) if all(each.suffix in SUFFIXES for each in files) else []
 
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
     """The bag; raises BagError."""
     try:
-        reader = AnyReader([path], default_typestore=types())
+        reader = AnyReader(_parts(path) or [path], default_typestore=types())
         reader.open()
     except Exception as error:  # the library and what it reads with raise all there is
-        raise BagError(f"{path}: no ROS 2 bag, or a damaged one ({error})") from None
+        remedy = "`ros2 bag reindex` may repair it"
+        files = [each for each in _parts(path) or [path] if each.suffix == ".mcap"]
+        if files:
+            remedy = f"`teamslam repair {files[0]} -o WHOLE.mcap` takes what is whole out of it"
+        raise BagError(f"{path}: no ROS 2 bag, or a damaged one ({error}); {remedy}") from None
     try:
         yield Bag(reader)
     except BagError as error:

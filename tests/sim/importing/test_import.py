@@ -121,6 +121,28 @@ def test_damage_is_counted_with_the_first_message(tmp_path: Path) -> None:
     assert "/odom: 1 of 4 messages dropped: damaged (first: message 4: no sound" in result.output
 
 
+def test_of_a_bag_whose_recorder_was_killed_all_that_is_whole_is_taken(tmp_path: Path) -> None:
+    bag = ros.write_bag(tmp_path / "bag", drive())
+    (bag / "metadata.yaml").unlink()
+    assert run(bag, "-o", tmp_path / "without_metadata").exit_code == 0
+    (file,) = bag.glob("*.mcap")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: whole.rindex(b"\x0f\x04\x00\x00\x00\x00\x00\x00\x00") - 3])
+    refused = run(bag, "-o", tmp_path / "set")
+    command = f"teamslam repair {file} -o WHOLE.mcap"
+    assert command in str(refused.exception)
+    repaired = CliRunner().invoke(app, ["repair", str(file), "-o", str(tmp_path / "whole.mcap")])
+    assert repaired.exit_code == 0, repaired.output
+    result = run(tmp_path / "whole.mcap", "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    first, second = (tmp_path / each for each in ("set", "without_metadata"))
+    assert same(read(first), read(second))
+    file.write_bytes(whole[:20])
+    none = CliRunner().invoke(app, ["repair", str(file), "-o", str(tmp_path / "none.mcap")])
+    assert "no whole message in it" in str(none.exception)
+    assert not (tmp_path / "none.mcap").exists()
+
+
 def test_a_bag_that_does_not_say_what_is_what_is_listed_with_what_to_type(tmp_path: Path) -> None:
     other = [(at, "/wheels", kind, m) for at, topic, kind, m in drive() if topic == "/odom"]
     bag = ros.write_bag(tmp_path / "bag", [*drive(), *other])
