@@ -2,12 +2,15 @@
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 
+from team.containment import reply_of
 from team.shell import Shell
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import BusError
+from team.wire.codec import WireError
 
 PATIENCE_S = 0.5
 """A gap has this long [s] to close before it is asked for."""
@@ -18,11 +21,14 @@ _LOG = logging.getLogger("teamslam")
 
 class MissingMeasurements:
     """Requests missing measurements for one node, whose shell takes the answers; call `look`
-    often.
+    often. confirm: is given each measurement of an answer before the node.
     """
 
-    def __init__(self, shell: Shell) -> None:
+    def __init__(
+        self, shell: Shell, confirm: Callable[[m.Measurement], None] = lambda _: None
+    ) -> None:
         self._shell = shell
+        self._confirm = confirm
         self._since_s: float | None = None
 
     def look(self, requested: Sequence[m.MeasurementsRequest]) -> None:
@@ -55,5 +61,8 @@ class MissingMeasurements:
         except BusError as error:
             _LOG.warning("%s", error)
             return 0
+        for reply in replies:
+            with suppress(WireError):  # the door counts it
+                self._confirm(reply_of(reply, m.Measurement))
         self._shell.take_replies(ch.MEASUREMENTS, requested.robot, replies, m.Measurement)
         return len(replies)

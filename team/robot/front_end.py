@@ -10,6 +10,7 @@ import numpy as np
 
 from team import translate
 from team.config import RobotConfig
+from team.door import another_time
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.plausible import start_beyond
 from team.estimation.scans import sensible
@@ -203,6 +204,8 @@ class FrontEnd:
     def drive(self, measurement: m.AnyOdometry) -> Driven:
         """Take one odometry interval, or only its duration where its motion is rejected."""
         self._goes_in(measurement)
+        if self._is_of_another_time(measurement):
+            return Driven(NOTHING_NEW, Rejection.TIME)
         interval = translate.interval_of(measurement, self._config)
         rejected = self._judge.odometry(interval)
         if rejected not in UNMEASURED:
@@ -216,7 +219,7 @@ class FrontEnd:
             return Rejection.NO_ASSOCIATION
         scan = translate.scan_of(measurement)
         near = self._judge.near(scan.ranges) & sensible(scan.own, scan.ranges, self._config.bounds)
-        rejected = self._judge.time(measurement.stamp_ns)
+        rejected = self._time(measurement)
         if rejected is None and len(near) and not near.any():
             rejected = Rejection.RANGE
         if rejected is None:
@@ -229,7 +232,7 @@ class FrontEnd:
         teammates, ranges, bearings = translate.detections_of(measurement)
         others = np.array([name != self._config.id for name in teammates], dtype=np.bool_)
         near = self._judge.near(ranges) & others
-        rejected = self._judge.time(measurement.stamp_ns)
+        rejected = self._time(measurement)
         if rejected is None and len(near) and not near.any():
             rejected = Rejection.RANGE if others.any() else Rejection.ITSELF
         if rejected is not None:
@@ -239,6 +242,16 @@ class FrontEnd:
         seen = tuple(name for name, is_near in zip(teammates, near, strict=True) if is_near)
         looks = seen, ranges[near], bearings[near]
         return self._windows.sight(measurement.stamp_ns, measurement.number, looks)
+
+    def _time(self, measurement: m.Measurement) -> Rejection | None:
+        if self._is_of_another_time(measurement):
+            return Rejection.TIME
+        return self._judge.time(measurement.stamp_ns)
+
+    def _is_of_another_time(self, measurement: m.Measurement) -> bool:
+        """Whether its clock has leapt so far that no receiver takes a submap with such a stamp."""
+        start = self._start
+        return start is not None and bool(another_time(measurement.stamp_ns, start.stamp_ns))
 
     @property
     def _associates(self) -> bool:

@@ -63,7 +63,7 @@ class RobotShell:
         """The shell of this process' node."""
         self.shell = shell
         shell.believed = self._believed
-        self._missing = MissingMeasurements(shell)
+        self._missing = MissingMeasurements(shell, lambda each: self.node.confirm(each))
 
     def run(self) -> None:
         """Run until the final map is there."""

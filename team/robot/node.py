@@ -215,6 +215,10 @@ class RobotNode:
                 pass
         return None
 
+    def confirm(self, measurement: m.Measurement) -> None:
+        """Note that a measurement comes in the source's own answer to a question."""
+        self._inbox.confirm(measurement)
+
     def end_in(self, end: m.End) -> tuple[int, int]:
         """Incarnation and measurements at which an announced end ends this robot's stream.
 

@@ -23,6 +23,14 @@ class Inbox:
         self._later: dict[int, dict[int, Measurement]] = {}
         self._received = 0
         self._began_ns: int | None = None
+        self._of_source: set[int] = set()
+
+    def confirm(self, measurement: Measurement) -> None:
+        """Note that a measurement comes in the source's own answer: its turn comes, however far off
+        its stamp is.
+        """
+        if measurement.incarnation == self.incarnation:
+            self._of_source.add(measurement.number)
 
     def resume(self, incarnation: int, next_measurement: int) -> None:
         """Note that an earlier process has consumed everything before `next_measurement` of
@@ -61,7 +69,9 @@ class Inbox:
             return (
                 f"of incarnation {measurement.incarnation}, while {self.incarnation} is in progress"
             )
-        if measurement.incarnation == self.incarnation and self._began_ns is not None:
+        if measurement.incarnation != self.incarnation or self._began_ns is None:
+            return None
+        if measurement.number not in self._of_source:
             return another_time(measurement.stamp_ns, self._began_ns)
         return None
 
@@ -87,6 +97,7 @@ class Inbox:
         while True:
             measurement = self._waiting.pop(self.next_measurement, None)
             if measurement is not None:
+                self._of_source.discard(self.next_measurement)
                 self.next_measurement += 1
                 if isinstance(measurement, InitialPose):
                     self._began_ns = measurement.stamp_ns
@@ -104,6 +115,7 @@ class Inbox:
         any more.
         """
         self._received = 0
+        self._of_source.clear()
         self._later = {
             e: measurements for e, measurements in self._later.items() if e > incarnation
         }

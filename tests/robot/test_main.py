@@ -1,6 +1,7 @@
 """The robot's process: one of a name."""
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import msgspec
 import pytest
 
 from team.recording.own_log import own_log
+from team.rejection import Rejection
 from team.robot.main import RobotShell
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -61,13 +63,22 @@ class Source:
         self.bus.publish(Outgoing(ch.START, "r1", said))
 
 
-def lived(network: MemoryNetwork, bus: MemoryBus, act: Callable[[], None]) -> RobotShell:
+def lived(
+    network: MemoryNetwork, bus: MemoryBus, act: Callable[[], None], waits_s: float = 0.0
+) -> RobotShell:
     """A robot's process that hears what `act` brings about, and is told to stop."""
     stop = threading.Event()
     shell = RobotShell(bus, config("r1"), stop, patience_s=0.0)
     shell.shell.begin = act  # when it has subscribed
     duty, turns = shell._duty, iter(range(5))
-    shell._duty = lambda: stop.set() if next(turns, None) is None else duty()
+
+    def acted() -> None:
+        if next(turns, None) is None:
+            stop.set()
+        duty()
+        time.sleep(waits_s)
+
+    shell._duty = acted
     shell.run()
     return shell
 
@@ -221,3 +232,36 @@ def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number: int) 
     shell = lived(network, MemoryBus(network), act)
     assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
     assert "the initial pose is measurement 0" in shell.shell.boundary.last_refused
+
+
+def test_a_stream_whose_clock_leaps_by_decades_goes_on_to_its_end() -> None:
+    """A board without a clock is set by the network: the robot refused all that came after, asked
+    for it, refused the answer, and the team waited for ever.
+    """
+
+    class Leaping(Source):
+        def answer(self, request: bytes) -> list[bytes]:
+            if not self.asked:  # they come once the stream has begun
+                for each in leapt:
+                    self.bus.publish(Outgoing(ch.ODOMETRY, "r1", each))
+                self.bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=0, streams=(ended,))))
+            super().answer(request)
+            wanted = decoded(request, m.MeasurementsRequest)
+            there = [self.start, *leapt]
+            return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
+
+    leapt = [
+        msgspec.structs.replace(odometry(k, "r1"), incarnation=1, stamp_ns=10**18 + k * 10**9)
+        for k in (1, 2)
+    ]
+    network = MemoryNetwork()
+    source, viewer = Leaping(network), MemoryBus(network)
+    viewer.subscribe(ch.ROBOT_DONE)
+    ended = m.StreamEnd(robot="r1", incarnation=1, measurements=3)
+    shell = lived(network, MemoryBus(network), lambda: source.begins(1), waits_s=0.3)
+    assert shell.shell.boundary.refused == 2
+    (said,) = viewer.receive()
+    done = decoded(said.payload, m.Done)
+    ledger = {each.disposition: each.measurements for each in done.ledger}
+    assert (done.measurements, ledger[Rejection.TIME.disposition]) == (3, 2)
+    assert done.stamp_ns < 10**18
