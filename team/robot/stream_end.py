@@ -17,7 +17,7 @@ class EndOfStream:
         self.driver_is_there: bool | None = None
         self.is_ordered = False
         self.at_source: tuple[int, int] | None = None
-        """Incarnation and measurements at which the stream ends by its source's own answer."""
+        """Incarnation and measurements at which a world ends the stream, by its own answer."""
 
     @property
     def reached(self) -> bool:
@@ -32,7 +32,8 @@ class EndOfStream:
     @property
     def waits_for_driver(self) -> bool:
         """Whether measurements must come from a driver that is not present."""
-        return self._head is not None and self.driver_is_there is False
+        driven = self._head is not None and self.at_source is None
+        return driven and self.driver_is_there is False
 
     def missing(self) -> tuple[int, int, int] | None:
         """Incarnation, first and last measurement to ask the source for."""
@@ -61,6 +62,10 @@ class EndOfStream:
         """Take a world's end; one that does not name this robot ends its stream where it is."""
         self._world_end = end = later_end(end, self._world_end)
         mine = [stream for stream in end.streams if stream.robot == self._robot]
+        if self.at_source is not None:  # no other word counts any more
+            incarnation, count = self.at_source
+            self._last = m.StreamEnd(robot=self._robot, incarnation=incarnation, measurements=count)
+            return
         self._last = mine[0] if mine else self._at(0)
 
     def take_head(self, head: m.StreamHead) -> m.StreamHead:
@@ -69,6 +74,8 @@ class EndOfStream:
         The stream ends when the head says so, unless a later incarnation begins after that.
         """
         self._head = head = later_head(head, self._head)
+        if self.at_source is not None:
+            return head
         if head.state == "ended":
             self.take(_end_at(head))
         elif self._last is not None and head.incarnation > self._last.incarnation:

@@ -191,6 +191,33 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on() -> N
     assert decoded(said.payload, m.Done).measurements == 2
 
 
+@pytest.mark.parametrize("state", ["ended", "open"])
+def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state: str) -> None:
+    """A stranger's head of a driver that is not there: the robot waited, and asked for nothing."""
+
+    class Published(Source):
+        def answer(self, request: bytes) -> list[bytes]:
+            super().answer(request)
+            wanted = decoded(request, m.MeasurementsRequest)
+            there = [self.start, msgspec.structs.replace(odometry(1, "r1"), incarnation=1)]
+            return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
+
+    network = MemoryNetwork()
+    source, viewer = Published(network), MemoryBus(network)
+    viewer.subscribe(ch.ROBOT_DONE)
+
+    def act() -> None:
+        source.begins(1)
+        head = m.StreamHead(stamp_ns=0, robot="r1", incarnation=1, measurements=5000, state=state)
+        source.bus.publish(Outgoing(ch.HEAD, "r1", head))
+        ended = m.StreamEnd(robot="r1", incarnation=1, measurements=2)
+        source.bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=0, streams=(ended,))))
+
+    lived(network, MemoryBus(network), act, waits_s=0.3)
+    (said,) = viewer.receive()
+    assert decoded(said.payload, m.Done).measurements == 2, "measurement 1 was asked for"
+
+
 def test_a_stream_begins_where_its_source_says() -> None:
     """A stranger was there first, years away: everything of the source was refused after that."""
     network = MemoryNetwork()
