@@ -32,6 +32,8 @@ MOST_REASONS = 100
 """Reasons for which messages are dropped that are told apart: a key's type may be any text."""
 WARN_S = 10.0
 """Between two words about what is dropped."""
+SILENT_S = 10.0
+"""Odometry that has not come by then [s] is named."""
 BEHIND_S = 1.0
 """A message that waits longer says that the driver is slower than its topics."""
 NANO = Decimal(10) ** -9
@@ -84,6 +86,8 @@ class Ros2Driver:
         self.dropped: Counter[str] = Counter()
         self.lost = Lost()
         self._names = {topics.odometry, *topics.detections, STATIC} - {""}
+        self._silent = {topics.odometry} - {""}
+        self._began_s = time.monotonic()
 
     @property
     def keys(self) -> list[str]:
@@ -108,6 +112,7 @@ class Ros2Driver:
         topic, kind = ("/" + sample.key.strip("/"), "") if named is None else named
         if topic not in self._names:
             return
+        self._silent.discard(topic)
         kind = kind[:80] or self._kinds.get(topic, "")
         self.lost.take(topic, sample.attachment)
         if not kind:
@@ -227,6 +232,13 @@ class Ros2Driver:
             "with the history keep_all: then Zenoh waits instead of dropping"
             for topic, count in self.lost.count.items()
         ]
+        if time.monotonic() - self._began_s > SILENT_S:
+            said += [
+                f"{topic}: no message yet: look at its name, at `domain` in the file of topics "
+                f"({self._domain} is listened to), and whether rmw_zenoh's router or the bridge is "
+                "at --ros2-connect"
+                for topic in self._silent
+            ]
         late_s = self._backlog.oldest_s
         if late_s > BEHIND_S:
             said.append(

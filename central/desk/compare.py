@@ -111,7 +111,7 @@ _TEAM: Sequence[tuple[str, Callable[[Evaluation], str]]] = (
         "covariance scale",
         lambda r: shown(None if r.map is None else r.map.covariance_scale, ".2f", ""),
     ),
-    ("final map's bytes", lambda r: "–" if r.map is None else r.map.payload_sha256[:12]),
+    ("final map, its bytes", lambda r: "–" if r.map is None else r.map.payload_sha256[:16]),
 )
 _ROBOT: Sequence[tuple[str, Callable[[RobotResult], str]]] = (
     ("path RMSE, aligned [m]", lambda r: shown(r.aligned_rmse_m, ".4f", "")),

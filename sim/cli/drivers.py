@@ -56,7 +56,7 @@ def driver(
     import numpy as np
 
     from team.driver.driver import Driver, DriverError
-    from team.driver.measured import DriverWarning
+    from team.driver.measured import DriverWarning, MeasurementError
     from team.ros2.topics import TopicsError, load_topics
     from team.ros2_driver import Ros2Driver
     from team.shell import process
@@ -113,5 +113,7 @@ def driver(
                 _LOG.warning("%s: %d", reason, count)
             for text in translated.warnings():
                 _LOG.warning("%s", text)
+    except MeasurementError as error:
+        fail(f"--start: {error}", WRONG_USE)
     except DriverError as error:
         fail(str(error), FAILED)

@@ -19,7 +19,7 @@ from team.ros2.arrivals import MOST_PUBLISHERS, Backlog, Lost, number_of
 from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics, TopicsError, load_topics
 from team.ros2.translator import Measured
-from team.ros2_driver import BEHIND_S, MOST_REASONS, Ros2Driver
+from team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
 from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
@@ -299,6 +299,20 @@ def test_a_driver_that_falls_behind_says_so_in_its_status(
     said = " ".join(status.warnings)
     assert "3 messages wait, the oldest for 5 s" in said
     assert "/r1/odom: 2 messages were dropped" in said
+
+
+def test_odometry_that_does_not_come_is_named_with_what_to_look_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    silent, heard = Ros2Driver(Robot(), TOPICS), Ros2Driver(Robot(), TOPICS)
+    heard.put(ForeignSample(by_rmw("/r1/odom", ODOMETRY), odometry(1)))
+    heard.deliver()
+    assert not silent.warnings()
+    now = time.monotonic()
+    monkeypatch.setattr("team.ros2_driver.time.monotonic", lambda: now + 2.0 * SILENT_S)
+    assert not heard.warnings()
+    (said,) = silent.warnings()
+    assert "/r1/odom: no message yet: look at its name, at `domain`" in said
 
 
 def test_a_backlog_keeps_the_order_of_each_topic() -> None:
