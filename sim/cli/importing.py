@@ -1,5 +1,6 @@
 """The command `teamslam import`."""
 
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from sim.cli.options import WRONG_USE, counted, fail, parsed_start
 
 app = typer.Typer()
 ROS2_PROFILE = b"ros2"
+BAG_FILES = (".mcap", ".db3")
 HEAD = 64
 """Bytes in which an MCAP file names its profile."""
 
@@ -68,9 +70,14 @@ def import_(
         ros2=ros2,
         truth=truth,
     )
-    report = imported(request, output)
-    elapsed_s = time.monotonic() - began
-    for note in dict.fromkeys([*report.notes, *_as_read(output)]):  # each once
+    try:
+        report = imported(request, output)
+        elapsed_s = time.monotonic() - began
+        notes = dict.fromkeys([*report.notes, *_as_read(output)])  # each once
+    except BaseException:  # half a data set is none, and the next attempt may have its folder
+        shutil.rmtree(output, ignore_errors=True)
+        raise
+    for note in notes:
         typer.echo(note)
     if report.messages:
         rate = report.messages / elapsed_s
@@ -80,7 +87,15 @@ def import_(
 
 def is_foreign(path: Path) -> bool:
     """Whether a data set must be imported before a team can run on it: a ROS 2 bag or a log."""
-    return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
+    return path.suffix in BAG_FILES or _is_bag_folder(path)
+
+
+def _is_bag_folder(path: Path) -> bool:
+    """Whether it has a bag's metadata.yaml, or nothing but a bag's files."""
+    if (path / "metadata.yaml").is_file():
+        return True
+    inside = {each.suffix for each in path.iterdir()} if path.is_dir() else set()
+    return bool(inside) and inside <= {*BAG_FILES}
 
 
 def imported_into(path: Path, folder: Path) -> Path:
@@ -102,7 +117,7 @@ def readable(path: Path) -> Iterator[Path]:
     """
     from tempfile import TemporaryDirectory
 
-    if not (path.suffix == ".db3" or (path / "metadata.yaml").is_file() or _is_ros2_mcap(path)):
+    if not (path.suffix == ".db3" or _is_bag_folder(path) or _is_ros2_mcap(path)):
         yield path
         return
     from sim.importing.source import Request, imported

@@ -136,6 +136,11 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
         inner = {each.name: sorted(each.glob("*.csv")) for each in sorted(source.iterdir())}
         inner = {name: files for name, files in inner.items() if files}
         beside = sorted(source.glob("*.csv"))
+        if inner and request.robot:
+            raise DatasetError(
+                f"--robot {request.robot}: {source} has a folder for each robot, "
+                f"{', '.join(inner)}, which names it; rename the folder"
+            )
         if inner:
             found |= {name: [*files, *beside] for name, files in inner.items()}
         elif len(request.sources) == 1:
