@@ -139,7 +139,7 @@ def _chain(
     ]
     if not odometry:
         return None
-    first_ns, last_ns = odometry[0][0] - odometry[0][1], odometry[-1][0]
+    first_ns, last_ns = odometry[0].end_ns - odometry[0].duration_ns, odometry[-1].end_ns
     grid = _grid(config) if sightings else None
     segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)
     segmenter.begin(first_ns)
