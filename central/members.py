@@ -11,7 +11,7 @@ from weakref import WeakValueDictionary
 
 from team import translate
 from team.estimation.contribution import Contribution
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.wire.digest import Digest
 from team.wire.messages import SightingFactor, Submap
 
@@ -29,7 +29,7 @@ class Members:
         self.tick_ns = tick_ns
         self._ticks: dict[int, dict[Key, Submap]] = {}
         self._order: list[int] = []
-        self._sightings: dict[Key, tuple[Sighting, ...]] = {}
+        self._sightings: dict[Key, tuple[InterRobotFactor, ...]] = {}
         self._digests: dict[Key, bytes] = {}
         self._made: WeakValueDictionary[Key, Contribution] = WeakValueDictionary()
         self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
@@ -75,7 +75,7 @@ class Members:
             self._made[key] = found
         return found
 
-    def sightings(self, key: Key) -> tuple[Sighting, ...]:
+    def sightings(self, key: Key) -> tuple[InterRobotFactor, ...]:
         """The inter-robot measurements from a submap."""
         return self._sightings.get(key, ())
 

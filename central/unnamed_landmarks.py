@@ -4,7 +4,7 @@ back.
 
 import numpy as np
 
-from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
+from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 
@@ -17,7 +17,7 @@ LARGEST = 1e300
 
 def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
     """The table of unnamed landmarks: member, identity, step."""
-    streams: dict[tuple[str, int], list[Member]] = {}
+    streams: dict[tuple[str, int], list[LocalLandmark]] = {}
     for member in sorted(landmarks.number):
         streams.setdefault((member.robot, member.incarnation), []).append(member)
     table = []
@@ -52,7 +52,7 @@ def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
 def verdict_of(judgement: m.Judgement) -> Verdict:
     """An operator's judgement as the fold's verdict."""
     first, second = (
-        Member(each.robot, each.incarnation, each.sequence, each.local)
+        LocalLandmark(each.robot, each.incarnation, each.sequence, each.local)
         for each in sorted(
             (judgement.first, judgement.second),
             key=lambda x: (x.robot, x.incarnation, x.sequence, x.local),

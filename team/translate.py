@@ -9,8 +9,9 @@ from jaxtyping import Float, UInt32
 
 from team.config import UNNAMED, RobotConfig
 from team.estimation.gaussian import Matrix, packed, unpacked
-from team.estimation.map_joining.conditioning import RobotPrior, Shared
-from team.estimation.map_joining.joining import Contribution, InitialPoseFactor, Sighting
+from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
+from team.estimation.map_joining.joining import Contribution, InitialPoseFactor
 from team.estimation.odometry import OdometryInterval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
 from team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
@@ -182,7 +183,7 @@ def association_message(
 
 
 def sighting_message(
-    sighting: Sighting, config: bytes, measurements: tuple[int, ...]
+    sighting: InterRobotFactor, config: bytes, measurements: tuple[int, ...]
 ) -> m.SightingFactor:
     """The message of an inter-robot factor, with the names of its inputs."""
     return m.SightingFactor(
@@ -199,9 +200,9 @@ def sighting_message(
     )
 
 
-def sighting_of(message: m.SightingFactor) -> Sighting:
+def sighting_of(message: m.SightingFactor) -> InterRobotFactor:
     """The inter-robot factor in a message, as map joining takes it."""
-    return Sighting(
+    return InterRobotFactor(
         message.robot,
         message.incarnation,
         message.sequence,
@@ -384,7 +385,7 @@ def prior_of(message: m.Prior) -> RobotPrior:
     covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
     landmark_ids = ids(message.ids, "ids").astype(np.uint32)
     biases = tuple((each.bias, each.value, each.sigma) for each in message.biases)
-    shared = Shared(message.covariance_factor, biases)
+    shared = SubmapCorrection(message.covariance_factor, biases)
     return RobotPrior(mean[:3], landmark_ids, mean[3:].reshape(-1, 2), covariance, shared)
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from team import translate
 from team.config import UNNAMED, RobotConfig
-from team.estimation.inter_robot import Sighting
-from team.estimation.map_joining.conditioning import RobotPrior, Shared
+from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from team.estimation.submap import LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -76,7 +76,9 @@ def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
     assert found.node_stamps.tolist() == [1_200, 1_700]
     assert found.nodes.tobytes() == local.mean[3:9].tobytes()
     assert found.landmarks.tobytes() == local.mean[9:].tobytes()
-    seen = Sighting("r1", 2, 5, 1_200, "r2", np.array([2.0, -1.0]), correlated(np.ones(2), rng))
+    seen = InterRobotFactor(
+        "r1", 2, 5, 1_200, "r2", np.array([2.0, -1.0]), correlated(np.ones(2), rng)
+    )
     again = translate.sighting_of(
         over_the_wire(translate.sighting_message(seen, b"settings", (3, 4)))
     )
@@ -89,7 +91,7 @@ def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
 @given(st.sets(st.integers(1, 50), max_size=5), st.integers(0, 99))
 def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
     local = local_map(ids, seed)
-    shared = Shared(2.5, (("bearing", 0.01, 0.001), ("range_scale", -0.02, 0.003)))
+    shared = SubmapCorrection(2.5, (("bearing", 0.01, 0.001), ("range_scale", -0.02, 0.003)))
     prior = RobotPrior(local.end_pose, local.ids, local.landmarks, local.covariance, shared)
     there = over_the_wire(translate.prior_message(7, "r1", 1, 3, b"its name", prior))
     found = translate.prior_of(there)

@@ -22,7 +22,7 @@ from team.estimation.models import NEAREST_M, Increment, noise
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class InterRobotFactor:
     """An inter-robot measurement: from the pose node at stamp_ns of submap `sequence` of (robot,
     incarnation).
 
@@ -55,14 +55,14 @@ class Sighting:
         return information(self.covariance, what)
 
 
-class Carried(NamedTuple):
+class CarriedPoint(NamedTuple):
     """A point in the observer's frame [m] with its covariance [m²]."""
 
     point: Float[np.ndarray, "2"]
     covariance: Float[np.ndarray, "2 2"]
 
 
-def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) -> Carried:
+def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) -> CarriedPoint:
     """A teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the node's
     time.
 
@@ -73,16 +73,16 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     own = sensor.marker_sigma**2 + drift * drift
     turn = _turn(bearing)
     spread = np.diag([range_variance + own, bearing_variance * distance**2 + own])
-    return Carried(distance * turn[:, 0], turn @ spread @ turn.T)
+    return CarriedPoint(distance * turn[:, 0], turn @ spread @ turn.T)
 
 
-def of_base(seen: Carried, mount: Pose) -> Carried:
+def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
     """A point that the sensor sees, in the frame of the base on which it is mounted."""
     turn = _turn(float(mount[2]))
-    return Carried(transformed(mount, seen.point), turn @ seen.covariance @ turn.T)
+    return CarriedPoint(transformed(mount, seen.point), turn @ seen.covariance @ turn.T)
 
 
-def carried_back(seen: Carried, node_from_here: Increment) -> Carried:
+def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
     """The point in the frame of a later node: the observer has moved by node_from_here before
     reaching it.
     """
@@ -90,10 +90,10 @@ def carried_back(seen: Carried, node_from_here: Increment) -> Carried:
     turn = _turn(float(T[2]))
     J = turn @ np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]])
     spread = turn @ seen.covariance @ turn.T + J @ node_from_here.covariance @ J.T
-    return Carried(transformed(T, seen.point), spread)
+    return CarriedPoint(transformed(T, seen.point), spread)
 
 
-def carried_on(seen: Carried, here_from_node: Increment) -> Carried:
+def carried_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
     """The point in the frame of an earlier node, from which the observer has moved by
     here_from_node.
     """
@@ -102,7 +102,7 @@ def carried_on(seen: Carried, here_from_node: Increment) -> Carried:
     turn = _turn(float(T[2]))
     J = np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
     spread = turn @ seen.covariance @ turn.T + J @ here_from_node.covariance @ J.T
-    return Carried(point, spread)
+    return CarriedPoint(point, spread)
 
 
 def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
@@ -111,7 +111,7 @@ def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
 
 
 def reduced(
-    carried: Sequence[Carried],
+    carried: Sequence[CarriedPoint],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
     """One (range, bearing) and its covariance for several measurements of a teammate from one node.
 

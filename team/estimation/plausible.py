@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from team.config import Bounds
 from team.estimation.contribution import InitialPoseFactor
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.submap import LocalMap
 
 Values = Float[np.ndarray, " _"]
@@ -31,7 +31,7 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
     return why or _spread(local.covariance, angles, bounds)
 
 
-def sighting_beyond(sighting: Sighting, bounds: Bounds) -> str | None:
+def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
     """Why an inter-robot measurement is refused; None if it is within the bounds."""
     why = _far(sighting.measurement[:1], bounds.extent_m, "of its observer")
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)

@@ -57,7 +57,7 @@ class Given:
 
 
 @dataclass
-class Carried:
+class NodeTraffic:
     """Traffic from one node: members that were new, and bytes, new or not."""
 
     members: int = 0
@@ -93,7 +93,7 @@ class PeerNode:
         self._fed: dict[Stream, int] = {}
         self._new_messages: list[m.Message] = []
         self.rebuild = False
-        self.carried: dict[str, Carried] = defaultdict(Carried)
+        self.carried: dict[str, NodeTraffic] = defaultdict(NodeTraffic)
         self.refused = 0
         self.last_refused = ""
         self.stamp_ns = 0

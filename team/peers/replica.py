@@ -33,7 +33,7 @@ _WORD = 2**256
 K = TypeVar("K")
 
 Outcome = Literal["new", "known", "replaced"]
-Look = tuple[int, str]
+TeammateAt = tuple[int, str]
 """(stamp, teammate) of an inter-robot measurement."""
 
 
@@ -52,7 +52,7 @@ class StreamShare:
 
     start: Member | None = None
     submaps: dict[int, Member] = field(default_factory=dict)
-    factors: dict[int, dict[Look, Member]] = field(default_factory=dict)
+    factors: dict[int, dict[TeammateAt, Member]] = field(default_factory=dict)
     complete: set[int] = field(default_factory=set)
     count: int = 0
     beyond: set[int] = field(default_factory=set)

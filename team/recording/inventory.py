@@ -25,7 +25,7 @@ _ASKED_FOR = (ch.SIGHTING_FACTOR, ch.FINAL_MAP, *ch.REPLIES[ch.ORDERS_KEPT])
 """Channels without numbers whose messages are sent as replies."""
 
 
-class Stream(NamedTuple):
+class NumberedStream(NamedTuple):
     """Measurements or submaps of one incarnation of a robot."""
 
     kind: Kind
@@ -87,7 +87,7 @@ class Inventory:
     """
 
     has_earlier_parts: bool = False
-    streams: dict[Stream, Numbered] = field(default_factory=dict)
+    streams: dict[NumberedStream, Numbered] = field(default_factory=dict)
     _earlier: set[int] = field(default_factory=set, init=False)
     _contents: set[int] = field(default_factory=set, init=False)
 
@@ -129,7 +129,7 @@ class Inventory:
         return True
 
     def _of(self, kind: Kind, robot: str, incarnation: int) -> Numbered:
-        return self.streams.setdefault(Stream(kind, robot, incarnation), Numbered())
+        return self.streams.setdefault(NumberedStream(kind, robot, incarnation), Numbered())
 
     def _hear(self, sample: Sample) -> None:
         try:
@@ -162,13 +162,13 @@ class Inventory:
         return found
 
     @property
-    def gaps(self) -> dict[Stream, int]:
+    def gaps(self) -> dict[NumberedStream, int]:
         """The first missing number of each incomplete stream."""
         return {
             name: each.whole for name, each in self.streams.items() if each.newest >= each.whole
         }
 
-    def span(self, stream: Stream) -> tuple[int, int]:
+    def span(self, stream: NumberedStream) -> tuple[int, int]:
         """The first and the last missing number of an incomplete stream."""
         missing = self.streams[stream].missing
         return missing[0][0], missing[-1][1]

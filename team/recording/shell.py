@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 
-from team.recording.inventory import Inventory, Stream, intervals
+from team.recording.inventory import Inventory, NumberedStream, intervals
 from team.recording.last_words import MISSING
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.replayer import schedule
@@ -81,7 +81,7 @@ class RecordLoop:
         self._failure: RecorderError | None = None
         self._retry_s = 0.0
         self._inventory = Inventory() if inventory is None else inventory
-        self._patience: Patience[Stream] = Patience()
+        self._patience: Patience[NumberedStream] = Patience()
         self._reported: dict[tuple[str, int], tuple[int, int]] = {}
         self._missing = set(expected)
         self._alive: set[str] = set()

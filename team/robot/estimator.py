@@ -15,7 +15,7 @@ from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.pose_grid import Looks
+from team.estimation.hybrid_slam.pose_grid import TeammateScan
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.estimation.submap import Became, LocalMap
@@ -130,7 +130,7 @@ class MakesSubmaps(Protocol):
     def resume(self, closed: ClosedWindow) -> None:
         """Continue behind a submap of an earlier process."""
 
-    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
+    def sight(self, stamp_ns: int, measurement: int, looks: TeammateScan) -> Rejection | None:
         """Take inter-robot measurements; returns the reason if they are rejected."""
 
     def open_window(self) -> LocalMap | None:

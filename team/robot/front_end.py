@@ -37,14 +37,14 @@ MOST_SET_ASIDE = 8
 further ones."""
 
 
-class Driven(NamedTuple):
+class IntervalOutcome(NamedTuple):
     """What an odometry interval led to, and why its motion was rejected, if it was."""
 
     estimates: Estimates
     rejected: Rejection | None
 
 
-class FrontEnd:
+class BoundedEstimator:
     """The estimators of one incarnation after the other: `begin`, then each measurement in its
     order.
 
@@ -201,7 +201,7 @@ class FrontEnd:
 
     # Measurements.
 
-    def drive(self, measurement: m.AnyOdometry) -> Driven:
+    def drive(self, measurement: m.AnyOdometry) -> IntervalOutcome:
         """Take one odometry interval, or only its duration where its motion is rejected."""
         self._goes_in(measurement)
         if self._is_of_another_time(measurement):
@@ -209,8 +209,8 @@ class FrontEnd:
         interval = translate.interval_of(measurement, self._config)
         rejected = self._judge.odometry(interval)
         if rejected not in UNMEASURED:
-            return Driven(NOTHING_NEW, rejected)
-        return Driven(self.estimator.drive(interval, measured=rejected is None), rejected)
+            return IntervalOutcome(NOTHING_NEW, rejected)
+        return IntervalOutcome(self.estimator.drive(interval, measured=rejected is None), rejected)
 
     def observe(self, measurement: m.AnyScan | m.Detections) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""

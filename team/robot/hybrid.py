@@ -14,7 +14,7 @@ from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, Pose
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.hybrid_slam.pose_grid import Looks
+from team.estimation.hybrid_slam.pose_grid import TeammateScan
 from team.estimation.map_joining.conditioning import pose_now
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.map_joining.whole_map import WholeMap, absorbed, initial_map, joined
@@ -79,7 +79,7 @@ class HybridEstimator:
         """Take a scan of landmarks; returns the reason if it is rejected."""
         return self._slam.observe(stamp_ns, scan)
 
-    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
+    def sight(self, stamp_ns: int, measurement: int, looks: TeammateScan) -> Rejection | None:
         """Take inter-robot measurements; returns the reason if they are rejected."""
         return self._slam.sight(stamp_ns, measurement, looks)
 

@@ -9,7 +9,7 @@ from team.config import RobotConfig
 from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
 from team.pairs import PAIRS
 from team.robot.estimator import AbsorbsMaps
-from team.robot.front_end import FrontEnd
+from team.robot.front_end import BoundedEstimator
 from team.robot.pace import Pace
 from team.robot.statements import MessageWriter
 from team.wire import messages as m
@@ -41,7 +41,7 @@ class RunningMaps:
         """Begin an incarnation: its maps are numbered from 0."""
         self.last = -1
 
-    def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
+    def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
         """A new running map: publish it for viewers, or in an exchange that is due."""
         self._map_ns = stamp_ns
         if not self._exchanges:
@@ -51,20 +51,22 @@ class RunningMaps:
             return []
         return self._exchange(stamp_ns, front, writer)
 
-    def finish(self, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
+    def finish(self, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
         """End the stream: publish the last map, unless an exchange had it."""
         if self._map_ns is None or not self._exchanges or self._map_ns == self._exchange_ns:
             return []
         return self._exchange(self._map_ns, front, writer)
 
-    def _exchange(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
+    def _exchange(
+        self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter
+    ) -> list[Outgoing]:
         self._exchange_ns = stamp_ns
         self.last = front.estimator.sequence
         if self._pace.lockstep:
             self._pace.sent_map()
         return [self._own_map(stamp_ns, front, writer)]
 
-    def _own_map(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> Outgoing:
+    def _own_map(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> Outgoing:
         estimator = front.estimator
         landmarks = estimator.own_map()
         joint = self._exchanges and estimator.joint
@@ -79,7 +81,7 @@ class RunningMaps:
             "joint" if joint else "blocks",
         )
 
-    def absorb(self, fused: m.FusedMap, front: FrontEnd) -> None:
+    def absorb(self, fused: m.FusedMap, front: BoundedEstimator) -> None:
         """Take the answer of an exchange: under a rule with feedback the own map absorbs it."""
         estimator: object = front.estimator
         if self._pace.answered(fused.exchange):

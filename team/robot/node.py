@@ -24,7 +24,7 @@ from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, PAIRS
 from team.rejection import UNMEASURED, Rejection
 from team.robot.estimator import Estimates
-from team.robot.front_end import FrontEnd
+from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition, no_listener
 from team.robot.maps import RunningMaps
 from team.robot.outbox import Outbox
@@ -90,7 +90,7 @@ class RobotNode:
         self._on_disposition = on_disposition
         self._inbox = Inbox()
         self._stream_end = EndOfStream(config.id, self._inbox)
-        self._front = FrontEnd(config, self.warnings)
+        self._front = BoundedEstimator(config, self.warnings)
         self.ledger = Ledger(self._front.estimator.used, on_disposition=self._on_disposition)
         """Law 1's account of the incarnation that is being consumed."""
         self._outbox = Outbox(config.id, exchange)

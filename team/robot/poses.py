@@ -7,7 +7,7 @@ from team.config import RobotConfig
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond
-from team.robot.front_end import FrontEnd
+from team.robot.front_end import BoundedEstimator
 from team.robot.statements import MessageWriter
 from team.robot.team_map import TeamMap
 from team.wire import channels as ch
@@ -58,7 +58,7 @@ class RunningPoses:
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 
-    def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
+    def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
         """A new pose: the messages to publish, if they are due."""
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
@@ -69,7 +69,7 @@ class RunningPoses:
         self,
         stamp_ns: int,
         prior: m.Prior | None,
-        front: FrontEnd,
+        front: BoundedEstimator,
         writer: MessageWriter,
     ) -> list[Outgoing]:
         """The message of the own pose and, given a prior, of the pose in the team's map."""

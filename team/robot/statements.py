@@ -11,7 +11,7 @@ from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.submap import Became
 from team.robot.estimator import Cloud
 from team.wire import channels as ch
@@ -54,7 +54,7 @@ class MessageWriter:
 
     def sighting(self, closed: ClosedWindow, each: NodeSighting) -> Outgoing:
         """The inter-robot measurement from a pose node of the window."""
-        sighting = Sighting(
+        sighting = InterRobotFactor(
             self.robot,
             self.incarnation,
             closed.sequence,

@@ -6,7 +6,7 @@ from team import translate
 from team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
-    Shared,
+    SubmapCorrection,
     curved,
     followed,
     is_majority,
@@ -28,7 +28,7 @@ class TeamMap:
     def __init__(self) -> None:
         self._prior: m.Prior | None = None
         self._submaps = 0
-        self._shared = Shared()
+        self._shared = SubmapCorrection()
         self._followed: Followed | Exception | None = None
         self.known = 0
         self.refused = 0

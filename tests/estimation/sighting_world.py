@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import correlated, drawn, local_truth, seen_from, wrap
@@ -71,7 +71,7 @@ def meeting(seed, robots=2, submaps=6, landmarks=5, reach=12.0, sigmas=(0.1, 0.0
             measurement = np.array([abs(to) + noise[0], wrap(np.angle(to) + noise[1])])
             covariance = np.diag(np.square(sigmas))
             stamp = 1000 * k + 500
-            sightings.append(Sighting(robot, 0, k, stamp, other, measurement, covariance))
+            sightings.append(InterRobotFactor(robot, 0, k, stamp, other, measurement, covariance))
     canonical = sorted(made, key=lambda each: each.key)
     return Met(points, starts, canonical, sorted(sightings, key=lambda each: each.key))
 
@@ -113,7 +113,7 @@ def mirrored(bearing_sigma, options):
         bearing = np.angle(to) if bearing_sigma < 1.0 else 0.0
         measurement = np.array([abs(to), bearing])
         covariance = np.diag([0.01, bearing_sigma]) ** 2
-        ranges_seen.append(Sighting("r0", 0, 0, stamp, "r1", measurement, covariance))
+        ranges_seen.append(InterRobotFactor("r0", 0, 0, stamp, "r1", measurement, covariance))
     starts = [
         InitialPoseFactor("r0", 0, np.zeros(3)),
         InitialPoseFactor("r1", 0, paths["r1"], np.diag([100.0, 100, 9])),

@@ -7,7 +7,7 @@ from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.robot.front_end import FrontEnd
+from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import OnDisposition, no_listener
 from team.robot.node import RobotNode
 from team.robot.poses import RunningPoses
@@ -32,7 +32,7 @@ class RecordedPoses(RunningPoses):
         super().__init__(config, [])
         self._recorded = recorded
 
-    def at(self, stamp_ns: int, front: FrontEnd, writer: MessageWriter) -> list[Outgoing]:
+    def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
         """The poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
         for prior in self._recorded.get((writer.incarnation, stamp_ns), ()):

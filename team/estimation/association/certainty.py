@@ -34,7 +34,7 @@ SETTLED = 1e-6
 
 
 @dataclass(frozen=True)
-class View:
+class FieldOfView:
     """The sector that a window's scans observe, estimated from its own detections.
 
     density: detections of a scan per square metre of the sector; area [m²]; looks: number of scans.
@@ -65,7 +65,7 @@ class View:
         return np.asarray(np.maximum(inside, LEAST))
 
 
-def view_of(scans: Scans) -> View:
+def view_of(scans: Scans) -> FieldOfView:
     """The sector that the window's detections fill, without the widening by their noise, and the
     density of detections in it.
     """
@@ -77,7 +77,7 @@ def view_of(scans: Scans) -> View:
     least, most = float(bearings.min()) - WIDER, float(bearings.max()) + WIDER
     area = max(0.5 * min(most - least, 2.0 * np.pi) * farthest**2, 1e-9)
     looks = len(np.unique(scans.keyframes))
-    return View(len(ranges) / (looks * area), area, looks, farthest, least, most)
+    return FieldOfView(len(ranges) / (looks * area), area, looks, farthest, least, most)
 
 
 def certainties(

@@ -24,7 +24,7 @@ from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian, inf
 from team.estimation.geometry import Pose, compose, tangent
 from team.estimation.map_joining.least_squares import (
     STUCK,
-    Point,
+    Iterate,
     Values,
     iterated,
     robust_scale,
@@ -44,7 +44,7 @@ until it is c: what is far off since a pose was dead-reckoned is not taken for a
 
 
 @dataclass(frozen=True, eq=False)
-class Batch(Point):
+class Batch(Iterate):
     """An estimate of everything, in the map frame.
 
     poses:     (x [m], y [m], θ [rad]), in the order in which they came.

@@ -126,7 +126,7 @@ class PointPairs(NamedTuple):
 NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)))
 
 
-class Exchange(NamedTuple):
+class ExchangedMap(NamedTuple):
     """What two maps make together, and how the second lies in the first."""
 
     landmarks: LandmarkGaussian
@@ -152,7 +152,9 @@ def mutual_sighting(
     )
 
 
-def exchanged(a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS) -> Exchange:
+def exchanged(
+    a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS
+) -> ExchangedMap:
     """Two maps as one in the frame of a, from their common landmarks and the robots' positions.
 
     argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): given (R, t), each common
@@ -188,7 +190,7 @@ def exchanged(a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_
     E = np.repeat(from_b, 2)[:, None] * slopes
     own = variance * np.where(common, 0.5, 1.0)
     covariance = np.diag(np.repeat(own, 2)) + E @ of_motion @ E.T
-    return Exchange(
+    return ExchangedMap(
         LandmarkGaussian(ids, means, 0.5 * (covariance + covariance.T)),
         PoseGaussian(a_from_b, of_motion),
     )
@@ -212,7 +214,7 @@ STANDS_STILL = 1e-9
 """A step that moves no coordinate by more than this [m, rad] is the last."""
 
 
-def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> Exchange:
+def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     """Two independent maps as one in the frame of a, each with its own covariance.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
@@ -246,7 +248,7 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> Exchange:
         state[2] = wrapped(state[2])
         if np.abs(step).max() < STANDS_STILL:
             break
-    return Exchange(
+    return ExchangedMap(
         LandmarkGaussian(ids, state[3:].reshape(-1, 2), covariance[3:, 3:]),
         PoseGaussian(state[:3], covariance[:3, :3]),
     )

@@ -13,7 +13,7 @@ from team.estimation import geometry
 from team.estimation.geometry import adjoint, inverse
 from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
-from team.estimation.hybrid_slam.reduction import Look, reduced
+from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
 from team.estimation.hybrid_slam.sensitivity import carried_on
 from team.estimation.models import Increment, acceptable, corrected
 from team.estimation.mount import of_sensor
@@ -46,7 +46,7 @@ class Keyframe:
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
     own: Own = field(default_factory=lambda: unclaimed(0))
-    looks: tuple[Look, ...] = ()
+    looks: tuple[KeyframeScan, ...] = ()
     rest: Increment | None = None
     is_node: bool = False
     forward: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -91,8 +91,8 @@ class Segmenter:
         self._here_ns = 0
         self._increment = Increment.identity()
         self._forward = np.zeros(3)
-        self._waiting: list[Look] = []
-        self._keyframe: list[Look] = []
+        self._waiting: list[KeyframeScan] = []
+        self._keyframe: list[KeyframeScan] = []
         self._keyframe_start_ns = 0
         self._scan_motion = np.zeros(3)
         self._since_look: Increment | None = None
@@ -130,7 +130,7 @@ class Segmenter:
             return Rejection.SENSOR_LIMITS
         r, b = corrected(self._sensor, ranges[mask], bearings[mask])
         noises = unclaimed(len(r)) if own is None else calibrated(own[mask], self._sensor)
-        scan = Look(stamp_ns, ids[mask], r, b, noises, np.zeros(3))
+        scan = KeyframeScan(stamp_ns, ids[mask], r, b, noises, np.zeros(3))
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 

@@ -20,7 +20,7 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.open_window import OpenWindow
-from team.estimation.hybrid_slam.pose_grid import Looks, PoseGrid
+from team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
@@ -62,7 +62,7 @@ class HybridSlam:
         self._scans += reason is None
         return reason
 
-    def sight(self, stamp_ns: int, measurement: int, looks: Looks) -> Rejection | None:
+    def sight(self, stamp_ns: int, measurement: int, looks: TeammateScan) -> Rejection | None:
         """Take inter-robot measurements; returns the reason if they are rejected."""
         if self._grid is None:
             return Rejection.NO_NODES

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from team.config import FrontEnd, Sensor
 from team.estimation.inter_robot import (
-    Carried,
+    CarriedPoint,
     carried_back,
     carried_on,
     of_base,
@@ -24,7 +24,7 @@ from team.estimation.inter_robot import (
 from team.estimation.models import Increment, acceptable, corrected
 from team.rejection import Rejection
 
-Looks = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""
 
 
@@ -49,7 +49,7 @@ class _Look:
     stamp_ns: int
     counter: int
     teammate: str
-    seen: Carried
+    seen: CarriedPoint
     node_ns: int
     motion: Increment
 
@@ -70,7 +70,7 @@ class PoseGrid:
         self._begin_ns = self._node_ns = self._last_ns = 0
         self._uncovered: list[_Look] = []
         self._ahead: list[_Look] = []
-        self._at_node: dict[tuple[int, str], list[tuple[int, Carried]]] = {}
+        self._at_node: dict[tuple[int, str], list[tuple[int, CarriedPoint]]] = {}
         self.since_node = Increment.identity()
 
     def begin(self, stamp_ns: int) -> None:
@@ -85,7 +85,7 @@ class PoseGrid:
         if stamp_ns >= self._begin_ns + self._window_ns:
             self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
 
-    def observe(self, stamp_ns: int, counter: int, looks: Looks) -> Rejection | None:
+    def observe(self, stamp_ns: int, counter: int, looks: TeammateScan) -> Rejection | None:
         """Keep inter-robot measurements until odometry covers their time; returns the reason if
         all are rejected.
         """
@@ -158,6 +158,6 @@ class PoseGrid:
             for (node_ns, teammate), looks in sorted(self._at_node.items())
         )
 
-    def _keep(self, look: _Look, at_node: Carried) -> None:
+    def _keep(self, look: _Look, at_node: CarriedPoint) -> None:
         key = (look.node_ns, look.teammate)
         self._at_node.setdefault(key, []).append((look.counter, at_node))

@@ -13,7 +13,7 @@ from team.estimation.scans import SENSOR, Own, carried, mean_claim, together
 
 
 @dataclass(frozen=True)
-class Look:
+class KeyframeScan:
     """One scan at at_ns (its stamp, or the start of the odometry that covers it).
 
     pose: the robot's, since the keyframe's start. back: the same pose relative to the keyframe's
@@ -40,7 +40,7 @@ Measured = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.nda
 """Ids, ranges [m], bearings [rad] and the noises that they claim."""
 
 
-def reduced(looks: Sequence[Look], end: Float[np.ndarray, "3"]) -> Measured:
+def reduced(looks: Sequence[KeyframeScan], end: Float[np.ndarray, "3"]) -> Measured:
     """Reduce scans to one measurement per landmark, by ascending id.
 
     It is the median of range and bearing, moved by the odometry to the keyframe's end; its claimed

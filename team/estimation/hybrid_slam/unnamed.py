@@ -17,7 +17,7 @@ from team.estimation.association.association import associated
 from team.estimation.association.scans import NOBODY, Scans, points_of
 from team.estimation.association.tracking import Slip, slip_covariance
 from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.reduction import Look, Measured, reduced, variances
+from team.estimation.hybrid_slam.reduction import KeyframeScan, Measured, reduced, variances
 from team.estimation.models import Increment
 from team.estimation.scans import Own, together
 from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
@@ -48,7 +48,7 @@ class Event(NamedTuple):
     at_ns: int
     keyframe: int
     motion: Increment
-    look: Look | None
+    look: KeyframeScan | None
     named: Keyframe | None
 
 
@@ -150,7 +150,7 @@ def _keyframes(
 
     Each keyframe gets one measurement per landmark; a motion that slipped gets a larger covariance.
     """
-    looks: dict[int, list[Look]] = {}
+    looks: dict[int, list[KeyframeScan]] = {}
     first = 0
     for event in events:
         if event.look is not None:
@@ -170,7 +170,7 @@ def _keyframes(
     return tuple(out)
 
 
-def _only(look: Look, numbers: Int64[np.ndarray, " n"]) -> Look:
+def _only(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
     """The detections of a scan that have a number, under it."""
     has_number = numbers > 0
     return replace(
@@ -182,7 +182,7 @@ def _only(look: Look, numbers: Int64[np.ndarray, " n"]) -> Look:
     )
 
 
-def _measured(looks: Sequence[Look]) -> Measured:
+def _measured(looks: Sequence[KeyframeScan]) -> Measured:
     """The detections of a keyframe's scans, relative to its end or, for a scan that is the
     keyframe, as they are.
     """

@@ -150,7 +150,7 @@ def _linearised(
     return (in_a - turned - a_from_b[:2]).ravel(), metric, jacobian
 
 
-class Shared(NamedTuple):
+class SharedPoints(NamedTuple):
     """Numbers of points that two maps share: landmarks, and teammates observed from one of the
     maps.
     """
@@ -165,7 +165,7 @@ class Shared(NamedTuple):
         return words
 
 
-def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -> str | None:
+def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: float) -> str | None:
     """Says why the shared points can not place one map in the other; None if they can.
 
     `alignment` is None where there are fewer than NEEDED points.
@@ -182,7 +182,7 @@ def refusal(shared: Shared, alignment: Alignment | None, heading_sigma: float) -
     return None
 
 
-def disagreement(shared: Shared, chi2: float, confidence: float) -> str | None:
+def disagreement(shared: SharedPoints, chi2: float, confidence: float) -> str | None:
     """Says why two maps that share these points can not show the same place; None if they can.
 
     chi2: the rise of the joint cost when the shared landmarks are made one and the inter-robot

@@ -28,7 +28,7 @@ from team.estimation.map_joining.association.growing import (
 from team.estimation.map_joining.association.hypotheses import jointly
 from team.estimation.map_joining.association.landmarks import (
     Landmarks,
-    Tie,
+    MergeRecord,
     united,
 )
 from team.estimation.map_joining.gauss_newton import (
@@ -50,7 +50,7 @@ AGAIN_WITHIN = 10.0
 """… if they lie within this many object radii of a landmark that the tick brings."""
 
 
-class View:
+class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
     ids, nodes: the identity and the node of each landmark, in the order of the nodes.
@@ -75,7 +75,7 @@ class View:
         unseen = _unseen(points, self.seen_by, self.profile.same)
         self.joint = Joint(points, covariance, apart, around, unseen)
         self.gone = np.zeros(len(nodes), np.bool_)
-        self.ties: list[tuple[int, Tie]] = []
+        self.ties: list[tuple[int, MergeRecord]] = []
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
 
     def views(self, k: int) -> list[Indices]:
@@ -88,7 +88,9 @@ class View:
         """Records the pairs that were merged, and the step (`kind`) that merged them."""
         self.joint = joint
         for pair in pairs:
-            tie = Tie(kind, self.ids[pair.second], pair.llr, pair.rival, pair.sd, self.stamp_ns)
+            tie = MergeRecord(
+                kind, self.ids[pair.second], pair.llr, pair.rival, pair.sd, self.stamp_ns
+            )
             self.ties.append((self.ids[pair.first], tie))
             self.gone[pair.first] = True
 
@@ -221,7 +223,7 @@ def associated(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
 def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
     """Tracks, merges nearby landmarks and sweeps, for the new submaps of one island."""
     island = fold.islands[key]
-    view = View(island, fold.landmarks)
+    view = IslandView(island, fold.landmarks)
     order = {id(each.contribution): k for k, each in enumerate(island.graph.submaps)}
     view.agreed(fold.landmarks)
     for contribution in arrived:
@@ -243,7 +245,9 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
     return applied(fold, key, view)
 
 
-def _doubtful(view: View, order: Mapping[int, int], arrived: Sequence[Contribution]) -> list[int]:
+def _doubtful(
+    view: IslandView, order: Mapping[int, int], arrived: Sequence[Contribution]
+) -> list[int]:
     """Indices of the newest submaps near the tick's submaps that have two or more landmarks which
     no other submap has: a pair that was undecided may be decidable now.
     """
@@ -260,7 +264,7 @@ def _doubtful(view: View, order: Mapping[int, int], arrived: Sequence[Contributi
     return found[-AGAIN:]
 
 
-def applied(fold: Fold, key: Stream, view: View) -> Fold:
+def applied(fold: Fold, key: Stream, view: IslandView) -> Fold:
     """The fold with the landmarks that a view has merged, after one further iteration."""
     if not view.ties:
         return fold
@@ -284,7 +288,7 @@ def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]
     ]
 
 
-def _unnamed(view: View, k: int) -> Int64[np.ndarray, " _"]:
+def _unnamed(view: IslandView, k: int) -> Int64[np.ndarray, " _"]:
     ids = view.island.graph.submaps[k].contribution.local.ids
     places: Int64[np.ndarray, " _"] = view.seen_by[k][ids >= UNNAMED]
     return places

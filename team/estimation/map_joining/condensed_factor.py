@@ -38,7 +38,7 @@ class SubmapCost(NamedTuple):
     weight: float
 
 
-class Path(NamedTuple):
+class EliminatedPath(NamedTuple):
     """The first and the last eliminated pose of a stream, at the state in which they were
     eliminated.
 
@@ -61,7 +61,7 @@ class Departed(NamedTuple):
     robots: Mapping[str, tuple[float, float]]
     submaps: tuple[SubmapCost, ...]
     believed: Mapping[int, int]
-    paths: Mapping[Stream, Path]
+    paths: Mapping[Stream, EliminatedPath]
 
 
 NOBODY = Departed({}, (), {}, {})

@@ -26,7 +26,7 @@ from team.estimation.map_joining.condensed_factor import (
     NOBODY,
     Condensed,
     Departed,
-    Path,
+    EliminatedPath,
     SubmapCost,
     places,
 )
@@ -248,7 +248,7 @@ def _departed(
 
 def _paths(
     island: Island, before: Departed, leaving: Bool[np.ndarray, " F"]
-) -> Mapping[Stream, Path]:
+) -> Mapping[Stream, EliminatedPath]:
     graph = island.graph
     counts: dict[Stream, int] = defaultdict(int)
     for f in np.flatnonzero(leaving):
@@ -259,7 +259,7 @@ def _paths(
         poses = np.array([island.state[graph.offset[n] : graph.offset[n] + 3] for n in nodes])
         old = paths.get(stream)
         if old is None:
-            paths[stream] = Path(poses, bool(graph.fixed[nodes[0]]))
+            paths[stream] = EliminatedPath(poses, bool(graph.fixed[nodes[0]]))
         else:
             paths[stream] = old._replace(poses=np.vstack([old.poses, poses]))
     return paths

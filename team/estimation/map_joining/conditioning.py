@@ -60,7 +60,7 @@ SELF = ("self", 0)
 """The stream of the prior and of the robot's submaps in the graph that is solved."""
 
 
-class Shared(NamedTuple):
+class SubmapCorrection(NamedTuple):
     """The centre's corrections of a robot's submaps: a covariance factor f, and the shared biases.
 
     biases: for each shared error b its name, the centre's estimate of it and the standard
@@ -98,7 +98,7 @@ class RobotPrior(NamedTuple):
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
     covariance: Float[np.ndarray, "n n"]
-    shared: Shared = Shared()
+    shared: SubmapCorrection = SubmapCorrection()
 
     @property
     def whole(self) -> WholeMap:

@@ -89,7 +89,7 @@ UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, eq=False)
-class Island(least_squares.Point):
+class Island(least_squares.Iterate):
     """One frame: its graph, the state (poses and landmarks by node) and the ages of the factors.
 
     age, sighting_age: number of iterations since each submap and each inter-robot measurement was

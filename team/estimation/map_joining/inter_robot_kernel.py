@@ -23,7 +23,7 @@ Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 
 
-class Sightings(NamedTuple):
+class InterRobotFactors(NamedTuple):
     """All inter-robot measurements of a graph in flat arrays, in the order in which they were
     added.
 
@@ -59,7 +59,7 @@ def sighting_residual(
 
 
 @compiled
-def sighting_costs(state: Values, offset: Indices, sightings: Sightings) -> Values:
+def sighting_costs(state: Values, offset: Indices, sightings: InterRobotFactors) -> Values:
     """χ² = rᵀR⁻¹r of each inter-robot measurement."""
     result = np.empty(len(sightings.nodes))
     for f in range(len(result)):
@@ -93,7 +93,7 @@ def add_sightings(
     state: Values,
     offset: Indices,
     fixed: Bool[np.ndarray, " _"],
-    sightings: Sightings,
+    sightings: InterRobotFactors,
     scale: Values,
     entry: Indices,
     value_start: Indices,
@@ -133,7 +133,7 @@ def add_sightings(
 def explained_by_sightings(
     state: Values,
     offset: Indices,
-    sightings: Sightings,
+    sightings: InterRobotFactors,
     entry: Indices,
     value_start: Indices,
     inverse: Values,

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from team.estimation.map_joining.submap_graph import Graph, pose_node
 from team.estimation.models import located
 
-Points = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
+JointPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""
 HEADINGS = 24
 MOST_POINTS = 24
@@ -29,7 +29,7 @@ HOPELESS = 100.0
 """Headings whose χ² exceeds the best one's by more than this are not tried."""
 
 
-class Tie(NamedTuple):
+class SharedPoint(NamedTuple):
     """One point: its node in the main island and in the other one, and the measurement that ties
     them.
 
@@ -40,27 +40,29 @@ class Tie(NamedTuple):
 
     main: int
     other: int
-    seen: Sighting | None = None
+    seen: InterRobotFactor | None = None
     from_main: bool = False
 
 
-def ties(main: Graph, other: Graph, sightings: Sequence[Sighting]) -> list[Tie]:
+def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> list[SharedPoint]:
     """The shared landmarks by id, then the inter-robot measurements between the islands in their
     order.
     """
     shared = sorted(main.landmarks.keys() & other.landmarks.keys())
-    found = [Tie(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
+    found = [SharedPoint(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
     for each in sightings:
         for observers, seen, from_main in ((main, other, True), (other, main, False)):
             observer = observers.poses.get((each.stream, each.stamp_ns))
             teammate = pose_node(seen, each.teammate, each.stamp_ns)
             if observer is not None and teammate is not None:
                 nodes = (observer, teammate) if from_main else (teammate, observer)
-                found.append(Tie(*nodes, each, from_main))
+                found.append(SharedPoint(*nodes, each, from_main))
     return found
 
 
-def aligned_by(main: Island, other: Island, tied: Sequence[Tie]) -> alignment.Alignment | None:
+def aligned_by(
+    main: Island, other: Island, tied: Sequence[SharedPoint]
+) -> alignment.Alignment | None:
     """Where the other island lies in the main one; None where the points do not suffice."""
     if len(tied) < alignment.NEEDED:
         return None
@@ -69,7 +71,7 @@ def aligned_by(main: Island, other: Island, tied: Sequence[Tie]) -> alignment.Al
     return alignment.aligned(*in_main, *in_other)
 
 
-def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points:
+def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None]]) -> JointPoints:
     """The positions of nodes, or of the teammates measured from them, with their joint
     covariance.
     """
@@ -96,7 +98,7 @@ def _points(island: Island, at: Sequence[tuple[int, Sighting | None]]) -> Points
 
 
 def headings_that_fit(
-    main: Island, other: Island, tied: Sequence[Tie]
+    main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> list[Float[np.ndarray, "3"]]:
     """Every main_from_other whose heading is a local minimum of the χ² of the shared points.
 

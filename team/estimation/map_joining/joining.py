@@ -16,7 +16,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.association.landmarks import (
     NO_LANDMARKS,
     Landmarks,
@@ -49,10 +49,10 @@ __all__ = [
     "Fold",
     "GapError",
     "InitialPoseFactor",
+    "InterRobotFactor",
     "JoinSettings",
     "LateStartError",
     "NotCanonicalError",
-    "Sighting",
     "Stream",
     "Tick",
     "compacted",
@@ -114,7 +114,7 @@ class Tick:
     """
 
     contributions: Sequence[Contribution]
-    sightings: Sequence[Sighting] = ()
+    sightings: Sequence[InterRobotFactor] = ()
     starts: Sequence[InitialPoseFactor] = ()
     outside: Mapping[Key, str] = field(default_factory=dict)
     set_aside: tuple[str, ...] = ()
@@ -161,7 +161,7 @@ class Fold:
     islands: Mapping[Stream, Island]
     home: Mapping[Stream, Stream]
     reasons: Mapping[Stream, str]
-    waiting: tuple[Sighting, ...] = ()
+    waiting: tuple[InterRobotFactor, ...] = ()
     iterations: int = 0
     change: float = 0.0
     joined: Mapping[Stream, str] = field(default_factory=dict)
@@ -225,7 +225,7 @@ def folded(
     fold: Fold,
     contributions: Sequence[Contribution],
     settings: JoinSettings,
-    sightings: Sequence[Sighting] = (),
+    sightings: Sequence[InterRobotFactor] = (),
 ) -> Fold:
     """Takes one tick: adds the submaps, places new landmarks, iterates, and merges islands where
     possible.

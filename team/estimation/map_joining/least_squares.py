@@ -27,7 +27,7 @@ ROUNDING = 1e-10
 """Relative rise of the cost that is accepted: rounding near the minimum is no reason to damp."""
 
 
-class Point(ABC):
+class Iterate(ABC):
     """An estimate of all unknowns, with the quadratic approximation of the cost there."""
 
     @property
@@ -62,7 +62,7 @@ class Point(ABC):
         """The point with `step` added to its unknowns."""
 
 
-P = TypeVar("P", bound=Point)
+P = TypeVar("P", bound=Iterate)
 
 
 class Iteration(NamedTuple):

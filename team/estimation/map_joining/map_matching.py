@@ -14,11 +14,11 @@ from jaxtyping import Float
 from team.association import AssociationProfile
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import compose, inverse
-from team.estimation.map_joining.associating import View, applied, associated, union
+from team.estimation.map_joining.associating import IslandView, applied, associated, union
 from team.estimation.map_joining.association.absence import renumbered, rows
 from team.estimation.map_joining.association.closing import (
-    Alignment,
     Closure,
+    Placement,
     Side,
     Tests,
     aligned,
@@ -35,13 +35,13 @@ from team.estimation.map_joining.association.landmarks import (
     OPEN,
     Decision,
     Landmarks,
-    Member,
+    LocalLandmark,
+    MergeRecord,
     Opened,
-    Tie,
     between,
     united,
 )
-from team.estimation.map_joining.association.voting import Points, Vote
+from team.estimation.map_joining.association.voting import PointSet, Vote
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, is_solvable, settled
 from team.estimation.map_joining.joining import Fold, merged_islands
 from team.estimation.map_joining.merging import Merge, placed
@@ -72,7 +72,7 @@ def matched(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
             last[each.stream] = each.sequence
     for stream in sorted(last):
         fold = _closed(fold, stream, last[stream])
-    views = Views()
+    views = IslandViews()
     for stream in sorted(last):
         for key in sorted(fold.islands):
             if key in fold.islands and key != fold.home[stream]:
@@ -80,21 +80,21 @@ def matched(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
     return fold
 
 
-class Views:
+class IslandViews:
     """The views of the islands, each computed once for as long as its island does not change."""
 
     def __init__(self) -> None:
-        self._of: dict[Stream, View] = {}
+        self._of: dict[Stream, IslandView] = {}
 
-    def of(self, fold: Fold, key: Stream) -> View:
+    def of(self, fold: Fold, key: Stream) -> IslandView:
         """The view of the island with this key."""
         known = self._of.get(key)
         if known is None or known.island is not fold.islands[key]:
-            known = self._of[key] = View(fold.islands[key], fold.landmarks)
+            known = self._of[key] = IslandView(fold.islands[key], fold.landmarks)
         return known
 
 
-def _patch(view: View, stream: Stream, last: int) -> list[int]:
+def _patch(view: IslandView, stream: Stream, last: int) -> list[int]:
     """Indices in the graph of the stream's submaps up to `last` that make up the patch."""
     first = last - view.profile.recent
     return [
@@ -107,7 +107,7 @@ def _patch(view: View, stream: Stream, last: int) -> list[int]:
 def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
     """The fold with a closure of the stream's last submaps inside their island, if there is one."""
     key = fold.home[stream]
-    view = View(fold.islands[key], fold.landmarks)
+    view = IslandView(fold.islands[key], fold.landmarks)
     profile = view.profile
     submaps = _patch(view, stream, last)
     patch = union(view.seen_by[k] for k in submaps)
@@ -158,7 +158,7 @@ def _opened(fold: Fold, opened: Opened) -> Fold:
 
 def _by_members(
     landmarks: Landmarks, pairs: Sequence[tuple[int, int]]
-) -> tuple[tuple[Member, Member], ...]:
+) -> tuple[tuple[LocalLandmark, LocalLandmark], ...]:
     """Pairs of landmarks by their smallest members; pairs with one named landmark are left out."""
     sets = landmarks.sets
     return tuple(
@@ -166,7 +166,7 @@ def _by_members(
     )
 
 
-def _reachable(view: View, patch: Indices) -> Indices:
+def _reachable(view: IslandView, patch: Indices) -> Indices:
     """Landmarks with which those of the patch may coincide by the joint covariance; empty where all
     are well known.
 
@@ -181,7 +181,7 @@ def _reachable(view: View, patch: Indices) -> Indices:
     return np.unique(two[fits])
 
 
-def _made(fold: Fold, key: Stream, view: View, found: Closure, decision: Decision) -> Fold:
+def _made(fold: Fold, key: Stream, view: IslandView, found: Closure, decision: Decision) -> Fold:
     """The fold with a closure, solved anew, and with nearby landmarks merged afterwards."""
     view.take(found.pairs, view.joint, decision.kind)
     fold = applied(fold, key, view)
@@ -197,26 +197,26 @@ def _solved(fold: Fold, key: Stream) -> Fold:
 
 def _tidied(fold: Fold, key: Stream) -> Fold:
     """Merges the landmarks that a closure has brought close to each other: all against all."""
-    view = View(fold.islands[key], fold.landmarks)
+    view = IslandView(fold.islands[key], fold.landmarks)
     everything = np.arange(len(view.ids))
     view.step("near", everything, everything, view.profile.near)
     view.sweep()
     return applied(fold, key, view)
 
 
-def _side(view: View, at: Indices, submaps: Sequence[int]) -> Side:
+def _side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
     """Landmarks of an island, with the observations of them by keyframes of some of its submaps."""
     P = view.joint.covariance.reshape(len(view.ids), 2, len(view.ids), 2)
     own = P[at, :, at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
-    points = Points(view.joint.mean[at], np.minimum(sd, view.profile.tight))
+    points = PointSet(view.joint.mean[at], np.minimum(sd, view.profile.tight))
     place = np.full(len(view.ids), -1)
     place[at] = np.arange(len(at))
     seen = rows(each for k in submaps for each in view.views(k))
     return Side(at, points, at, np.arange(len(at)), renumbered(seen, place))
 
 
-def _patch_side(view: View, patch: Indices, submaps: Sequence[int]) -> Side:
+def _patch_side(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:
     """A patch of at least PART landmarks where possible: those of its submaps from the last one
     backwards.
     """
@@ -231,7 +231,7 @@ def _patch_side(view: View, patch: Indices, submaps: Sequence[int]) -> Side:
     return _side(view, patch, submaps)._replace(parts=tuple(parts))
 
 
-def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
+def _decision(view: IslandView, found: Closure, kind: str, about: str) -> Decision:
     return Decision(
         stamp_ns=view.stamp_ns,
         kind=kind,
@@ -247,7 +247,7 @@ def _decision(view: View, found: Closure, kind: str, about: str) -> Decision:
     )
 
 
-def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Views) -> Fold:
+def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: IslandViews) -> Fold:
     """Merges the stream's island with another one, if the stream's last submaps are found there."""
     key = fold.home[stream]
     mine, theirs = (views.of(fold, at) for at in (key, other_key))
@@ -267,11 +267,11 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Vie
     )
     of_patch = _patch_side(mine, patch, submaps)._replace(at=np.arange(n))
 
-    def laid_on(view: View) -> tuple[Side, Callable[[Vote], tuple[Joint, Side]]]:
+    def laid_on(view: IslandView) -> tuple[Side, Callable[[Vote], tuple[Joint, Side]]]:
         side = _side(view, np.arange(len(view.ids)), range(len(view.seen_by)))
         return side, lambda vote: free_joint(own, view.joint, side, vote, profile)
 
-    def aliases() -> list[Alignment]:
+    def aliases() -> list[Placement]:
         found = aligned(of_patch, *laid_on(mine), profile)
         return [each for each in found if not _is_identity(each, patch)]
 
@@ -301,7 +301,7 @@ def _joined(fold: Fold, stream: Stream, last: int, other_key: Stream, views: Vie
     return _merged(fold, (key, mine), (other_key, theirs), pairs, their_from_mine, decision)
 
 
-def _is_identity(found: Alignment, patch: Indices) -> bool:
+def _is_identity(found: Placement, patch: Indices) -> bool:
     """Whether an alignment of a patch with its own map places a third of its landmarks on
     themselves.
     """
@@ -313,8 +313,8 @@ def _is_identity(found: Alignment, patch: Indices) -> bool:
 
 def _merged(
     fold: Fold,
-    one: tuple[Stream, View],
-    two: tuple[Stream, View],
+    one: tuple[Stream, IslandView],
+    two: tuple[Stream, IslandView],
     pairs: Sequence[Pair],
     two_from_one: Float[np.ndarray, "3"],
     decision: Decision,
@@ -328,7 +328,9 @@ def _merged(
         [
             (
                 mine.ids[pair.first],
-                Tie("merge", theirs.ids[pair.second], pair.llr, pair.rival, pair.sd, mine.stamp_ns),
+                MergeRecord(
+                    "merge", theirs.ids[pair.second], pair.llr, pair.rival, pair.sd, mine.stamp_ns
+                ),
             )
             for pair in pairs
         ],

@@ -14,7 +14,7 @@ from team.config import UNNAMED, Bias
 from team.estimation.contribution import Stream
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
-from team.estimation.map_joining.conditioning import RobotPrior, Shared
+from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from team.estimation.map_joining.inter_robot_kernel import explained_by_sightings
 from team.estimation.map_joining.joining import Fold
@@ -215,7 +215,7 @@ def _priors_in(
             np.array(ids, dtype=np.uint32),
             mean[shared].reshape(-1, 2),
             covariance[np.ix_(columns, columns)],
-            Shared(island.settings.covariance_factor, own),
+            SubmapCorrection(island.settings.covariance_factor, own),
         )
     return priors
 

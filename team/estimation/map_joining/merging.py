@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.estimation.contribution import named
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
-from team.estimation.map_joining.alignment import Alignment, Shared
+from team.estimation.map_joining.alignment import Alignment, SharedPoints
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island, is_solvable, joint_marginal
-from team.estimation.map_joining.island_ties import Tie, aligned_by, headings_that_fit, ties
+from team.estimation.map_joining.island_ties import SharedPoint, aligned_by, headings_that_fit, ties
 from team.estimation.map_joining.minima import Minimum, Search, minimum, searched
 from team.estimation.map_joining.submap_graph import encounter_of, merged
 
@@ -35,7 +35,7 @@ class Merge(NamedTuple):
     """
 
     best: Minimum
-    waiting: tuple[Sighting, ...]
+    waiting: tuple[InterRobotFactor, ...]
     words: str
 
 
@@ -51,7 +51,9 @@ def ages(count: int) -> Int64[np.ndarray, " count"]:
     return np.zeros(count, dtype=np.int64)
 
 
-def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[Sighting, ...]]:
+def sighted(
+    island: Island, waiting: Sequence[InterRobotFactor]
+) -> tuple[Island, tuple[InterRobotFactor, ...]]:
     """The island with the inter-robot measurements between its own pose nodes, and the remaining
     ones.
     """
@@ -65,7 +67,7 @@ def sighted(island: Island, waiting: Sequence[Sighting]) -> tuple[Island, tuple[
     return replace(island, graph=graph, sighting_age=age), left
 
 
-def merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
+def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
     """Merges the other island into the main one's frame, or returns why that has to wait.
 
     It waits, too, where the numbers of the shared points allow no solution.
@@ -77,10 +79,10 @@ def merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | W
         return Waits(f"can not be solved for: {error}", after_search=True)
 
 
-def _merge(main: Island, other: Island, waiting: Sequence[Sighting]) -> Merge | Waits:
+def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
     tied = ties(main.graph, other.graph, waiting)
     seen = sum(tie.seen is not None for tie in tied)
-    shared = Shared(len(tied) - seen, seen)
+    shared = SharedPoints(len(tied) - seen, seen)
     found = aligned_by(main, other, tied)
     why = alignment.refusal(shared, found, main.settings.alignment_heading_sigma)
     if found is None or why is not None:
@@ -104,15 +106,17 @@ def placed(
     main: Island,
     other: Island,
     main_from_other: Float[np.ndarray, "3"],
-    waiting: Sequence[Sighting],
-) -> tuple[Island, tuple[Sighting, ...]]:
+    waiting: Sequence[InterRobotFactor],
+) -> tuple[Island, tuple[InterRobotFactor, ...]]:
     """Both islands as one, with every factor's robust scale at its beginning."""
     graph, state = merged(main.graph, main.state, other.graph, other.state, main_from_other)
     new = ages(len(graph.submaps)), ages(len(graph.sightings))
     return sighted(Island(graph, state, *new, main.settings), waiting)
 
 
-def _places(main: Island, other: Island, tied: Sequence[Tie]) -> list[Float[np.ndarray, "3"]]:
+def _places(
+    main: Island, other: Island, tied: Sequence[SharedPoint]
+) -> list[Float[np.ndarray, "3"]]:
     """Further places of the other island that its shared points propose."""
     by_landmarks = [tie for tie in tied if tie.seen is None]
     by_sightings = [tie for tie in tied if tie.seen is not None]
@@ -130,7 +134,7 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
     return island.state[begin : begin + 3]
 
 
-def _ambiguous(shared: Shared, search: Search, second: Minimum, node: int) -> str:
+def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
     """The reason to defer a merge: another place is about as likely."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
@@ -139,7 +143,7 @@ def _ambiguous(shared: Shared, search: Search, second: Minimum, node: int) -> st
     )
 
 
-def _words(other: Island, shared: Shared, search: Search, rise: float) -> str:
+def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
     """Describes how an island was merged and how certain its place is."""
     stream = min(other.graph.streams)
     node = search.best.island.graph.streams[stream][0]

@@ -19,7 +19,7 @@ from typing import TypeVar
 import numpy as np
 
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
 from team.estimation.map_joining.joining import Fold, Tick, folded, started
 from team.estimation.map_joining.map_matching import recognised
@@ -79,7 +79,7 @@ def _in_reach(
     return replace(fold, refused=refused), members
 
 
-def _of_members(sightings: Iterable[Sighting], fold: Fold) -> list[Sighting]:
+def _of_members(sightings: Iterable[InterRobotFactor], fold: Fold) -> list[InterRobotFactor]:
     """The inter-robot measurements whose submaps are not refused."""
     gone = {key[1:] for key in fold.refused}
     return [each for each in sightings if (*each.stream, each.sequence) not in gone]
@@ -89,7 +89,7 @@ def _attempt(
     fold: Fold,
     members: Sequence[Contribution],
     starts: Iterable[InitialPoseFactor],
-    sightings: Sequence[Sighting],
+    sightings: Sequence[InterRobotFactor],
     settings: JoinSettings,
 ) -> Fold | None:
     """The fold after one tick with these members; None where it has no solution."""
@@ -123,7 +123,7 @@ class _OneByOne:
         self._refused = dict(fold.refused)
         self._set_aside = list(fold.set_aside)
 
-    def taken(self, members: Sequence[Contribution], sightings: Sequence[Sighting]) -> Fold:
+    def taken(self, members: Sequence[Contribution], sightings: Sequence[InterRobotFactor]) -> Fold:
         """Takes the submaps first, then the inter-robot measurements, earlier ones that waited
         included.
         """
@@ -133,7 +133,7 @@ class _OneByOne:
         waiting = [*self._fold.waiting, *_of_members(sightings, base)]
         candidates = sorted(waiting, key=lambda each: each.key)
 
-        def after(some: Sequence[Sighting]) -> Fold | None:
+        def after(some: Sequence[InterRobotFactor]) -> Fold | None:
             return _attempt(base, self._members, self._of(self._members), some, self._settings)
 
         accepted, bad = _greatest(candidates, lambda some: after(some) is not None)

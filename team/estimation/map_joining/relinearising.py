@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import compose
-from team.estimation.inter_robot import Sighting
-from team.estimation.map_joining.condensed_factor import Path
+from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.map_joining.condensed_factor import EliminatedPath
 from team.estimation.map_joining.condensing import BEGIN
 from team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
@@ -51,7 +51,7 @@ def is_due(before: int, after: int, begin: int = BEGIN) -> bool:
 
 
 def relinearised(
-    fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[Sighting]
+    fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
 ) -> Fold:
     """The fold with nothing condensed, and its main island solved again from its present state.
 
@@ -86,7 +86,10 @@ def relinearised(
 
 
 def _raw(
-    island: Island, fold: Fold, contributions: Sequence[Contribution], paths: Mapping[Stream, Path]
+    island: Island,
+    fold: Fold,
+    contributions: Sequence[Contribution],
+    paths: Mapping[Stream, EliminatedPath],
 ) -> Island:
     """The graph of all submaps, each node at its state in the island or where it was when
     condensed.
@@ -109,7 +112,7 @@ def _raw(
         return island.state[graph.offset[node] : graph.offset[node + 1]]
 
     for stream, nodes in graph.streams.items():
-        left = paths.get(stream, Path(np.zeros((0, 3)), bool(graph.fixed[nodes[0]])))
+        left = paths.get(stream, EliminatedPath(np.zeros((0, 3)), bool(graph.fixed[nodes[0]])))
         fixed[full.streams[stream][0]] = left.is_fixed
         known = [*left.poses, *(value(node) for node in nodes)]
         for node, pose in zip(full.streams[stream], known, strict=True):

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Int64
 from team.config import UNNAMED, Bias
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed
-from team.estimation.map_joining.inter_robot_kernel import Sightings
+from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, Factors, block_pattern
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
@@ -106,7 +106,7 @@ def _scaling(error: CommonError) -> Bias:
 class Encounter(NamedTuple):
     """An inter-robot measurement in the graph, between the pose nodes of observer and teammate."""
 
-    sighting: Sighting
+    sighting: InterRobotFactor
     observer: int
     teammate: int
 
@@ -166,11 +166,11 @@ class Graph:
         )
 
     @cached_property
-    def sighting_factors(self) -> Sightings:
+    def sighting_factors(self) -> InterRobotFactors:
         """The inter-robot measurements in flat arrays, for the kernels; their entries follow those
         of the submaps.
         """
-        return Sightings(
+        return InterRobotFactors(
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
             np.array([each.sighting.measurement for each in self.sightings]).reshape(-1, 2),
             np.array([each.sighting.information for each in self.sightings]).reshape(-1, 2, 2),
@@ -456,7 +456,7 @@ def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
     return next((node for node in found if node is not None), None)
 
 
-def encounter_of(graph: Graph, sighting: Sighting) -> Encounter | None:
+def encounter_of(graph: Graph, sighting: InterRobotFactor) -> Encounter | None:
     """The inter-robot measurement between its pose nodes; None while the graph lacks one of
     them.
     """

@@ -12,7 +12,7 @@ from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 
 
-class Tie(NamedTuple):
+class Constraints(NamedTuple):
     """The constraints R(θ) bₗ + t − aₗ = 0 of k landmarks, linearised at the result of the
     iterations.
 
@@ -34,7 +34,7 @@ def tied(
     seen: Float[np.ndarray, " m"],
     seen_covariance: Float[np.ndarray, "m m"],
     iterations: int,
-) -> tuple[Tie, bool]:
+) -> tuple[Constraints, bool]:
     """The iterated EKF update by the constraints; returns also whether S is positive definite.
 
     mean: (t, θ, a₁, a₂, …), a map's pose and the landmarks; seen: (b₁, b₂, …), the same landmarks
@@ -65,11 +65,11 @@ def tied(
                 S[i, k] += c * V[i, k] - s * V[j, k]
                 S[j, k] += s * V[i, k] + c * V[j, k]
         if not _invert(S):
-            return Tie(c, s, lever, z, S), False
+            return Constraints(c, s, lever, z, S), False
         _multiply(S, y, z)
         _step(mean, U, z, state)
         _step(seen, V, z, local)
-    return Tie(c, s, lever, z, S), True
+    return Constraints(c, s, lever, z, S), True
 
 
 @compiled
@@ -125,7 +125,7 @@ def _step(
 
 @compiled
 def tied_pose(
-    tie: Tie,
+    tie: Constraints,
     mean: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "p p"],
     end: Float[np.ndarray, "3"],

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
 from team.estimation.geometry import wrapped
-from team.estimation.map_joining.tie_kernel import Tie, tied, tied_pose
+from team.estimation.map_joining.tie_kernel import Constraints, tied, tied_pose
 from team.estimation.submap import LocalMap
 
 ITERATIONS = 3
@@ -103,7 +103,7 @@ def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> tuple[
 
 def _agreeing(
     whole: WholeMap, local: LocalMap, gate: float
-) -> tuple[LocalMap, Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Tie]:
+) -> tuple[LocalMap, Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Constraints]:
     """The local map without the landmarks that the gate leaves out; the indices of its known
     landmarks in both maps; their constraints.
     """
@@ -127,7 +127,7 @@ def _agreeing(
         local = without(local, int(in_local[worst]))
 
 
-def _worst(tie: Tie, gate: float) -> int | None:
+def _worst(tie: Constraints, gate: float) -> int | None:
     """Index of the constraint that the others contradict most; None where all are within the
     gate.
     """

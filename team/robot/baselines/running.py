@@ -15,7 +15,7 @@ from team.estimation.gaussian import (
 from team.estimation.geometry import Pose, inverse
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.hybrid_slam.reduction import Look
+from team.estimation.hybrid_slam.reduction import KeyframeScan
 from team.estimation.models import Increment
 from team.estimation.mount import moved_by
 from team.estimation.odometry import OdometryInterval
@@ -50,7 +50,7 @@ class RunningEstimator:
         self._filter = FILTERS[config.estimator]
         self.associates = self._filter.took is not None and config.fusion == "alone"
         self._taken: list[slice] = []
-        self._looks: list[Look] = []
+        self._looks: list[KeyframeScan] = []
         maps_at_keyframes = config.fusion in FEEDBACK
         self._map_every_ns = 0 if maps_at_keyframes else round(config.front_end.window_s * 1e9)
         self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)

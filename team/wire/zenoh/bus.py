@@ -30,7 +30,7 @@ from team.wire.messages import Liveliness, Message, Tally
 from team.wire.zenoh.delivery import Publisher, declared, subscribe
 from team.wire.zenoh.queries import Queries, Question, Reply
 from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
-from team.wire.zenoh.session import Door, client
+from team.wire.zenoh.session import RouterAccess, client
 
 if TYPE_CHECKING:  # a node without keys needs none of it
     from team.keys.credentials import Credentials
@@ -87,7 +87,7 @@ class ZenohBus:
         self._session = client(connect, patience_s, keys)
         self._recovery = Recovery(self._session, self._prefix, self._queue.put)
         self._queries = Queries(self._session, self._prefix, self._queue.put)
-        self._door = None if keys is None else Door(self._session, connect, keys)
+        self._door = None if keys is None else RouterAccess(self._session, connect, keys)
 
     def __enter__(self) -> Self:
         return self

@@ -97,7 +97,7 @@ def _client_tls(keys: "Credentials") -> dict[str, object]:
     }
 
 
-class Door:
+class RouterAccess:
     """Checks whether a router with keys still accepts this node: Zenoh itself would retry silently.
 
     An absent router is waited for. Where the router no longer accepts us, or we no longer accept

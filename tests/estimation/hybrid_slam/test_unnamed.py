@@ -4,7 +4,7 @@ import numpy as np
 
 from team.config import UNNAMED, Association, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.reduction import Look
+from team.estimation.hybrid_slam.reduction import KeyframeScan
 from team.estimation.hybrid_slam.unnamed import settled
 from team.estimation.models import Increment
 from team.estimation.scans import unclaimed
@@ -18,7 +18,9 @@ def keyframe(k: int, ranges: list[float]) -> Keyframe:
     ids = (UNNAMED + np.arange(len(ranges))).astype(np.uint32)
     own, still = unclaimed(len(ranges)), Increment.identity()
     at = k * SECOND
-    look = Look(at, ids, np.array(ranges), bearings, own, np.zeros(3), at_ns=at, motion=FORWARD)
+    look = KeyframeScan(
+        at, ids, np.array(ranges), bearings, own, np.zeros(3), at_ns=at, motion=FORWARD
+    )
     looks, rest = ((look,), still) if ranges else ((), None)
     none = np.empty(0)
     return Keyframe(

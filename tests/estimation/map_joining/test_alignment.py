@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import InitialPoseFactor
-from team.estimation.map_joining.alignment import Shared, aligned, procrustes, refusal
+from team.estimation.map_joining.alignment import SharedPoints, aligned, procrustes, refusal
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
 from team.estimation.map_joining.marginals import landmark_map, trajectory
@@ -147,11 +147,11 @@ def test_maps_that_disagree_are_not_merged():
 def test_landmarks_close_together_do_not_give_a_heading():
     in_a = np.array([[0.0, 0.0], [0.3, 0.0]])
     found = aligned(in_a, np.eye(4), in_a + 5.0, np.eye(4))
-    reason = refusal(Shared(2), found, 0.3)
+    reason = refusal(SharedPoints(2), found, 0.3)
     assert reason is not None
     assert "too close together" in reason
     apart = aligned(10.0 * in_a, 0.01 * np.eye(4), 10.0 * in_a, 0.01 * np.eye(4))
-    assert refusal(Shared(2), apart, 0.3) is None
+    assert refusal(SharedPoints(2), apart, 0.3) is None
 
 
 def test_an_island_that_is_not_merged_does_not_disturb_the_main_one():

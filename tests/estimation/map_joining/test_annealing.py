@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.inter_robot import Sighting
+from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
@@ -41,7 +41,7 @@ def closed_loop(options):
     """
     starts = {(robot, 0): InitialPoseFactor(robot, 0, np.zeros(3)) for robot in ("r0", "r1")}
     submaps = [standing("r0", (0.0, 0.0), 0.01), standing("r1", (10.0, 3.5), 1.0)]
-    seen = Sighting("r0", 0, 0, 500, "r1", np.array([10.0, 0.0]), np.diag([1e-4, 1e-6]))
+    seen = InterRobotFactor("r0", 0, 0, 500, "r1", np.array([10.0, 0.0]), np.diag([1e-4, 1e-6]))
     graph, state = extended(EMPTY_GRAPH, np.zeros(0), submaps, starts, {})
     island = Island(graph, state, ages(len(submaps)), ages(0), options)
     island, waiting = sighted(island, [seen])

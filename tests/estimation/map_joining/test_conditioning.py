@@ -11,7 +11,7 @@ from team.estimation.geometry import compose, exponential, tangent
 from team.estimation.map_joining import conditioning, whole_map
 from team.estimation.map_joining.conditioning import (
     RobotPrior,
-    Shared,
+    SubmapCorrection,
     curved,
     followed,
     pose_now,
@@ -241,13 +241,15 @@ def test_a_submap_is_taken_with_the_variance_of_each_shared_error_that_it_knows(
     n, rng = len(local.mean), np.random.default_rng(1)
     columns = rng.normal(size=(2, n))
     local = replace(local, biases=("bearing", "range_scale"), sensitivity=columns)
-    shared = Shared(1.5, (("range_scale", 0.2, 0.3), ("bearing", -0.1, 0.05), ("clock", 7.0, 7.0)))
+    shared = SubmapCorrection(
+        1.5, (("range_scale", 0.2, 0.3), ("bearing", -0.1, 0.05), ("clock", 7.0, 7.0))
+    )
     taken = shared.taken(local)
     S, B = columns, np.diag(np.square([0.05, 0.3]))
     np.testing.assert_allclose(taken.mean, local.mean + S.T @ [-0.1, 0.2])
     np.testing.assert_allclose(taken.covariance, 1.5 * local.covariance + S.T @ B @ S)
     np.testing.assert_array_equal(taken.ids, local.ids)
-    assert Shared().taken(local).covariance.tobytes() == local.covariance.tobytes()
+    assert SubmapCorrection().taken(local).covariance.tobytes() == local.covariance.tobytes()
 
 
 FACTOR, SIGMA = 2.5, 0.3
@@ -277,7 +279,7 @@ def test_a_team_pose_takes_later_submaps_as_the_centre_does_or_it_claims_too_muc
         world.submaps = [with_shared_error(each, error[each.robot], rng) for each in world.submaps]
         before, after = later(world, "r0", 4)
         prior = prior_for(joined(before, world.starts, SHARED), "r0", 0)
-        for shared in (prior.shared, Shared()):
+        for shared in (prior.shared, SubmapCorrection()):
             pose, spread = team_pose(prior, [shared.taken(each.local) for each in after], None)
             off = pose - world.paths["r0"][5]
             off[2] = wrap(off[2])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from team.config import Sensor
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.geometry import compose, exponential, inverse, transformed
-from team.estimation.inter_robot import Carried, carried_back, carried_on, point_seen, reduced
+from team.estimation.inter_robot import CarriedPoint, carried_back, carried_on, point_seen, reduced
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import converged
@@ -265,7 +265,7 @@ def test_a_carried_point_has_the_mean_and_covariance_of_samples(back):
 @given(st.floats(0.2, 20.0), st.floats(-3.14, 3.14), st.floats(0.0, 0.3))
 def test_looks_about_one_direction_reduce_to_their_middle_on_the_circle(distance, bearing, spread):
     looks = [
-        Carried(
+        CarriedPoint(
             np.array([np.cos(bearing + a), np.sin(bearing + a)]) * (distance + a), 0.01 * np.eye(2)
         )
         for a in (-spread, 0.0, spread)

@@ -10,11 +10,11 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-Views = Int64[np.ndarray, "_ _"]
+SeenTogether = Int64[np.ndarray, "_ _"]
 """For each keyframe the landmarks that it observed together; rows are padded with −1."""
 
 
-def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
+def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> SeenTogether:
     """Lists of landmarks as the rows of one array."""
     each = list(views)
     out = np.full((len(each), max(map(len, each), default=0)), -1)
@@ -23,17 +23,17 @@ def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
     return out
 
 
-def renumbered(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
+def renumbered(views: SeenTogether, to: Int64[np.ndarray, " n"]) -> SeenTogether:
     """The views with renumbered landmarks; −1 leaves a landmark out."""
     if not views.size:
         return views
     now = np.where(views >= 0, to[views], -1)
-    polygons: Views = now[(now >= 0).sum(axis=1) >= 3]
+    polygons: SeenTogether = now[(now >= 0).sum(axis=1) >= 3]
     return polygons
 
 
 def covered(
-    points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: Views
+    points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: SeenTogether
 ) -> Bool[np.ndarray, " n"]:
     """Marks the points in the convex hull of the landmarks of any one view, at their positions
     `own`.

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
-from team.estimation.map_joining.association.absence import Views, covered, renumbered
+from team.estimation.map_joining.association.absence import SeenTogether, covered, renumbered
 from team.estimation.map_joining.association.growing import Grown, Indices, Joint, Pair, grow
 from team.estimation.map_joining.association.shares import distance, matched_share
-from team.estimation.map_joining.association.voting import Points, Vote, moved, voted
+from team.estimation.map_joining.association.voting import PointSet, Vote, moved, voted
 
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""
@@ -45,14 +45,14 @@ class Side(NamedTuple):
     """
 
     at: Indices
-    points: Points
+    points: PointSet
     names: Indices
     within: Indices
-    views: Views
+    views: SeenTogether
     parts: tuple[Indices, ...] = ()
 
 
-class Alignment(NamedTuple):
+class Placement(NamedTuple):
     """A placement of the patch on the target: its pairs, and the part of the target that it was
     grown on.
 
@@ -106,7 +106,7 @@ def aligned(
     target: Side,
     joint_of: Callable[[Vote], tuple[Joint, Side]],
     profile: AssociationProfile,
-) -> list[Alignment]:
+) -> list[Placement]:
     """The alignments of a patch with a target, the one with the most evidence first.
 
     joint_of: returns the joint Gaussian of both for a proposed alignment, and the part of the
@@ -116,7 +116,7 @@ def aligned(
         :EXAMINED
     ]
     votes.sort(key=lambda vote: -_promise(vote, patch, target, profile))
-    found: list[Alignment] = []
+    found: list[Placement] = []
     most = 0
     for vote in votes[:TRIED]:
         if WEAK * len(vote.first) < most:
@@ -126,7 +126,7 @@ def aligned(
         if grown is not None:
             absent = _absent(grown, patch, there, profile)
             evidence = grown.llr - profile.absent * absent
-            found.append(Alignment(grown, there, vote.motion, absent, evidence))
+            found.append(Placement(grown, there, vote.motion, absent, evidence))
             most = max(most, len(grown.pairs))
     return sorted(found, key=lambda each: -each.evidence)
 
@@ -137,7 +137,7 @@ def closure(
     joint_of: Callable[[Vote], tuple[Joint, Side]],
     profile: AssociationProfile,
     tests: Tests,
-    aliases: Callable[[], Sequence[Alignment]] = tuple,
+    aliases: Callable[[], Sequence[Placement]] = tuple,
 ) -> Closure | None:
     """The best alignment of a patch with a target; None where no alignment has two pairs.
 
@@ -185,7 +185,7 @@ def closure(
     return closure._replace(why=failed(closure, profile, tests))
 
 
-def _against(closure: Closure, others: Sequence[Alignment]) -> Closure:
+def _against(closure: Closure, others: Sequence[Placement]) -> Closure:
     """The closure with the figures of the best rival, if one of `others` is better than its present
     one.
     """
@@ -220,7 +220,7 @@ def _absent(grown: Grown, patch: Side, there: Side, profile: AssociationProfile)
 def _missing(
     one: tuple[Float[np.ndarray, "n 2"], Indices],
     two: tuple[Float[np.ndarray, "m 2"], Indices],
-    views: tuple[Views, Views],
+    views: tuple[SeenTogether, SeenTogether],
     profile: AssociationProfile,
 ) -> int:
     """Number of unmatched points of two sides, given with the matched ones' indices, inside the

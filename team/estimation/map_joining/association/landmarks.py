@@ -20,7 +20,7 @@ MOST_DECISIONS = 400
 """Number of newest decisions that are stored."""
 
 
-class Member(NamedTuple):
+class LocalLandmark(NamedTuple):
     """One local landmark of one submap."""
 
     robot: str
@@ -33,7 +33,7 @@ class Member(NamedTuple):
         return f"{self.robot}/{self.incarnation}/{self.sequence}/{self.local}"
 
 
-class Tie(NamedTuple):
+class MergeRecord(NamedTuple):
     """Why the set with this number was united with another: by which step and with which figures.
 
     rival: the best log-likelihood ratio of a pair that excludes it.
@@ -74,8 +74,8 @@ class Decision(NamedTuple):
 class Verdict(NamedTuple):
     """An operator's decision on two local landmarks: that they are one landmark, or two."""
 
-    first: Member
-    second: Member
+    first: LocalLandmark
+    second: LocalLandmark
     same: bool
 
 
@@ -86,7 +86,7 @@ class Opened(NamedTuple):
     """
 
     decision: Decision
-    pairs: tuple[tuple[Member, Member], ...]
+    pairs: tuple[tuple[LocalLandmark, LocalLandmark], ...]
     newer: tuple[tuple[Stream, int, int], ...]
 
 
@@ -102,16 +102,16 @@ class Landmarks:
     undone: closures that are not accepted again.
     """
 
-    number: Mapping[Member, int] = field(default_factory=dict)
-    sets: Mapping[int, tuple[Member, ...]] = field(default_factory=dict)
-    ties: Mapping[int, Tie] = field(default_factory=dict)
+    number: Mapping[LocalLandmark, int] = field(default_factory=dict)
+    sets: Mapping[int, tuple[LocalLandmark, ...]] = field(default_factory=dict)
+    ties: Mapping[int, MergeRecord] = field(default_factory=dict)
     decisions: tuple[Decision, ...] = ()
     waits: Mapping[tuple[Stream, Stream], Decision] = field(default_factory=dict)
     verdicts: tuple[Verdict, ...] = ()
     opened: tuple[Opened, ...] = ()
     undone: tuple[Opened, ...] = ()
 
-    def identity(self, member: Member) -> int | None:
+    def identity(self, member: LocalLandmark) -> int | None:
         """The number of the landmark that a member belongs to; None where there is no such
         member.
         """
@@ -137,11 +137,13 @@ class Landmarks:
 NO_LANDMARKS = Landmarks()
 
 
-def members_of(contribution: Contribution) -> list[Member | None]:
+def members_of(contribution: Contribution) -> list[LocalLandmark | None]:
     """The member for each landmark of a submap; None for a named one."""
     of = contribution
     return [
-        Member(of.robot, of.incarnation, of.sequence, id_ - UNNAMED) if id_ >= UNNAMED else None
+        LocalLandmark(of.robot, of.incarnation, of.sequence, id_ - UNNAMED)
+        if id_ >= UNNAMED
+        else None
         for id_ in of.local.ids.tolist()
     ]
 
@@ -179,14 +181,14 @@ def founded(
     return replace(landmarks, number=number, sets=sets), numbers
 
 
-def number_of(member: Member) -> int:
+def number_of(member: LocalLandmark) -> int:
     """2³¹ | 31 bits of the BLAKE2b digest of a member's name."""
     digest = hashlib.blake2b(str(member).encode(), digest_size=4).digest()
     return UNNAMED | int.from_bytes(digest, "little") & (UNNAMED - 1)
 
 
 def united(
-    landmarks: Landmarks, ties: Sequence[tuple[int, Tie]]
+    landmarks: Landmarks, ties: Sequence[tuple[int, MergeRecord]]
 ) -> tuple[Landmarks, dict[int, int]]:
     """Unites sets; returns them with the new number of each identity that was renumbered.
 

@@ -22,7 +22,7 @@ MOST_DISTANCES = 2_000_000
 """Number of distances between points that are in memory at once."""
 
 
-class Points(NamedTuple):
+class PointSet(NamedTuple):
     """Points of one side [m], and the standard deviation [m] of each relative to its neighbours."""
 
     mean: Float[np.ndarray, "n 2"]
@@ -40,8 +40,8 @@ class Vote(NamedTuple):
 
 
 def voted(
-    a: Points,
-    b: Points,
+    a: PointSet,
+    b: PointSet,
     tolerance: float,
     longest: float,
     parts: Sequence[Int64[np.ndarray, " _"]] = (),
@@ -61,7 +61,7 @@ def voted(
     for part in parts:
         if not 2 <= len(part) < len(a.mean):
             continue
-        own = Points(a.mean[part], a.sd[part])
+        own = PointSet(a.mean[part], a.sd[part])
         middle = own.mean.mean(axis=0)
         proposed = _proposed(own.mean - middle, b.mean, tolerance, longest)
         found = _distinct(_refined(own, b, middle, proposed, tolerance), len(part))[:OF_A_PART]
@@ -159,8 +159,8 @@ def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndar
 
 
 def _refined(
-    a: Points,
-    b: Points,
+    a: PointSet,
+    b: PointSet,
     centre: Float[np.ndarray, "2"],
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
@@ -179,8 +179,8 @@ def _refined(
 
 
 def _refined_together(
-    a: Points,
-    b: Points,
+    a: PointSet,
+    b: PointSet,
     centre: Float[np.ndarray, "2"],
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,

@@ -5,7 +5,7 @@ import pytest
 
 from team.association import AssociationProfile
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.association.landmarks import Landmarks, Member, Verdict
+from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -45,13 +45,13 @@ def _folded(
 
 
 @pytest.fixture(scope="module")
-def loop() -> tuple[list[Contribution], dict[Member, int], Fold]:
+def loop() -> tuple[list[Contribution], dict[LocalLandmark, int], Fold]:
     submaps, truth = drive("r1", LOOP, _world(5), np.random.default_rng(5))
     return submaps, truth, _folded(submaps)
 
 
 def test_a_loop_without_names_is_the_map_with_names(
-    loop: tuple[list[Contribution], dict[Member, int], Fold],
+    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
 ) -> None:
     _, truth, fold = loop
     assert wrong(fold.landmarks, truth) == duplicates(fold.landmarks, truth) == 0
@@ -70,7 +70,7 @@ def test_a_loop_without_names_is_the_map_with_names(
 
 
 def test_the_fold_is_the_same_bits_again_and_submaps_with_names_cost_it_nothing(
-    loop: tuple[list[Contribution], dict[Member, int], Fold],
+    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
 ) -> None:
     submaps, _, fold = loop
     again = _folded(submaps)
@@ -128,7 +128,7 @@ def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it(
 
 
 def test_an_operator_says_that_two_are_one_or_two(
-    loop: tuple[list[Contribution], dict[Member, int], Fold],
+    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
 ) -> None:
     submaps, _, fold = loop
     members = next(m for m in fold.landmarks.sets.values() if len(m) > 1)

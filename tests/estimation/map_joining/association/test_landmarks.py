@@ -5,8 +5,8 @@ import numpy as np
 from team.config import UNNAMED
 from team.estimation.map_joining.association.landmarks import (
     NO_LANDMARKS,
-    Member,
-    Tie,
+    LocalLandmark,
+    MergeRecord,
     founded,
     number_of,
     united,
@@ -16,17 +16,17 @@ from tests.estimation.map_joining.association.unnamed_worlds import circle, driv
 WORLD = np.array([[8.0, 1.0], [9.0, -2.0], [7.0, 3.0]])
 
 
-def _tie(into: int) -> Tie:
-    return Tie("track", into, 5.0, 0.0, 0.1, 0)
+def _tie(into: int) -> MergeRecord:
+    return MergeRecord("track", into, 5.0, 0.0, 0.1, 0)
 
 
 def test_each_unnamed_landmark_founds_a_set_of_its_own_with_a_number_made_of_its_name():
     (submap,), _ = drive("r1", circle((0.0, 0.0), 5.0, 1, 0.05), WORLD, np.random.default_rng(1))
     landmarks, numbers = founded(NO_LANDMARKS, [submap])
-    assert numbers[submap.key] == [number_of(Member("r1", 1, 0, k)) for k in range(3)]
+    assert numbers[submap.key] == [number_of(LocalLandmark("r1", 1, 0, k)) for k in range(3)]
     assert all(number >= UNNAMED for number in numbers[submap.key])
     assert [landmarks.sets[number] for number in numbers[submap.key]] == [
-        (Member("r1", 1, 0, k),) for k in range(3)
+        (LocalLandmark("r1", 1, 0, k),) for k in range(3)
     ]
 
 
@@ -56,4 +56,4 @@ def test_a_set_with_a_name_keeps_the_name():
     for ties in ([(7, _tie(number))], [(number, _tie(7))]):
         found, becomes = united(landmarks, ties)
         assert becomes == {number: 7}
-        assert found.sets[7] == (Member("r1", 1, 0, 0),)
+        assert found.sets[7] == (LocalLandmark("r1", 1, 0, 0),)

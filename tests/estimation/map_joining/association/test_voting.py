@@ -1,10 +1,10 @@
 import numpy as np
 
-from team.estimation.map_joining.association.voting import Points, moved, voted
+from team.estimation.map_joining.association.voting import PointSet, moved, voted
 
 
-def _points(mean: np.ndarray) -> Points:
-    return Points(mean, np.full(len(mean), 0.1))
+def _points(mean: np.ndarray) -> PointSet:
+    return PointSet(mean, np.full(len(mean), 0.1))
 
 
 def test_the_motion_between_two_sets_is_found_among_points_that_only_one_of_them_has():

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from team.config import UNNAMED
 from team.estimation.contribution import Contribution
 from team.estimation.geometry import between, inverse, transformed
-from team.estimation.map_joining.association.landmarks import Landmarks, Member
+from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark
 from team.estimation.submap import LocalMap, Unnamed
 
 POSE_SD = (0.03, 0.03, 0.004)
@@ -22,7 +22,7 @@ def drive(
     rng: np.random.Generator,
     reach: float = 6.0,
     named: bool = False,
-) -> tuple[list[Contribution], dict[Member, int]]:
+) -> tuple[list[Contribution], dict[LocalLandmark, int]]:
     """A submap between each two poses of a path of all landmarks within reach, and its truth.
 
     Each submap has them in an order of its own; all are seen by one keyframe. named: they keep
@@ -49,7 +49,7 @@ def drive(
             unnamed=unnamed,
         )
         submaps.append(Contribution(robot, 1, k, (k + 1) * 10**10, each))
-        truth |= {Member(robot, 1, k, n): int(at) for n, at in enumerate(seen)}
+        truth |= {LocalLandmark(robot, 1, k, n): int(at) for n, at in enumerate(seen)}
     return submaps, truth
 
 
@@ -62,7 +62,7 @@ def circle(
     return np.column_stack([x, y, (angle + np.pi / 2 + np.pi) % (2 * np.pi) - np.pi])
 
 
-def wrong(landmarks: Landmarks, truth: dict[Member, int]) -> int:
+def wrong(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
     """Members whose set has more of another true landmark."""
     count = 0
     for members in landmarks.sets.values():
@@ -71,6 +71,6 @@ def wrong(landmarks: Landmarks, truth: dict[Member, int]) -> int:
     return count
 
 
-def duplicates(landmarks: Landmarks, truth: dict[Member, int]) -> int:
+def duplicates(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
     """Sets beyond one of each true landmark."""
     return len(landmarks.sets) - len({truth[member] for member in landmarks.number})
