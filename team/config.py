@@ -192,7 +192,7 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return any(self.mount)
 
 
-class Association(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AssociationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of the association of detections without identities inside a window.
 
     gate: the largest squared Mahalanobis distance of a detection from its landmark, χ² of two
@@ -245,7 +245,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     teammate_speed: NonNegative = 0.2
     outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     biases: tuple[Bias, ...] = ()
-    association: Association = Association()
+    association: AssociationSettings = AssociationSettings()
 
     def __post_init__(self) -> None:
         if tuple(sorted(set(self.biases))) != self.biases:

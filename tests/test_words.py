@@ -53,6 +53,8 @@ ON_THE_WIRE = ("team/wire/messages/", "team/wire/channels.py")
 """Where fields and keys are named as logs have them."""
 DRIVERS = ("team/driver/", "team/ros2/", "team/ros2_driver.py")
 """Folders whose identifiers are not examined for such participles yet."""
+LIBRARY = "team/library.py"
+"""Values of users' programs have the names of those that they stand for."""
 FORMER = {"team/former_names.py"}
 """Files that are about former names."""
 FOLDERS = ("team", "central", "sim", "examples", "benchmarks")
@@ -126,6 +128,16 @@ def test_an_identifier_of_team_names_a_thing_and_no_vague_participle():
         for word in sorted(parts_of(each) & VAGUE.keys())
     ]
     assert found == []
+
+
+def test_a_class_of_team_has_a_name_of_its_own_beside_its_message_and_the_library_face():
+    places: dict[str, list[str]] = {}
+    for name, tree in sources():
+        if name.startswith("team/") and not name.startswith((*ON_THE_WIRE, *DRIVERS, LIBRARY)):
+            for node in tree.body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    places.setdefault(node.name, []).append(name)
+    assert {each: where for each, where in places.items() if len(where) > 1} == {}
 
 
 def test_no_docstring_and_no_page_has_such_a_word():

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.config import Association
+from team.config import AssociationSettings
 from team.estimation.association.certainty import certainties
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import (
@@ -41,7 +41,7 @@ class Associated:
     clutter: Bool[np.ndarray, " N"]
 
 
-def associated(scans: Scans, settings: Association) -> Associated:
+def associated(scans: Scans, settings: AssociationSettings) -> Associated:
     """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
     first = tracked(scans, settings)
     scans = _with_slips(scans, first.slips)
@@ -93,7 +93,7 @@ def _renumbered(
 
 
 def _again(
-    scans: Scans, names: Int64[np.ndarray, " before"], now: Smoothed, settings: Association
+    scans: Scans, names: Int64[np.ndarray, " before"], now: Smoothed, settings: AssociationSettings
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     """Associate every scan again, from the smoothed path against the landmarks of the whole window.
 
@@ -138,7 +138,7 @@ def _merged(
     landmark_of: Int64[np.ndarray, " N"],
     names: Int64[np.ndarray, " before"],
     now: Smoothed,
-    settings: Association,
+    settings: AssociationSettings,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     """Merge unnamed landmarks at one place that no scan saw together, the closest pair first."""
     count, first = len(names), 3 * len(now.poses)
@@ -167,7 +167,7 @@ def _certain(
     landmark_of: Int64[np.ndarray, " N"],
     names: Int64[np.ndarray, " L"],
     now: Smoothed,
-    settings: Association,
+    settings: AssociationSettings,
 ) -> Int64[np.ndarray, " N"]:
     """Drop detections that may as well be of something else (`certain`); identities are always
     accepted.
@@ -177,7 +177,9 @@ def _certain(
 
 
 def _confirmed(
-    landmark_of: Int64[np.ndarray, " N"], names: Int64[np.ndarray, " L"], settings: Association
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " L"],
+    settings: AssociationSettings,
 ) -> Bool[np.ndarray, " L"]:
     """Whether each landmark is accepted: it has a name or was seen often enough."""
     counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
@@ -189,7 +191,7 @@ def _missed_too_often(
     landmark_of: Int64[np.ndarray, " N"],
     confirmed: Bool[np.ndarray, " L"],
     now: Smoothed,
-    settings: Association,
+    settings: AssociationSettings,
 ) -> Bool[np.ndarray, " N"]:
     """Of landmarks that are not confirmed, those that would have been seen more often if they were
     real.
@@ -217,7 +219,7 @@ def _missed_too_often(
     return clutter
 
 
-def _rare(seen: int, looks: int, settings: Association) -> bool:
+def _rare(seen: int, looks: int, settings: AssociationSettings) -> bool:
     """Whether P(at most `seen` of `looks` detections) < 0.05 with the detection probability."""
     p = settings.detection_probability
     term, total = (1.0 - p) ** looks, 0.0

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.special import ndtr
 
-from team.config import Association
+from team.config import AssociationSettings
 from team.estimation.association.matching import squared_distances
 from team.estimation.association.scans import NOBODY, Scans
 from team.estimation.association.smoothing import Smoothed, predicted_by
@@ -81,7 +81,7 @@ def view_of(scans: Scans) -> FieldOfView:
 
 
 def certainties(
-    scans: Scans, landmark_of: Int64[np.ndarray, " N"], now: Smoothed, settings: Association
+    scans: Scans, landmark_of: Int64[np.ndarray, " N"], now: Smoothed, settings: AssociationSettings
 ) -> Float[np.ndarray, " N"]:
     """Of each detection, the probability that it is of the landmark that it was associated with;
     0 for a detection without a landmark.

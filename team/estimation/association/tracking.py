@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.special import chdtri
 
-from team.config import Association
+from team.config import AssociationSettings
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import NOBODY, Scans, pose_jacobians, rotation
 from team.estimation.geometry import adjoint, compose, inverse
@@ -51,7 +51,7 @@ class Tracked(NamedTuple):
 class Tracker:
     """The state of the filter: the pose, the landmarks so far and their joint covariance."""
 
-    def __init__(self, settings: Association, most: int) -> None:
+    def __init__(self, settings: AssociationSettings, most: int) -> None:
         self._settings = settings
         self.pose = np.zeros(3)
         self.names: list[int] = []
@@ -243,7 +243,7 @@ def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.diag([metres**2, metres**2, turn**2])
 
 
-def tracked(scans: Scans, settings: Association) -> Tracked:
+def tracked(scans: Scans, settings: AssociationSettings) -> Tracked:
     """Associate a window's detections scan by scan."""
     tracker = Tracker(settings, len(scans.points))
     landmark_of = np.full(len(scans.points), NOBODY)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from team.config import UNNAMED, Association, Sensor
+from team.config import UNNAMED, AssociationSettings, Sensor
 from team.estimation.association.association import associated
 from team.estimation.association.scans import NOBODY, Scans, points_of
 from team.estimation.association.tracking import Slip, slip_covariance
@@ -53,7 +53,7 @@ class Event(NamedTuple):
 
 
 def settled(
-    keyframes: Sequence[Keyframe], settings: Association, sensor: Sensor, most: int
+    keyframes: Sequence[Keyframe], settings: AssociationSettings, sensor: Sensor, most: int
 ) -> Settled:
     """Associate the window's detections. Raises LinAlgError where the window has no solution.
 

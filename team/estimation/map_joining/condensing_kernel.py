@@ -21,7 +21,7 @@ def add_submaps(
     place: Indices,
     state: Values,
     offset: Indices,
-    factors: kernel.Factors,
+    factors: kernel.SubmapFactors,
     chosen: Indices,
     weights: Values,
 ) -> None:

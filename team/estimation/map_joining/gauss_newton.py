@@ -117,7 +117,7 @@ class Island(least_squares.Iterate):
         return robust_scale(age, settings.robust_c, settings.robust_start, settings.robust_decay)
 
     @cached_property
-    def _submaps(self) -> kernel.Factors:
+    def _submaps(self) -> kernel.SubmapFactors:
         """The submaps, with their noise taken at this state."""
         factors = self.graph.factors
         if not self.settings.joined_ranges:
@@ -145,11 +145,11 @@ class Island(least_squares.Iterate):
         return weight
 
     @cached_property
-    def factors(self) -> kernel.Factors:
+    def factors(self) -> kernel.SubmapFactors:
         """The submaps with the covariances of discounted landmarks enlarged."""
         return self._discounted(self.landmark_weight)
 
-    def _discounted(self, weight: Values) -> kernel.Factors:
+    def _discounted(self, weight: Values) -> kernel.SubmapFactors:
         factors = self._submaps
         if (weight == 1.0).all():
             return factors

@@ -28,7 +28,7 @@ beyond it is an outlier.
 NO_POWER = -1
 
 
-class Factors(NamedTuple):
+class SubmapFactors(NamedTuple):
     """All submaps of a graph in flat arrays, in the order in which they were added.
 
     member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
@@ -138,7 +138,7 @@ def _turn_and_stretch(values: Values, i: int, j: int, c: float, s: float, stretc
 
 
 @compiled
-def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Factors:
+def with_joined_ranges(state: Values, offset: Indices, factors: SubmapFactors) -> SubmapFactors:
     """The submaps, with their noise recomputed at the ranges of the joined map.
 
     For errors proportional to the range: q is the distance of a landmark, in the state, from where
@@ -197,7 +197,7 @@ def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Fact
                     continue
                 i = factors.sensitivity_start[f] + b * n + row
                 _turn_and_stretch(columns, i, i + 1, c, s, q ** factors.range_power[first + b])
-    return Factors(
+    return SubmapFactors(
         factors.member,
         factors.member_start,
         factors.mean,
@@ -215,7 +215,7 @@ def with_joined_ranges(state: Values, offset: Indices, factors: Factors) -> Fact
 
 @compiled
 def landmark_chi2(
-    state: Values, offset: Indices, factors: Factors, covariance_factor: float
+    state: Values, offset: Indices, factors: SubmapFactors, covariance_factor: float
 ) -> Values:
     """r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap."""
     result = np.empty(len(factors.block))
@@ -239,7 +239,7 @@ def landmark_chi2(
 
 
 @compiled
-def discounted_information(factors: Factors, weight: Values) -> Values:
+def discounted_information(factors: SubmapFactors, weight: Values) -> Values:
     """(P + blkdiag(0, (1/w_l − 1) P_ll))⁻¹ of each submap, in the layout of `information`.
 
     A landmark with weight w_l counts as if its own covariance were that much larger; the rest of
@@ -279,14 +279,14 @@ def _discount(
 
 
 @compiled
-def _sensitivity(factors: Factors, f: int, n: int) -> Float[np.ndarray, "B n"]:
+def _sensitivity(factors: SubmapFactors, f: int, n: int) -> Float[np.ndarray, "B n"]:
     begin, end = factors.sensitivity_start[f], factors.sensitivity_start[f + 1]
     return factors.sensitivity[begin:end].reshape((end - begin) // n, n)
 
 
 @compiled
 def submap_of(
-    offset: Indices, factors: Factors, f: int
+    offset: Indices, factors: SubmapFactors, f: int
 ) -> tuple[Indices, Indices, Values, Float[np.ndarray, "n n"], Float[np.ndarray, "B n"]]:
     """Submap f: its nodes, their indices in the state, its mean, its P⁻¹ and its sensitivity."""
     nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
@@ -297,7 +297,9 @@ def submap_of(
 
 
 @compiled
-def costs(state: Values, offset: Indices, factors: Factors, covariance_factor: float) -> Values:
+def costs(
+    state: Values, offset: Indices, factors: SubmapFactors, covariance_factor: float
+) -> Values:
     """χ² of each submap in the metric (covariance_factor · P)⁻¹."""
     result = np.empty(len(factors.member_start) - 1)
     for f in range(len(result)):
@@ -328,7 +330,7 @@ def normal_equations(
     state: Values,
     offset: Indices,
     fixed: Bool[np.ndarray, " _"],
-    factors: Factors,
+    factors: SubmapFactors,
     covariance_factor: float,
     scale: Values,
     entry: Indices,
@@ -378,7 +380,7 @@ def normal_equations(
 def explained(
     state: Values,
     offset: Indices,
-    factors: Factors,
+    factors: SubmapFactors,
     covariance_factor: float,
     entry: Indices,
     value_start: Indices,

@@ -20,7 +20,7 @@ from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed
 from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
-from team.estimation.map_joining.joining_kernel import NO_POWER, Factors, block_pattern
+from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
@@ -141,10 +141,10 @@ class Graph:
     gone: Mapping[Stream, int] = field(default_factory=dict)
 
     @cached_property
-    def factors(self) -> Factors:
+    def factors(self) -> SubmapFactors:
         """The submaps in flat arrays, for the kernels."""
         submaps = [each.contribution for each in self.submaps]
-        return Factors(
+        return SubmapFactors(
             member=np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
             member_start=_starts([len(each.nodes) for each in self.submaps]),
             mean=np.concatenate([np.zeros(0), *(each.local.mean for each in submaps)]),

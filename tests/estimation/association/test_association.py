@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from team.config import Association
+from team.config import AssociationSettings
 from team.estimation.association.association import Associated, associated
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import (
@@ -19,7 +19,7 @@ from team.estimation.association.scans import (
 )
 from team.estimation.association.smoothing import smoothed
 
-SETTINGS = Association()
+SETTINGS = AssociationSettings()
 MOTION_NOISE = np.diag([0.02, 0.01, 0.01]) ** 2
 RANGE_M, VIEW_M = 0.05, 6.0
 
@@ -108,7 +108,7 @@ def test_what_is_looked_at_again_in_vain_is_clutter_and_what_is_not_is_unconfirm
 @pytest.mark.parametrize("reach", [0.0, 0.8])
 def test_a_slip_of_the_odometry_is_named_and_costs_no_landmark(reach):
     scans, labels = window(3, slip=(12, np.array([0.3, 0.25, 0.0])))
-    result = associated(scans, Association(slip_m=reach))
+    result = associated(scans, AssociationSettings(slip_m=reach))
     recall = pairs(result.landmark_of, labels)[1]
     if not reach:
         assert recall < 0.9, "without the search the window falls into two halves"
@@ -187,7 +187,7 @@ def test_the_smoothed_window_is_consistent_and_one_with_half_the_noise_claimed_i
 
 def test_landmarks_that_one_scan_saw_together_are_never_merged():
     scans, labels = window(6, spacing=1.0)
-    result = associated(scans, Association(slack_m=5.0, certain=0.0))
+    result = associated(scans, AssociationSettings(slack_m=5.0, certain=0.0))
     by_scan = [labels[scans.keyframes == k] for k in range(len(scans.motions))]
     together = {pair for seen in by_scan for pair in combinations(sorted(seen), 2)}
     members = [set(labels[result.landmark_of == i]) for i in range(len(result.counts))]

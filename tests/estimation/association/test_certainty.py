@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from team.config import Association
+from team.config import AssociationSettings
 from team.estimation.association.association import associated
 from team.estimation.association.certainty import marginals, view_of
 from team.estimation.association.scans import NOBODY
@@ -57,7 +57,7 @@ def test_a_poor_sensor_gives_fewer_landmarks_and_not_wrong_ones():
             noise = np.random.default_rng(seed).normal(size=scans.points.shape) * 0.45
             poor = np.tile((0.45**2 + 0.05**2) * np.eye(2), (len(labels), 1, 1))
             scans = replace(scans, points=scans.points + noise, covariances=poor)
-            result = associated(scans, Association(certain=certain))
+            result = associated(scans, AssociationSettings(certain=certain))
             precision.append(pairs(result.landmark_of, labels)[0])
             kept.append((result.landmark_of != NOBODY).mean())
         wrong.append(1.0 - np.mean(precision))

@@ -23,7 +23,7 @@ from sim.world.config import (
     UtiasWorld,
 )
 from team.config import (
-    Association,
+    AssociationSettings,
     Bounds,
     FrontEnd,
     Lens,
@@ -39,8 +39,8 @@ STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, FolderWorld, LiveWorld, RobotConfig, MotionModel,
     MotionNoise,
     Sensor,
-    Lens, FrontEnd, Association, UnlabelledWorld, CentralConfig, BiasSigmas, CommonBiasSigmas,
-    Bounds,
+    Lens, FrontEnd, AssociationSettings, UnlabelledWorld, CentralConfig, BiasSigmas,
+    CommonBiasSigmas, Bounds,
 )  # fmt: skip
 
 
