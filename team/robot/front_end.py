@@ -205,7 +205,7 @@ class BoundedEstimator:
         """Take one odometry interval, or only its duration where its motion is rejected."""
         self._goes_in(measurement)
         if self._is_of_another_time(measurement):
-            return Driven(NOTHING_NEW, Rejection.TIME)
+            return IntervalOutcome(NOTHING_NEW, Rejection.TIME)
         interval = translate.interval_of(measurement, self._config)
         rejected = self._judge.odometry(interval)
         if rejected not in UNMEASURED:
