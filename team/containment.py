@@ -138,7 +138,9 @@ class Boundary:
         _LOG.warning("%s: dropped %s", self.name, self.last_refused)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
-        """Count and log a fault; returns its message."""
+        """Count and log a fault; returns its message. Raises KeyboardInterrupt again."""
+        if _is_interrupt(error):
+            raise KeyboardInterrupt from error
         self.faults += 1
         place = place_of(error.__traceback__)
         text = _cut(str(error), LONGEST_TEXT)
@@ -203,6 +205,13 @@ def place_of(trace: TracebackType | None) -> str:
     ours = [frame for frame in frames if f"{frame[0]}.".startswith(_OURS)]
     module, function, line = (ours or [("?", "?", 0), *frames])[-1]
     return _cut(f"{module}:{function}:{line}", LONGEST_TEXT)
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether an interrupt is behind an exception: within a compiled kernel it is a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _cut(text: str, length: int) -> str:

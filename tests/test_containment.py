@@ -281,3 +281,16 @@ def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(
     shell = Shell(bus, CentralNode(CENTRE, ["r1"]), "robot/alpha", threading.Event())
     shell.publish(Outgoing(ch.SUBMAP, "alpha", submap(k)) for k in range(2))
     assert [s.key for s in sink.receive()] == ["robot/alpha/fault", "robot/alpha/submap"]
+
+
+def test_an_interrupt_within_a_compiled_kernel_ends_the_run_and_is_no_fault() -> None:
+    """Numba makes a SystemError of it: Ctrl-C was set aside as a fault, and the run went on."""
+
+    class Interrupted:
+        def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    boundary = Boundary("central")
+    with pytest.raises(KeyboardInterrupt):
+        boundary.give(Interrupted(), submap(0))
+    assert boundary.faults == 0
