@@ -1,59 +1,56 @@
-"""The fold over the set in its canonical order, by ticks of team time, with its checkpoints.
+"""The fold over the set of submaps in its canonical order, by ticks of team time.
 
 Tick b takes the submaps that end in (b·tick, (b + 1)·tick]. Before the watermark every submap of a
 tick has arrived, so the fold is final; a late submap rolls it back to the checkpoint before its
 tick.
 
-The fold itself withdraws a robot that contradicts the rest beyond chance, and begins again without
-it. It tests this after the first tick of each broadcast's time and of the full solution, never when
-a broadcast happens to be due. So a withdrawal depends on the set alone, not on the order or time of
-arrival.
+    add, judge ───> FoldInputs ───tick───> taken(fold, tick) ───> Checkpoints.push
+    (grow only)         ^                        ^                      │
+                        │                  condensed(fold) <──fold──────┤
+                        │ without the robot                             v
+                        └──────────────── Conviction <──────────── agreement(fold)
 
-The running fold is bounded (`condensing`): its old submaps are condensed before each tick. The full
+There are three pieces of state, each with one owner. The inputs know no fold. The checkpoints are
+a stack that `_take` pushes and `_roll_back` pops. The conviction, the robots that contradict the
+rest beyond chance (`central.withdrawal`), is replaced as a whole; whenever it changes all ticks are
+taken again without these robots. It is tested after the first tick of each broadcast's time and
+after the full solution, never when a broadcast happens to be due. So a withdrawal depends on the
+set alone, not on the order or time of arrival.
+
+The running fold is bounded (`condensing`): its old submaps are condensed before each tick. Where a
+condensed island has to move, the ticks since it was condensed are taken again raw. The full
 solution uses the raw submaps: it takes the condensed ticks again (but see FULL).
 """
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
+from central.checkpoints import Checkpoints
 from central.config import CentralConfig
-from central.members import Members
+from central.fold_inputs import FoldInputs
 from central.withdrawal import convicted, suspects
 from team.config import UNNAMED
-from team.estimation.contribution import Stream, named
+from team.estimation.contribution import Stream
 from team.estimation.hybrid_slam.sensitivity import BIASES
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.association.landmarks import Verdict
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.condensing import condensed
-from team.estimation.map_joining.joining import (
-    EMPTY_FOLD,
-    Fold,
-    InitialPoseFactor,
-    JoinSettings,
-    Tick,
-    compacted,
-    converged,
-)
+from team.estimation.map_joining.joining import Fold, InitialPoseFactor, JoinSettings, converged
 from team.estimation.map_joining.marginals import Agreement
-from team.estimation.map_joining.relinearising import is_due, relinearised
+from team.estimation.map_joining.relinearising import is_due
 from team.estimation.map_joining.submap_graph import CommonBias, CondensedError
-from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
-from team.wire.digest import digest_of
 from team.wire.messages import SightingFactor, Submap
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
-"""The errors that the whole team has."""
+"""The biases that the whole team may have in common."""
 GROWTH = 1.25
 """Suspects that were not withdrawn are tested again once the number of submaps has grown by this
 factor."""
 FULL = 2000
 """The full solution of up to this many submaps takes all ticks again; with more it starts from
 the running fold, since the ticks would take hours."""
-NEWEST = 8
-"""Number of newest ticks whose checkpoints are all kept; of older ones as many for each doubling
-of the age."""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
@@ -73,67 +70,46 @@ def join_settings(config: CentralConfig) -> JoinSettings:
     )
 
 
-@dataclass
-class Checkpoint:
-    """The fold after a tick; tried: its number of submaps when no suspect was last found.
+@dataclass(frozen=True)
+class Conviction:
+    """The robots that a fold has withdrawn, with the reason in words, and the last tick for it."""
 
-    number: of the ticks that were taken, this one included.
-    """
-
-    tick: int
-    fold: Fold
-    tried: int
-    number: int
-
-
-def thinned(taken: list[Checkpoint]) -> list[Checkpoint]:
-    """The checkpoints to keep: the newest, then ever fewer, and the last one of a raw fold.
-
-    Of those that are n to 2n ticks old a quarter and more of every n: what comes late is taken from
-    a checkpoint that is not much older than it, and there are no more than a few tens.
-    """
-    last = taken[-1].number
-    raw = max((each.number for each in taken if not each.fold.departed), default=0)
-    return [
-        each
-        for each in taken
-        if each.number == raw or each.number % _spacing(last - each.number) == 0
-    ]
-
-
-def _spacing(age: int) -> int:
-    return 1 << max(0, (age // NEWEST).bit_length())
+    robots: Mapping[str, str] = field(default_factory=dict)
+    at: float = -math.inf
 
 
 class TickFold:
-    """Holds the contributions by tick and the fold after each tick that has been taken.
+    """Folds a set of submaps tick by tick.
 
-    convicted: the robots that the fold has withdrawn, with the reason in words; none, unless
-    `convicts`. bounded: old submaps are condensed, except in ticks up to `_raw_until`, since a
-    condensed island's frame had to be turned there. verdicts: an operator's on unnamed landmarks.
+    ordered: robots withdrawn by an order. conviction: those withdrawn by the fold itself; none,
+    unless `convicts`. bounded: old submaps are condensed, except in ticks up to `_raw_until`, where
+    a condensed island had to move. inputs: those of another fold, which are then only read.
     """
 
-    def __init__(self, config: CentralConfig, bounded: bool = True) -> None:
+    def __init__(
+        self, config: CentralConfig, bounded: bool = True, inputs: FoldInputs | None = None
+    ) -> None:
         self._config = config
         self._bounded = bounded
-        self._raw_until = -math.inf
+        self._inputs = FoldInputs(config) if inputs is None else inputs
+        self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
         self.settings = join_settings(config)
         self.convicts = config.withdraw_above is not None
-        self._ordered: set[str] = set()
-        self.convicted: dict[str, str] = {}
-        self._convicted_at = -math.inf
-        self._tick_ns = round(config.tick_s * 1e9)
-        self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
-        self._members = Members(self._tick_ns)
-        self._starts: dict[Stream, InitialPoseFactor] = {}
-        self.verdicts: set[Verdict] = set()
-        self._tick_with: dict[tuple[str, int, int], int] = {}
-        self._taken: list[Checkpoint] = []
+        self._ordered: frozenset[str] = frozenset()
         self._agreed: tuple[Fold, Agreement] | None = None
+        self._begin_again(Conviction())
+
+    def _begin_again(self, conviction: Conviction) -> None:
+        """Forget every tick that was taken, under another conviction."""
+        self._conviction = conviction
+        self.checkpoints = Checkpoints()
+        self._raw_until = -math.inf
+
+    # What goes in.
 
     def know_start(self, start: InitialPoseFactor) -> None:
         """Take a stream's initial pose, before its first submap is added."""
-        self._starts[(start.robot, start.incarnation)] = start
+        self._inputs.know_start(start)
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()) -> None:
         """Put a submap in its tick, with the inter-robot measurements from it, all of which
@@ -141,9 +117,8 @@ class TickFold:
 
         The fold goes back to before that tick if it was taken.
         """
-        tick = self._members.add(submap, digest, sightings)
-        self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
-        if submap.robot not in self._gone or tick <= self._convicted_at:
+        tick = self._inputs.add(submap, digest, sightings)
+        if submap.robot not in self._gone or tick <= self._conviction.at:
             self._roll_back(tick)
 
     def judge(self, verdicts: Collection[Verdict]) -> None:
@@ -152,23 +127,9 @@ class TickFold:
         The fold goes back to before the first tick with both landmarks of a verdict that is new or
         withdrawn.
         """
-        changed = self.verdicts.symmetric_difference(verdicts)
-        if not changed:
-            return
-        until_ns = self._until_ns
-        self.verdicts.symmetric_difference_update(changed)
-        ticks = [tick for each in changed if (tick := self._tick_judging(each)) is not None]
-        if ticks:
-            self._roll_back(min(ticks))
-            self.take_until(until_ns)
-
-    def _tick_judging(self, verdict: Verdict) -> int | None:
-        """The first tick by which both landmarks' submaps have arrived; None while one is
-        missing.
-        """
-        ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
-        known = [tick for tick in ticks if tick is not None]
-        return max(known) if len(known) == len(ticks) else None
+        tick = self._inputs.judge(verdicts)
+        if math.isfinite(tick):
+            self._fold_again(tick)
 
     def withdraw(self, robot: str) -> None:
         """Leave out a robot's submaps, and the inter-robot measurements by it or of it, now and in
@@ -177,46 +138,44 @@ class TickFold:
         The result is that of a team without the robot: the fold goes back to the checkpoint before
         the robot's first submap, or the first measurement of it, and takes the ticks again.
         """
-        if robot in self._ordered:
-            return
+        if robot not in self._ordered:
+            self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
+
+    def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
+        """Take the ticks from this one on again, with other robots withdrawn if there are any."""
         until_ns = self._until_ns
-        ticks = self._members.behind(-math.inf)
-        touched = next((tick for tick in ticks if self._members.concerns(tick, robot)), None)
-        if touched is not None:
-            self._roll_back(touched)
-        self._ordered.add(robot)
+        if math.isfinite(tick):
+            self._roll_back(tick)
+        self._ordered = self._ordered if ordered is None else ordered
         self.take_until(until_ns)
 
-    def without(self, robots: Collection[str]) -> "TickFold":
-        """Another one of the same submaps without some robots' that has taken the same ticks.
+    def _roll_back(self, tick: float) -> None:
+        """Forget what was folded from a tick on, and a conviction that is based on it.
 
-        It withdraws no further robot.
+        A convicted robot was left out from the first tick on: no checkpoint has it still.
         """
-        other = self._other(self._bounded)
-        other.convicts = False
-        other._ordered = self._gone | set(robots)
-        other.take_until(self._until_ns)
-        return other
+        if tick <= self._conviction.at:
+            self._begin_again(Conviction())
+        if tick <= self._raw_until:
+            self._raw_until = -math.inf
+            self.checkpoints = self.checkpoints.raw()
+        self.checkpoints.back_to(tick)
 
-    def _other(self, bounded: bool) -> "TickFold":
-        """Another one of the same members that has taken nothing yet."""
-        other = TickFold(self._config, bounded)
-        other._members, other._starts = self._members, self._starts
-        other.verdicts, other._tick_with = self.verdicts, self._tick_with
-        return other
-
-    def _full(self) -> "TickFold":
-        """Another one of the same members that condenses nothing, from the last raw checkpoint."""
-        other = self._other(bounded=False)
-        other.convicts, other._ordered = self.convicts, set(self._ordered)
-        raw = [each for each in self._taken if not each.fold.departed]
-        if raw and not self.convicted:
-            other._taken = [replace(raw[-1])]
-        return other
+    # What has been folded.
 
     @property
-    def _gone(self) -> set[str]:
-        return self._ordered | self.convicted.keys()
+    def fold(self) -> Fold:
+        """The fold over the ticks that have been taken."""
+        return self.checkpoints.fold
+
+    @property
+    def convicted(self) -> Mapping[str, str]:
+        """The robots that the fold has withdrawn, with the reason in words."""
+        return self._conviction.robots
+
+    @property
+    def _gone(self) -> frozenset[str]:
+        return self._ordered.union(self.convicted)
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
@@ -226,40 +185,25 @@ class TickFold:
     @property
     def _until_ns(self) -> float:
         """The end of the last tick that was taken."""
-        return (self._taken[-1].tick + 1) * self._tick_ns if self._taken else -math.inf
-
-    def _roll_back(self, tick: int) -> None:
-        """Forget what was folded from a tick on, and withdrawals caused by it.
-
-        The robot was left out from the first tick on: there is no checkpoint that still has it.
-        """
-        if tick <= self._convicted_at:
-            self.convicted, self._convicted_at = {}, -math.inf
-            self._taken, self._raw_until = [], -math.inf
-        if tick <= self._raw_until:
-            self._raw_until = -math.inf
-            self._taken = [each for each in self._taken if not each.fold.departed]
-        while self._taken and self._taken[-1].tick >= tick:
-            self._taken.pop()
-
-    @property
-    def fold(self) -> Fold:
-        """The fold over the ticks that have been taken."""
-        return self._taken[-1].fold if self._taken else EMPTY_FOLD
+        return (self.checkpoints.tick + 1) * self._inputs.tick_ns
 
     def take_until(self, watermark_ns: float) -> bool:
         """Take every tick that ends at the watermark or before; True if there was one."""
-        taken, again = False, True
+        took, again = False, True
         while again:
             again = False
             for tick in self._open_ticks():
-                if (tick + 1) * self._tick_ns > watermark_ns:
+                if (tick + 1) * self._inputs.tick_ns > watermark_ns:
                     break
-                taken = True
+                took = True
                 again = not self._take(tick)
                 if again:
                     break
-        return taken
+        return took
+
+    def _open_ticks(self) -> list[int]:
+        """The ticks that are not taken yet and have a submap of a robot that is not withdrawn."""
+        return self._inputs.ticks_behind(self.checkpoints.tick, self._gone)
 
     def _take(self, tick: int) -> bool:
         """Take a tick; False if ticks before it are to be taken again.
@@ -267,23 +211,48 @@ class TickFold:
         If it withdraws a robot, all ticks are taken again; if it has to move a condensed island,
         those since it was condensed.
         """
-        before = self._taken[-1] if self._taken else None
+        before = self.checkpoints.tick
         try:
             fold = self._with_tick(self.fold, tick)
         except CondensedError:
             self._raw_until = tick
-            self._taken = [each for each in self._taken if not each.fold.departed]
+            self.checkpoints = self.checkpoints.raw()
             return False
-        taken = Checkpoint(
-            tick, fold, *((0, 1) if before is None else (before.tried, before.number + 1))
-        )
-        if before is not None:
-            before.fold = compacted(before.fold)
-        self._taken = thinned([*self._taken, taken])
-        asked = before is None or before.tick // self._period < tick // self._period
-        if asked and taken.fold.size >= GROWTH * taken.tried:
-            return not self._convict(taken.fold, tick)
+        self.checkpoints.push(tick, fold)
+        is_tested = math.isinf(before) or before // self._period < tick // self._period
+        if is_tested and fold.size >= GROWTH * self.checkpoints.tested:
+            return not self._convict(fold, tick)
         return True
+
+    def _with_tick(self, fold: Fold, tick: int) -> Fold:
+        """The fold with all of a tick; members beyond the bounds are refused before the others.
+
+        Raises CondensedError where an island would have to be moved that is condensed, or comes to
+        have unnamed landmarks.
+        """
+        if self._bounded and tick > self._raw_until:
+            fold = self._condensed(fold, tick)
+        members = self._inputs.tick(tick, self._gone)
+        submaps = members.contributions
+        unnamed = (each.stream for each in submaps if (each.local.ids >= UNNAMED).any())
+        if fold.departed and (stream := next(unnamed, None)) is not None:
+            raise CondensedError(stream)
+        return taken(fold, members, self.settings)
+
+    def _condensed(self, fold: Fold, tick: int) -> Fold:
+        """The fold that a tick is added to; relinearised where that is due."""
+        coming = self._inputs.size(tick, self._gone)
+        if fold.departed and is_due(fold.size, fold.size + coming):
+            fold = self._inputs.relinearised(fold, tick - 1, self._gone)
+        return condensed(fold)
+
+    # Who contradicts the rest.
+
+    def agreement(self, fold: Fold) -> Agreement:
+        """The agreement of a fold; the last one's is cached, since a broadcast asks again."""
+        if self._agreed is None or self._agreed[0] is not fold:
+            self._agreed = fold, marginals.joint_cost(fold)
+        return self._agreed[1]
 
     def _convict(self, fold: Fold, at: float) -> bool:
         """Whether a robot is withdrawn; it is then left out from the first tick on."""
@@ -293,21 +262,14 @@ class TickFold:
         agreement = self.agreement(fold)
         if not suspects(agreement, limit):
             return False
-        self._taken[-1].tried = fold.size
+        self.checkpoints.note_tested(fold.size)
         found = convicted(agreement, limit, self._agreement_without)
         if found is None:
             return False
         robot, reason = found
-        self.convicted[robot] = reason
-        self._convicted_at = max(self._convicted_at, at)
-        self._taken, self._raw_until = [], -math.inf
+        robots = {**self.convicted, robot: reason}
+        self._begin_again(Conviction(robots, max(self._conviction.at, at)))
         return True
-
-    def agreement(self, fold: Fold) -> Agreement:
-        """The agreement of a fold; the last one's is kept, since a broadcast asks again."""
-        if self._agreed is None or self._agreed[0] is not fold:
-            self._agreed = fold, marginals.joint_cost(fold)
-        return self._agreed[1]
 
     def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
         fold = self.without(robots).fold
@@ -315,27 +277,18 @@ class TickFold:
             return None
         return marginals.joint_cost(fold if fold.departed else converged(fold, self.settings))
 
-    def solved(self) -> Fold:
-        """The full solution of everything that is here, without the robots that it withdraws."""
-        self.take_until(math.inf)
-        if self.fold.departed:
-            raw = self._raw(self.fold, math.inf) if self.fold.size > FULL else self.fold
-            if not raw.departed:
-                fold = converged(raw, self.settings)
-                return self.solved() if self._convict(fold, math.inf) else fold
-            full = self._full()
-            fold = full.solved()
-            if full.convicted != self.convicted:
-                self.convicted, self._convicted_at = full.convicted, full._convicted_at
-                self._taken, self._raw_until = [], -math.inf
-            return fold
-        while True:
-            self.take_until(math.inf)
-            if not self.fold.contributions:
-                return self.fold
-            fold = converged(self.fold, self.settings)
-            if not self._convict(fold, math.inf):
-                return fold
+    def without(self, robots: Collection[str]) -> "TickFold":
+        """Another fold of the same inputs without some robots', with the same ticks taken.
+
+        It withdraws no further robot.
+        """
+        other = TickFold(self._config, self._bounded, self._inputs)
+        other.convicts = False
+        other._ordered = self._gone.union(robots)
+        other.take_until(self._until_ns)
+        return other
+
+    # Solutions beyond the closed ticks.
 
     def provisional(self) -> Fold:
         """The fold over everything that is there, ahead of the watermark too."""
@@ -349,98 +302,39 @@ class TickFold:
                 return whole.fold
         return fold
 
-    def _open_ticks(self) -> list[int]:
-        """The ticks that are not taken yet and have a submap of a robot that is not withdrawn."""
-        last = self._taken[-1].tick if self._taken else -math.inf
-        gone = self._gone
-        return [tick for tick in self._members.behind(last) if self._members.keys(tick, gone)]
+    def solved(self) -> Fold:
+        """The full solution of everything that is here, without the robots that it withdraws."""
+        while True:
+            self.take_until(math.inf)
+            fold = self.fold
+            if fold.departed and fold.size > FULL:
+                fold = self._inputs.relinearised(fold, math.inf, self._gone)
+            if fold.departed:
+                return self._solved_raw()
+            if not fold.contributions:
+                return fold
+            fold = converged(fold, self.settings)
+            if not self._convict(fold, math.inf):
+                return fold
 
-    def _with_tick(self, fold: Fold, tick: int) -> Fold:
-        """The fold with all of a tick; members beyond the bounds are refused before the others.
-
-        Raises CondensedError where an island would have to be moved that is condensed, or comes to
-        have unnamed landmarks.
+    def _solved_raw(self) -> Fold:
+        """The full solution by a fold of the same inputs that condenses nothing, from the last raw
+        checkpoint; its conviction is taken over.
         """
-        if self._bounded and tick > self._raw_until:
-            fold = self._condensed(fold, tick)
-        gone = self._gone
-        order = self._members.keys(tick, gone)
-        members = [self._members.contribution(key) for key in order]
-        unnamed = (each.stream for each in members if (each.local.ids >= UNNAMED).any())
-        if fold.departed and (stream := next(unnamed, None)) is not None:
-            raise CondensedError(stream)
-        outside = {}
-        for each in members:
-            why = submap_beyond(each.local, self._config.bounds)
-            if why is not None:
-                outside[each.key] = why
-        sightings, starts, set_aside = [], [], []
-        for sighting in (each for key in order for each in self._members.sightings(key)):
-            if sighting.teammate in gone:
-                continue
-            why = sighting_beyond(sighting, self._config.bounds)
-            if why is None:
-                sightings.append(sighting)
-            else:
-                of = f"{sighting.teammate} by {named(sighting.stream)}"
-                set_aside.append(f"an inter-robot measurement of {of} refused: {why}")
-        for start in (
-            self._starts[m.stream] for m in members if m.sequence == 0 and m.stream in self._starts
-        ):
-            why = start_beyond(start, self._config.bounds)
-            if why is None:
-                starts.append(start)
-            else:
-                of = named(start.stream)
-                set_aside.append(f"the initial pose of {of} refused, taken as unknown: {why}")
-        verdicts = sorted(
-            v
-            for v in self.verdicts
-            if self._tick_judging(v) == tick and not {v.first.robot, v.second.robot} & gone
-        )
-        news = Tick(members, sightings, starts, outside, tuple(set_aside), tuple(verdicts))
-        return taken(fold, news, self.settings)
+        other = TickFold(self._config, False, self._inputs)
+        other.convicts, other._ordered = self.convicts, self._ordered
+        if not self.convicted:
+            other.checkpoints = Checkpoints(self.checkpoints.raw().taken[-1:])
+        fold = other.solved()
+        if other.convicted != self.convicted:
+            self._begin_again(other._conviction)
+        return fold
 
-    def _condensed(self, fold: Fold, tick: int) -> Fold:
-        """The fold that a tick is put on; linearised again where that is due."""
-        coming = len(self._members.keys(tick, self._gone))
-        if fold.departed and is_due(fold.size, fold.size + coming):
-            fold = self._raw(fold, tick - 1)
-        return condensed(fold)
-
-    def _raw(self, fold: Fold, last: float) -> Fold:
-        """A fold up to a tick, solved again from where it is with nothing condensed."""
-        gone = self._gone
-        keys = [
-            key
-            for tick in self._members.behind(-math.inf, last)
-            for key in self._members.keys(tick, gone)
-            if fold.home.get(key[1:3]) == fold.main_key
-        ]
-        contributions = [self._members.contribution(key) for key in keys]
-        seen = (each for key in keys for each in self._members.sightings(key))
-        return relinearised(fold, contributions, [s for s in seen if s.teammate not in gone])
+    # The names of a fold.
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """The name of the fold's set: starts and submaps in canonical order, and `more`."""
-        starts = [
-            digest_of(
-                robot.encode(),
-                incarnation.to_bytes(8, "little"),
-                start.pose.tobytes(),
-                b"" if start.covariance is None else start.covariance.tobytes(),
-            )
-            for (robot, incarnation), start in sorted(self._starts.items())
-            if (robot, incarnation) in fold.home
-        ]
-        gone = [f"without {robot}".encode() for robot in self.withdrawn]
-        verdicts = sorted(
-            f"{v.first} {v.second} {v.same}".encode() for v in fold.landmarks.verdicts
-        )
-        keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
-        last = max((self._members.tick_of(key[0]) for key in keys), default=-math.inf)
-        closed = min(last, self._taken[-1].tick if self._taken else -math.inf)
-        return self._members.digest((*more, *gone, *starts, *verdicts), closed, last, self._gone)
+        return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """The version vector: the last sequence of each stream that was taken or refused."""

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from central import tick_fold
+from central.checkpoints import Checkpoint, thinned
 from central.config import CentralConfig
-from central.tick_fold import Checkpoint, TickFold, thinned
+from central.tick_fold import TickFold
 from team import translate
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.condensing import condensed
@@ -115,10 +116,10 @@ def test_a_withdrawal_gives_the_fold_without_the_robot():
 
 def test_checkpoints_are_few_and_spaced_by_their_age():
     raw, late = EMPTY_FOLD, replace(EMPTY_FOLD, departed=1)
-    kept = []
+    kept: tuple[Checkpoint, ...] = ()
     for number in range(1, 5001):
         fold = raw if number <= 20 else late
-        kept = thinned([*kept, Checkpoint(number, fold, 0, number)])
+        kept = thinned((*kept, Checkpoint(number, fold, 0, number)))
     numbers = [each.number for each in kept]
     assert len(numbers) < 90
     assert numbers[-8:] == list(range(4993, 5001))

@@ -64,17 +64,19 @@ def test_a_late_submap_rolls_back_to_before_its_tick_and_no_further():
     for each in SUBMAPS["r1"]:
         add(ticks, each)
     assert ticks.take_until(12e9)
-    before = [bits(each.fold) for each in ticks._taken]
+    before = [bits(each.fold) for each in ticks.checkpoints.taken]
     add(ticks, SUBMAPS["r2"][0])
-    assert ticks._taken == []
+    assert ticks.checkpoints.taken == ()
     for each in SUBMAPS["r2"][1:]:
         add(ticks, each)
     ticks.take_until(float("inf"))
     assert bits(ticks.fold) == EXPECTED
-    assert bits(ticks._taken[0].fold) != before[0]
-    kept = [each.fold for each in ticks._taken]
+    assert bits(ticks.checkpoints.taken[0].fold) != before[0]
+    kept = [each.fold for each in ticks.checkpoints.taken]
     add(ticks, SUBMAPS["r2"][-1])
-    assert [each.fold for each in ticks._taken] == kept[:-1], "earlier checkpoints stay as they are"
+    assert [each.fold for each in ticks.checkpoints.taken] == kept[:-1], (
+        "earlier checkpoints stay as they are"
+    )
 
 
 def test_a_tick_is_taken_when_the_watermark_has_reached_its_end():

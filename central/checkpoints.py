@@ -1,0 +1,86 @@
+"""The folds after the ticks that have been taken: few enough to keep, near enough to go back to."""
+
+import math
+from dataclasses import dataclass, replace
+
+from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
+
+NEWEST = 8
+"""Number of newest ticks whose checkpoints are all kept; of older ones as many for each doubling
+of the age."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """The fold after a tick; tested: its number of submaps when no suspect was last found.
+
+    number: of the ticks that were taken, this one included.
+    """
+
+    tick: int
+    fold: Fold
+    tested: int
+    number: int
+
+
+class Checkpoints:
+    """A stack of checkpoints by tick: a tick is pushed, a late input pops those it is missing in.
+
+    taken: the checkpoints, in the order of their ticks.
+    """
+
+    def __init__(self, taken: tuple[Checkpoint, ...] = ()) -> None:
+        self.taken = taken
+
+    @property
+    def fold(self) -> Fold:
+        """The fold over the ticks that have been taken."""
+        return self.taken[-1].fold if self.taken else EMPTY_FOLD
+
+    @property
+    def tick(self) -> float:
+        """The last tick that was taken; minus infinity if none was."""
+        return self.taken[-1].tick if self.taken else -math.inf
+
+    @property
+    def tested(self) -> int:
+        """Number of submaps in the fold when no suspect was last found."""
+        return self.taken[-1].tested if self.taken else 0
+
+    def push(self, tick: int, fold: Fold) -> None:
+        """Add the fold after one more tick; older ones are compacted, and thinned by their age."""
+        *before, last = self.taken or (None,)
+        new = Checkpoint(tick, fold, self.tested, 1 if last is None else last.number + 1)
+        older = () if last is None else (*before, replace(last, fold=compacted(last.fold)))
+        self.taken = thinned((*older, new))
+
+    def note_tested(self, size: int) -> None:
+        """Note that there was no suspect in the last fold with this number of submaps."""
+        self.taken = (*self.taken[:-1], replace(self.taken[-1], tested=size))
+
+    def back_to(self, tick: float) -> None:
+        """Drop the checkpoints from a tick on."""
+        self.taken = tuple(each for each in self.taken if each.tick < tick)
+
+    def raw(self) -> "Checkpoints":
+        """The checkpoints before anything was condensed."""
+        return Checkpoints(tuple(each for each in self.taken if not each.fold.departed))
+
+
+def thinned(taken: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
+    """The checkpoints to keep: the newest, then ever fewer, and the last one of a raw fold.
+
+    Of those that are n to 2n ticks old a quarter and more of every n are kept: a late submap is
+    folded from a checkpoint that is not much older than it, and there are a few tens in all.
+    """
+    last = taken[-1].number
+    raw = max((each.number for each in taken if not each.fold.departed), default=0)
+    return tuple(
+        each
+        for each in taken
+        if each.number == raw or each.number % _spacing(last - each.number) == 0
+    )
+
+
+def _spacing(age: int) -> int:
+    return 1 << max(0, (age // NEWEST).bit_length())

@@ -1,0 +1,149 @@
+"""The inputs of a fold by ticks of team time: submaps, initial poses and verdicts.
+
+They only grow, except for verdicts, which an operator may withdraw. Nothing here is computed from a
+fold: `tick` returns what one tick brings, and a fold without some robots reads the same inputs.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+
+from central.config import CentralConfig
+from central.members import Members
+from team.estimation.contribution import Stream, named
+from team.estimation.map_joining.association.landmarks import Verdict
+from team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
+from team.estimation.map_joining.relinearising import relinearised
+from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
+from team.wire.digest import digest_of
+from team.wire.messages import SightingFactor, Submap
+
+
+class FoldInputs:
+    """The set of submaps by ticks, with initial poses and an operator's verdicts."""
+
+    def __init__(self, config: CentralConfig) -> None:
+        self.tick_ns = round(config.tick_s * 1e9)
+        self._bounds = config.bounds
+        self._members = Members(self.tick_ns)
+        self._starts: dict[Stream, InitialPoseFactor] = {}
+        self._verdicts: set[Verdict] = set()
+        self._tick_with: dict[tuple[str, int, int], int] = {}
+
+    def know_start(self, start: InitialPoseFactor) -> None:
+        """Take a stream's initial pose, before its first submap is added."""
+        self._starts[(start.robot, start.incarnation)] = start
+
+    def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
+        """File a submap with the inter-robot measurements from it, which `digest` names, too;
+        returns its tick.
+        """
+        tick = self._members.add(submap, digest, sightings)
+        self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
+        return tick
+
+    def judge(self, verdicts: Collection[Verdict]) -> float:
+        """Replace the verdicts; returns the first tick that has both landmarks of a changed one,
+        infinity if there is none.
+        """
+        changed = self._verdicts.symmetric_difference(verdicts)
+        self._verdicts = set(verdicts)
+        ticks = (self._tick_judging(each) for each in changed)
+        return min((tick for tick in ticks if tick is not None), default=math.inf)
+
+    def _tick_judging(self, verdict: Verdict) -> int | None:
+        """The first tick by which both landmarks' submaps have arrived; None while one is
+        missing.
+        """
+        ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
+        known = [tick for tick in ticks if tick is not None]
+        return max(known) if len(known) == len(ticks) else None
+
+    def first_tick_of(self, robot: str) -> float:
+        """The first tick with a submap of a robot or an inter-robot measurement of it; infinity
+        if there is none.
+        """
+        ticks = self._members.behind(-math.inf)
+        return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
+
+    def ticks_behind(self, last: float, without: Collection[str]) -> list[int]:
+        """The ticks after this one with a submap of any other robot, ascending."""
+        ticks = self._members.behind(last)
+        return [tick for tick in ticks if self._members.keys(tick, without)]
+
+    def size(self, tick: int, without: Collection[str]) -> int:
+        """Number of submaps of a tick, those of some robots left out."""
+        return len(self._members.keys(tick, without))
+
+    def tick(self, tick: int, without: Collection[str]) -> Tick:
+        """The members of a tick, without some robots' submaps and the measurements of these robots.
+
+        Submaps beyond the bounds are named as such; inter-robot measurements and initial poses
+        beyond them are set aside in words.
+        """
+        order = self._members.keys(tick, without)
+        submaps = [self._members.contribution(key) for key in order]
+        outside = {}
+        for each in submaps:
+            why = submap_beyond(each.local, self._bounds)
+            if why is not None:
+                outside[each.key] = why
+        sightings, starts, set_aside = [], [], []
+        for sighting in (each for key in order for each in self._members.sightings(key)):
+            if sighting.teammate in without:
+                continue
+            why = sighting_beyond(sighting, self._bounds)
+            if why is None:
+                sightings.append(sighting)
+            else:
+                of = f"{sighting.teammate} by {named(sighting.stream)}"
+                set_aside.append(f"an inter-robot measurement of {of} refused: {why}")
+        first = (m.stream for m in submaps if m.sequence == 0 and m.stream in self._starts)
+        for start in (self._starts[stream] for stream in first):
+            why = start_beyond(start, self._bounds)
+            if why is None:
+                starts.append(start)
+            else:
+                of = named(start.stream)
+                set_aside.append(f"the initial pose of {of} refused, taken as unknown: {why}")
+        verdicts = sorted(
+            v
+            for v in self._verdicts
+            if self._tick_judging(v) == tick and not {v.first.robot, v.second.robot} & {*without}
+        )
+        return Tick(submaps, sightings, starts, outside, tuple(set_aside), tuple(verdicts))
+
+    def relinearised(self, fold: Fold, last: float, without: Collection[str]) -> Fold:
+        """A fold up to a tick, solved again from its own solution with nothing condensed."""
+        keys = [
+            key
+            for tick in self._members.behind(-math.inf, last)
+            for key in self._members.keys(tick, without)
+            if fold.home.get(key[1:3]) == fold.main_key
+        ]
+        submaps = [self._members.contribution(key) for key in keys]
+        seen = (each for key in keys for each in self._members.sightings(key))
+        return relinearised(fold, submaps, [s for s in seen if s.teammate not in without])
+
+    def digest(
+        self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]
+    ) -> bytes:
+        """The name of a fold's set: `more`, the robots left out, initial poses and verdicts, then
+        the submaps in canonical order. closed: the last tick whose digest is worth caching.
+        """
+        starts = [
+            digest_of(
+                robot.encode(),
+                incarnation.to_bytes(8, "little"),
+                start.pose.tobytes(),
+                b"" if start.covariance is None else start.covariance.tobytes(),
+            )
+            for (robot, incarnation), start in sorted(self._starts.items())
+            if (robot, incarnation) in fold.home
+        ]
+        gone = [f"without {robot}".encode() for robot in sorted(without)]
+        judged = fold.landmarks.verdicts
+        verdicts = sorted(f"{v.first} {v.second} {v.same}".encode() for v in judged)
+        keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
+        last = max((self._members.tick_of(key[0]) for key in keys), default=-math.inf)
+        before = (*more, *gone, *starts, *verdicts)
+        return self._members.digest(before, min(last, closed), last, without)
