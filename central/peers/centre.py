@@ -1,7 +1,7 @@
 """A centre among peers: it has no estimator, and keeps and folds the team's set as they do.
 
 It may join, leave and come back at any time: nobody waits for it, and it requests what it lacks
-from any peer. It publishes a centre's maps; peers do not need them.
+from any peer. It publishes a centre's maps, which peers do not need.
 """
 
 from collections.abc import Sequence
@@ -29,12 +29,12 @@ class PeerCentre(Peer):
         """The first messages: its configuration."""
         return self.fold.centre.begin()
 
-    def _of_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
+    def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
         """A centre's maps and orders; nobody waits for its credit."""
         return [each for each in messages if each.channel is not ch.CENTRAL_PROGRESS]
 
     def status(self) -> m.Status:
-        """A centre's status, with how much of the set is here."""
+        """A centre's status with the figures of the set."""
         own = self.fold.centre.status()
         faults = (*self.boundary.warnings, *self.fold.boundary.warnings)
         figures = {**own.figures, **self.set_figures()}

@@ -1,4 +1,5 @@
-"""A peer's own fold: the centre's node, fed from the peer's set instead of from the network.
+"""A peer's own fold: a centre's node that receives the peer's set instead of the network's
+messages.
 
 So its maps are the centre's, byte for byte, wherever the set is the same. The fold begins anew
 where a folded member changes (a robot has contradicted itself), or where the set grows after the
@@ -25,9 +26,10 @@ FoldWhen = Literal["always", "request", "end"]
 
 
 class PeerFold:
-    """Folds the set of a `PeerNode`; `name` is the node for faults.
+    """Folds the set of a `PeerNode`.
 
-    final: the newest final map; finals: how many there were.
+    centre: the node that folds; it is made anew where the fold begins anew. final: the newest final
+    map; finals: number of final maps.
     """
 
     def __init__(
@@ -75,8 +77,8 @@ class PeerFold:
         return [*self._give(message), *self.grow()]
 
     def _stored(self, message: m.Message) -> bool:
-        """Keep a message for a fold that begins anew, unless a later one replaces it; returns
-        whether it was of use.
+        """Store a message for a fold that begins anew, unless it has a later one; returns whether
+        the message was of use.
         """
         match message:
             case m.End():
@@ -160,7 +162,7 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Whether everything that an announced end speaks of is here."""
+        """Whether everything that any node has announced is here."""
         return any(self._is_here(end) for end in (self._end, *self._ends) if end is not None)
 
     def _is_here(self, end: m.End) -> bool:

@@ -1,6 +1,4 @@
-"""The processes of peers, a robot that is its own centre and a centre among peers, with their sets
-on disk.
-"""
+"""The processes of peers: a robot that is its own centre, and a centre among peers."""
 
 import logging
 import threading
@@ -24,22 +22,28 @@ from team.wire import messages as m
 from team.wire.bus import Bus, Tap
 
 LINGER_S = 5.0
-"""A robot that knows that all others have concluded stays so long, so that they know of it, too."""
+"""Time [s] for which a robot stays once it knows that all others have concluded, so that they learn
+it, too.
+"""
 FRESH_SHARE = 0.2
-"""Of the time, for maps that are not due: a robot has more to do than a centre."""
+"""Share of the time for maps that are not due: a robot has more to do than a centre."""
 WORLD_GONE_S = 1.0
-"""The world leaves when everyone has concluded; one that died is there again sooner."""
+"""Time [s] after the world's end before a peer leaves: a world that has died is started again
+sooner.
+"""
 _LOG = logging.getLogger("teamslam")
 
 
 class Alone:
-    """How long a peer has been left alone: who comes back when all have gone leaves, too."""
+    """Measures how long a peer has been left alone; a peer that comes back after all others have
+    left leaves, too.
+    """
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def since(self, now: float, *, alone: bool) -> bool:
-        """Whether it has been so for LINGER_S."""
+        """Whether it has been left alone for LINGER_S."""
         self._since = (self._since or now) if alone else None
         left = self._since is not None and now - self._since >= LINGER_S
         if left:
@@ -48,10 +52,10 @@ class Alone:
 
 
 class PeerShell(RobotShell):
-    """A robot's process without a centre: subscribe, go on with what is on disk, run, stay for
+    """A robot's process without a centre: subscribe, continue from the stored set, run, stay for
     others.
 
-    store: where its set is kept; None: nowhere.
+    store: the file of its set; None: it is not stored.
     """
 
     def __init__(
@@ -78,7 +82,7 @@ class PeerShell(RobotShell):
         self._alone = Alone()
 
     def run(self) -> None:
-        """Until nobody needs this peer any more."""
+        """Run until nobody needs this peer any more."""
         try:
             super().run()
         finally:
@@ -97,7 +101,7 @@ class PeerShell(RobotShell):
         self.shell.answer(ch.FOLD, self._peer.robot, self._peer.answer_fold)
 
     def _resume(self) -> bool:
-        """Take over what is on disk; whether the stream goes on behind it."""
+        """Take over the stored set; returns whether the robot's own stream continues after it."""
         stored = self._keeper.members
         if not stored:
             return False
@@ -126,21 +130,23 @@ class PeerShell(RobotShell):
         self._peer.finished = self._may_leave(now)
 
     def _log_carried(self) -> None:
-        """What others have brought stands in the robot's own log as who first said it had said it:
-        so the log proves the robot's maps, and logs of a team can be merged.
+        """Write members that others have forwarded into the robot's own log, under their first
+        publisher's name, so that the log proves the robot's maps, and logs of a team can be merged.
         """
         members, self._peer.carried = self._peer.carried, []
         self._log(members)
 
     def _log(self, members: Sequence[Member]) -> None:
-        """Into the robot's own log: what a death has torn off that may still be in the set."""
+        """Write members into the robot's own log, which may have lost them when the process
+        died.
+        """
         tap: Tap | None = getattr(self.bus, "tap", None)
         if tap is not None and members:
             now_ns = time.time_ns()
             tap([member.as_sample(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
-        """Nobody needs this peer any more: all have concluded, or the world has left."""
+        """Whether nobody needs this peer any more: all have concluded, or the world has left."""
         if self._alone.since(now, alone=self._peer.is_left_alone):
             return True
         if self._peer.final is None:
@@ -156,7 +162,7 @@ class PeerShell(RobotShell):
 
 
 class CentreShell:
-    """The process of a centre among peers: go on with what is on disk, run, leave when all agree.
+    """The process of a centre among peers: continue from the stored set, run, leave when all agree.
 
     Raises BusError when the bus is lost.
     """
@@ -179,7 +185,7 @@ class CentreShell:
         self._alone = Alone()
 
     def run(self) -> None:
-        """Until every peer has the final map that is here."""
+        """Run until every peer has the same final map."""
         for channel in self._peer.overhears:
             self._bus.subscribe(channel)
         self._bus.watch_alive()

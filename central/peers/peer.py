@@ -1,7 +1,7 @@
-"""What a robot without a centre and a centre among peers have in common: the set and its fold.
+"""The common part of a robot without a centre and a centre among peers: the set and its fold.
 
-A peer takes members from wherever they come, hands what is news to its own fold, and says what the
-fold says under its own name. What it does besides (an estimator, say) is its subclass's.
+A peer takes members from any publisher, gives new ones to its own fold, and publishes the fold's
+messages under its own name. The rest (an estimator, say) is its subclass's.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ from team.wire.bus import Outgoing, Sample
 from team.wire.codec import decoded, encoded
 
 TALK = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
-"""What the set costs a radio; questions for it, too."""
+"""Channels of the set, which its traffic figures count; requests count, too."""
 CENTRE = "central"
 """The node name of a centre."""
 
@@ -26,11 +26,11 @@ CENTRE = "central"
 class Peer:
     """Keeps the team's set as the node `name` and folds it.
 
-    finished: whether it may leave: by its shell's word. carried: members that others have brought,
-    since somebody has last cleared it. uplink, downlink: bytes of the set's talk that were said,
-    each once, and heard. world_alive: None while no world was heard of. ended: whether somebody has
-    had a final map. others: the robots and the centre that are there, but for this node. unsaid: of
-    a fold that was asked for; newest: the last map that was.
+    finished: whether it may leave; set by its shell. carried: members that others have forwarded,
+    until the shell takes them. uplink, downlink: bytes of the set's channels that were published,
+    each message once, and received. world_alive: None before any message of a world. ended: whether
+    anyone has had a final map. others: the other robots and the centre that are present.
+    unpublished: messages of a fold that was requested; newest: its last map.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class Peer:
         self.world_alive: bool | None = None
         self.ended = False
         self.others: set[str] = set()
-        self.unsaid: list[Outgoing] = []
+        self.unpublished: list[Outgoing] = []
         self.newest: m.FusedMap | None = None
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """The channels to subscribe to whoever they name: members, summaries, progress."""
+        """The channels to subscribe to under every name: members, summaries, progress."""
         signed = () if self.peer.proofs is None else (ch.SIGNATURE, ch.ORDER_SIGNATURE)
         others = (ch.ROBOT_PROGRESS, ch.HEAD, ch.END, ch.END_ORDER, *signed)
         return tuple(dict.fromkeys((*PeerNode.listens, *others)))
@@ -68,7 +68,7 @@ class Peer:
 
     @property
     def all_concluded(self) -> bool:
-        """Whether every robot that is not given up has the final map that is here."""
+        """Whether every robot that is not given up has this node's final map."""
         if self.final is None:
             return False
         lost = {*self.final.lost, *self.final.withdrawn}
@@ -79,12 +79,12 @@ class Peer:
         )
 
     def keep(self, members: Iterable[Member]) -> None:
-        """Take what an earlier life has kept."""
+        """Take the stored set of an earlier process."""
         for member in members:
             self.peer.take(member, self.name)
 
     def news_of_set(self) -> list[Member]:
-        """The members that are new since this was asked last."""
+        """The members that are new since the last call."""
         members, self.peer.unsaved = self.peer.unsaved, []
         return members
 
@@ -102,7 +102,7 @@ class Peer:
         return self._take(message, sample, channel, name) if answered is None else answered
 
     def _hear(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        """Take what others say of themselves; None: it is something else."""
+        """Take a message about the set or the team's progress; None: it is another message."""
         match message:
             case m.Members():
                 self.carried += self.peer.take_carried(message)
@@ -117,7 +117,7 @@ class Peer:
             case m.SetSummary():
                 return self.counted(self.peer.hear(message))
             case m.Progress() | m.StreamHead() | m.TeamEnd() | m.End():
-                return self._of_fold(self.fold.note(message))
+                return self._from_fold(self.fold.note(message))
             case m.Liveliness(node="world"):
                 self.world_alive = message.alive
                 return []
@@ -126,12 +126,12 @@ class Peer:
                 return []
             case m.Liveliness():
                 self._meet(message)
-                return self._of_fold(self.fold.note(message))
+                return self._from_fold(self.fold.note(message))
             case _:
                 return None
 
     def _meet(self, token: m.Liveliness) -> None:
-        """Somebody comes, who may lack something, or goes."""
+        """Note that a node has come, which may lack members, or gone."""
         if token.node == self.name or not (token.node.startswith("robot/") or token.node == CENTRE):
             return
         (self.others.add if token.alive else self.others.discard)(token.node)
@@ -140,7 +140,7 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """The team has ended, and nobody is there who has what is missing here."""
+        """Whether the team has ended, and nobody is present who has the missing members."""
         return self.ended and self.final is None and not self.others
 
     def _take(
@@ -153,27 +153,27 @@ class Peer:
         return self.grown()
 
     def tick(self, now_s: float) -> list[Outgoing]:
-        """What there is to say by now, by any clock that goes on."""
-        unsaid, self.unsaid = self.unsaid, []
-        return [*unsaid, *self.counted(self.peer.tick(now_s))]
+        """The messages that are due, by any clock that does not run backwards."""
+        unpublished, self.unpublished = self.unpublished, []
+        return [*unpublished, *self.counted(self.peer.tick(now_s))]
 
     def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """Count what goes out of the set's talk."""
+        """The same messages, with those of the set's channels counted."""
         talk = (each.message for each in out if each.channel in TALK or each.channel is ch.MEMBERS)
         self.uplink += sum(len(encoded(message)) for message in talk)
         return list(out)
 
     def grown(self) -> list[Outgoing]:
-        """Fold what the set has more; what the fold says."""
-        return self._of_fold(self.fold.grow())
+        """Fold the new members of the set; returns the fold's messages."""
+        return self._from_fold(self.fold.grow())
 
-    def _of_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """What the fold says, as this node says it."""
+    def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
+        """The fold's messages as this node publishes them."""
         return list(messages)
 
     def refresh(self) -> list[Outgoing]:
-        """What there is to say of what has come since the last map; for when there is time."""
-        return self._of_fold(self.fold.refresh())
+        """A map of the members since the last map; to be called when there is time."""
+        return self._from_fold(self.fold.refresh())
 
     def answer(self, request: bytes) -> list[bytes]:
         """The answer to a peer's `MembersRequest`."""
@@ -183,15 +183,19 @@ class Peer:
         return answer
 
     def answer_fold(self, request: bytes) -> list[bytes]:
-        """The answer to a `FoldRequest`: the newest map, once all that is here has been folded."""
+        """The answer to a `FoldRequest`: the newest map, once all members that are here have been
+        folded.
+        """
         decoded(request, m.FoldRequest)
-        self.unsaid += self._of_fold(self.fold.ask())
-        maps = [each.message for each in self.unsaid if isinstance(each.message, m.FusedMap)]
+        self.unpublished += self._from_fold(self.fold.ask())
+        maps = [each.message for each in self.unpublished if isinstance(each.message, m.FusedMap)]
         self.newest = maps[-1] if maps else self.newest
         return [] if self.newest is None else [encoded(self.newest)]
 
     def set_figures(self) -> dict[str, float]:
-        """How much of the set is here, how new, over whom it came, and who has the same."""
+        """The figures of the set: its size, its newest submap by robot, its sources, and the peers
+        with the same set.
+        """
         replica = self.peer.replica
         figures = {
             "set_submaps": float(replica.submaps),
@@ -211,5 +215,5 @@ class Peer:
 
 
 def member_in(out: Outgoing) -> Member:
-    """What a node says, as a member of the set."""
+    """A message of this node as a member of the set."""
     return Member(out.channel.key(about(out.message)), encoded(out.message), out.message)

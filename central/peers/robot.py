@@ -1,8 +1,8 @@
 """A robot that needs no centre: its estimator, its copy of the set, and its own fold of it.
 
-The three nodes know nothing of each other. What the estimator sends for fusion goes into the set;
-what the set has goes into the fold; the fold's prior goes back to the estimator for `team/pose`,
-as a centre's would. Law 1 holds as ever: nothing of the fold reaches what the robot sends.
+The estimator's submaps go into the set, the set's members into the fold, and the fold's prior back
+to the estimator for `team/pose`, as a centre's would. Law 1 holds as with a centre: nothing of the
+fold reaches what the robot sends for fusion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,15 +27,15 @@ _OF_THE_FOLD = {
     ch.FINAL_MAP: ch.TEAM_FINAL,
     ch.TRAJECTORY: ch.TEAM_TRAJECTORY,
 }
-"""What the centre would say under its own name the robot says under its own."""
+"""The robot's channels in place of a centre's, for its own fold's messages."""
 _OF_A_CENTRE = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
-"""What a robot hears from a centre and a peer from its own fold."""
+"""Channels on which a robot receives a centre's messages, and a peer those of its own fold."""
 
 
 class PeerRobot(Peer):
     """One robot and its own centre: `begin`, then `handle_sample` and `tick`, until `finished`.
 
-    node: the estimator's.
+    node: the estimator.
     """
 
     def __init__(
@@ -62,18 +62,18 @@ class PeerRobot(Peer):
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """The channels to subscribe to whoever they name."""
+        """The channels to subscribe to under every name."""
         own = (each for each in self.node.overhears if each is not ch.WITHDRAWAL)
         return tuple(dict.fromkeys((*super().overhears, *own)))
 
     def begin(self) -> list[Outgoing]:
-        """What it says first: its configuration, and that of its fold."""
+        """The first messages: its configuration, and that of its fold."""
         announced = msgspec.structs.replace(self.fold.centre.announcement, node=self.name)
         config = Outgoing(ch.TEAM_CONFIG, self.robot, announced)
-        return [config, *self._certified(), *self._of_robot(self.node.begin())]
+        return [config, *self._certified(), *self._from_estimator(self.node.begin())]
 
     def _certified(self) -> list[Outgoing]:
-        """With keys: what its signatures are checked by."""
+        """With keys: the certificate that verifies its signatures."""
         proofs = self.peer.proofs
         if proofs is None:
             return []
@@ -82,7 +82,7 @@ class PeerRobot(Peer):
         return [certificate]
 
     def _vouched(self, outgoing: Outgoing) -> list[Outgoing]:
-        """Take a member of its own into the set; with keys its signature goes out behind it."""
+        """Take a member of its own into the set; with keys its signature is published after it."""
         member = member_in(outgoing)
         self.peer.take(member, self.name)
         proofs = self.peer.proofs
@@ -91,7 +91,9 @@ class PeerRobot(Peer):
         return [Outgoing(ch.SIGNATURE, self.robot, proofs.signed(member))]
 
     def restore(self, members: Iterable[Member]) -> bool:
-        """Take what an earlier life has kept, before `begin`; whether its stream goes on there."""
+        """Take the stored set of an earlier process, before `begin`; returns whether its own stream
+        continues from it.
+        """
         self.keep(members)
         stored = self._own_stored()
         if not stored:
@@ -104,7 +106,9 @@ class PeerRobot(Peer):
         return True
 
     def _own_stored(self) -> list[m.Message]:
-        """Of each incarnation of its own stream, the latest first: what `take_over` takes."""
+        """The messages that the estimator takes over: of each incarnation of its own stream, the
+        latest first.
+        """
         found: list[m.Message] = []
         own = (s for s in self.peer.replica.streams if s[0] == self.robot)
         for stream in sorted(own, reverse=True):
@@ -116,21 +120,27 @@ class PeerRobot(Peer):
         return found
 
     def _hear(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        """Take what others say of themselves; what is of its own stream is the estimator's, too."""
+        """Take a message about the set or the team's progress; those of its own stream go to the
+        estimator, too.
+        """
         match message:
             case m.StreamHead() if message.robot == self.robot:
-                return self._tell_robot(message, sample) + self._of_fold(self.fold.note(message))
+                return self._to_estimator(message, sample) + self._from_fold(
+                    self.fold.note(message)
+                )
             case m.End():
-                return self._tell_robot(message, sample) + self._of_fold(self.fold.note(message))
+                return self._to_estimator(message, sample) + self._from_fold(
+                    self.fold.note(message)
+                )
             case m.Liveliness() if message.node == ch.source_node(self.robot):
-                return self._tell_robot(message, sample)
+                return self._to_estimator(message, sample)
             case _:
                 return super()._hear(message, sample)
 
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str
     ) -> list[Outgoing]:
-        """Take a member, a measurement, or what else an estimator hears."""
+        """Take a member, a measurement, or another message for the estimator."""
         out: list[Outgoing] = []
         if channel is not None and channel in CHANNELS:
             self.peer.take_sample(sample, channel.publisher(name))
@@ -142,24 +152,24 @@ class PeerRobot(Peer):
             out = self._vouched(Outgoing(ch.START, self.robot, message)) + self.grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
         if own or isinstance(message, m.KnownMap | m.Rendezvous | m.Withdrawal):
-            out = self._tell_robot(message, sample) + out
+            out = self._to_estimator(message, sample) + out
         return out
 
-    def _tell_robot(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        return self._of_robot(self.counted(self.boundary.hand(self.node, message, sample)))
+    def _to_estimator(self, message: m.Message, sample: Sample) -> list[Outgoing]:
+        return self._from_estimator(self.counted(self.boundary.hand(self.node, message, sample)))
 
-    def _of_robot(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """What the estimator says goes out; what of it is for fusion goes into the set, too."""
+    def _from_estimator(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
+        """The estimator's messages to publish; those for fusion go into the set, too."""
         out = list(messages)
         for each in messages:
             if each.channel in CHANNELS:
                 out += self._vouched(each)
             elif isinstance(each.message, m.Progress):
-                out += self._of_fold(self.fold.note(each.message))
+                out += self._from_fold(self.fold.note(each.message))
         return out + self.grown()
 
-    def _of_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """What the fold says, under this robot's name; the prior goes to the estimator first."""
+    def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
+        """The fold's messages under this robot's name; the prior goes to the estimator first."""
         out: list[Outgoing] = []
         for each in messages:
             channel = _OF_THE_FOLD.get(each.channel)
@@ -167,13 +177,13 @@ class PeerRobot(Peer):
                 out.append(each)
             elif each.channel is ch.TEAM_END:
                 sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
-                out += self._tell_robot(each.message, sample)
+                out += self._to_estimator(each.message, sample)
             elif channel is None or each.name not in ("", self.robot):
                 continue
             else:
                 if channel is ch.TEAM_PRIOR:
                     sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
-                    out += self._of_robot(self.boundary.hand(self.node, each.message, sample))
+                    out += self._from_estimator(self.boundary.hand(self.node, each.message, sample))
                 out.append(Outgoing(channel, self.robot, each.message))
         if self.fold.finals > self._finals:
             self._finals = self.fold.finals
@@ -184,7 +194,7 @@ class PeerRobot(Peer):
         return out
 
     def status(self) -> m.Status:
-        """The estimator's status with how much of the set is here, and what the fold finds."""
+        """The estimator's status with the figures of the set, and the fold's findings."""
         own, fold = self.node.status(), self.fold.centre.status()
         figures = {f"fold.{name}": value for name, value in fold.figures.items()}
         faults = [*self.boundary.warnings, *self.fold.boundary.warnings]
