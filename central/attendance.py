@@ -2,61 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 
+from central.robot_attendance import Attendance, note
 from team.wire import messages as m
 from team.wire.newer import further, later_end, later_head
 
-MOST_HEARD = 1_000
-"""Announced ends of the team, and last words of a robot, that are kept beside those believed."""
-
 Dealt = Callable[[m.Done], bool]
 """True once all messages announced in a robot's `Done` have been dealt with."""
-
-
-@dataclass
-class Attendance:
-    """The progress and presence of one robot, as the centre knows them.
-
-    done: the believed one of the `Done` messages; dones: all that have arrived. began: the latest
-    incarnation that has begun; 0: none. head: the newest head of its driver, in a live team.
-    driver: whether its driver is present; None: unknown.
-    """
-
-    alive: bool = False
-    seen: bool = False
-    given_up: bool = False
-    progress: m.Progress | None = None
-    done: m.Done | None = None
-    dones: list[m.Done] = field(default_factory=list)
-    began: int = 0
-    head: m.StreamHead | None = None
-    driver: bool | None = None
-
-    @property
-    def lost(self) -> bool:
-        """True once the robot was present and is not any more."""
-        return self.seen and not self.alive
-
-    @property
-    def stream_end(self) -> m.StreamEnd | None:
-        """Where its driver has ended the stream, unless a later incarnation has begun."""
-        head = self.head
-        if head is None or head.state != "ended" or head.incarnation < self.began:
-            return None
-        return m.StreamEnd(
-            robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
-        )
-
-    @property
-    def has_all(self) -> bool:
-        """True once the robot has consumed all that its driver has numbered and the stream is
-        not open.
-        """
-        head, done = self.head, self.done
-        if head is None or done is None or head.state == "open":
-            return False
-        return (done.incarnation, done.measurements) >= (head.incarnation, head.measurements)
 
 
 @dataclass
@@ -97,7 +49,7 @@ class TeamAttendance:
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Done() if message.robot in self.robots:
                 robot = self.robots[message.robot]
-                _note(message, robot.dones)
+                note(message, robot.dones)
                 # A robot's last word is that of its last incarnation, in whichever order they come.
                 if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
@@ -123,7 +75,7 @@ class TeamAttendance:
 
     def note_end(self, end: m.End) -> None:
         """Keep an announced end, believed or refused: robots' last words may confirm it."""
-        _note(end, self.ends)
+        note(end, self.ends)
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
         robot.began = max(robot.began, message.incarnation)
@@ -300,13 +252,3 @@ class TeamAttendance:
         return (
             not robot.began or robot.driver is False or (head is not None and head.state == "left")
         )
-
-
-T = TypeVar("T", m.Done, m.End)
-
-
-def _note(message: T, heard: list[T]) -> None:
-    """Keep a message beside those that were heard, the newest MOST_HEARD."""
-    if message not in heard:
-        heard.append(message)
-        del heard[:-MOST_HEARD]

@@ -18,6 +18,7 @@ KERNEL = "compiled: an inner loop, whose locals Numba keeps in registers"
 STUDY = "reproduces one source's tables: read beside that source"
 COMMAND = "commands: typer reads their options from signatures"
 REASONS = {
+    "team/robot/main.py": "the robot's process: how it resumes, and what it asks for",
     "team/robot/node.py": "the node: its parts are modules of their own, here is who hears what",
     "team/translate.py": "both directions of each message side by side",
     "team/driver/driver.py": "a user's face: a method for each kind of measurement",

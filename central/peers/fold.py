@@ -10,9 +10,9 @@ import hashlib
 from collections.abc import Callable
 from typing import Literal
 
-from central.attendance import MOST_HEARD
 from central.config import CentralConfig
 from central.node import CentralNode
+from central.robot_attendance import note
 from team.containment import Boundary
 from team.peers.node import PeerNode
 from team.wire import channels as ch
@@ -71,9 +71,8 @@ class PeerFold:
         refused = self.centre.refusal(message)
         if refused is None and not self._stored(message):
             return []
-        if isinstance(message, m.End) and message not in self._ends:
-            self._ends.append(message)  # robots' last words may say that it is right
-            del self._ends[:-MOST_HEARD]
+        if isinstance(message, m.End):
+            note(message, self._ends)  # the robots' `Done` messages may confirm it
         return [*self._give(message), *self.grow()]
 
     def _stored(self, message: m.Message) -> bool:

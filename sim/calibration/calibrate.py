@@ -17,7 +17,6 @@ with it) is learnt without the truth in both cases, from the maps of single robo
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import hypot
-from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -27,12 +26,18 @@ from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.calibration import claims, motion, sensor
 from sim.calibration.consistency import covariance_factor, normal_scale
 from sim.calibration.data import Reference, references, true_paths
-from sim.calibration.figures import CalibrationError, Figure, jackknifed
+from sim.calibration.figures import (
+    CalibrationError,
+    Figure,
+    jackknifed,
+    nested,
+    with_figures,
+)
 from sim.calibration.join import config_of, joined_team
 from sim.calibration.own import marker_spread, own_constants
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import WorldStreams
-from team.config import MotionModel, MotionNoise, Sensor
+from team.config import MotionModel, MotionNoise
 from team.estimation.map_joining.joining import Fold
 
 JOINED_GAP_NS = 2_000_000_000
@@ -52,7 +57,6 @@ reported.
 ALARM = 0.015
 """A scale that differs by more than this from the scenario's does not fit the data."""
 
-NOTHING: Mapping[str, Sequence[Figure]] = MappingProxyType({})
 
 Progress = Callable[[str], None]
 
@@ -262,52 +266,3 @@ def _mistrusting(scenario: Scenario) -> Scenario:
 
     robots = tuple(msgspec.structs.replace(r, motion=of(r.motion)) for r in scenario.robots)
     return msgspec.structs.replace(scenario, robots=robots)
-
-
-def with_figures(
-    scenario: Scenario,
-    of_motion: Sequence[Figure],
-    of_sensor: Sequence[Figure],
-    of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
-) -> Scenario:
-    """The scenario with the learnt figures in every robot's models; a robot's own figures take
-    precedence.
-    """
-    robots = tuple(
-        msgspec.structs.replace(
-            robot,
-            motion=msgspec.convert(
-                nested(msgspec.to_builtins(robot.motion), of_motion, MotionModel), MotionModel
-            ),
-            sensor=msgspec.convert(
-                nested(
-                    msgspec.to_builtins(robot.sensor),
-                    (*of_sensor, *of_robots.get(robot.id, ())),
-                    Sensor,
-                ),
-                Sensor,
-            ),
-        )
-        for robot in scenario.robots
-    )
-    return msgspec.structs.replace(scenario, robots=robots)
-
-
-def nested(
-    below: Mapping[str, object], figures: Sequence[Figure], declared: type[msgspec.Struct]
-) -> dict[str, object]:
-    """The fields of a model overlaid with figures: `forward.per_m` is a field of `forward`.
-
-    A learnt density replaces all three densities of its noise. A figure that is no field of the
-    model (a share of outliers) is left out.
-    """
-    names = {field.name for field in msgspec.structs.fields(declared)}
-    fields = dict(below)
-    noises: dict[str, dict[str, float]] = {}
-    for figure in figures:
-        name, _, part = figure.name.partition(".")
-        if part:
-            noises.setdefault(name, {})[part] = figure.value
-        elif name in names:
-            fields[name] = figure.value
-    return fields | noises

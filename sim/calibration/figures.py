@@ -1,14 +1,18 @@
-"""Learnt figures with their uncertainty by the jackknife."""
+"""Learnt figures with their uncertainty by the jackknife, and models with these figures in them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from types import MappingProxyType
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from sim.calibration.data import Reference
+from sim.scenarios.scenario import Scenario
+from team.config import MotionModel, Sensor
 
 GROUPS = 5
 """Least number of parts that are left out in turn; fewer robots are cut into equal stretches of
@@ -88,3 +92,55 @@ def jackknifed(fit: Fit, data: Sequence[Reference], units: Mapping[str, str]) ->
         sigma = float(np.sqrt((len(groups) - 1) / len(groups) * spread))
         figures.append(Figure(name, float(value), sigma, units[name]))
     return tuple(figures)
+
+
+NOTHING: Mapping[str, Sequence[Figure]] = MappingProxyType({})
+
+
+def with_figures(
+    scenario: Scenario,
+    of_motion: Sequence[Figure],
+    of_sensor: Sequence[Figure],
+    of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
+) -> Scenario:
+    """The scenario with the learnt figures in every robot's models; a robot's own figures take
+    precedence.
+    """
+    robots = tuple(
+        msgspec.structs.replace(
+            robot,
+            motion=msgspec.convert(
+                nested(msgspec.to_builtins(robot.motion), of_motion, MotionModel), MotionModel
+            ),
+            sensor=msgspec.convert(
+                nested(
+                    msgspec.to_builtins(robot.sensor),
+                    (*of_sensor, *of_robots.get(robot.id, ())),
+                    Sensor,
+                ),
+                Sensor,
+            ),
+        )
+        for robot in scenario.robots
+    )
+    return msgspec.structs.replace(scenario, robots=robots)
+
+
+def nested(
+    below: Mapping[str, object], figures: Sequence[Figure], declared: type[msgspec.Struct]
+) -> dict[str, object]:
+    """The fields of a model overlaid with figures: `forward.per_m` is a field of `forward`.
+
+    A learnt density replaces all three densities of its noise. A figure that is no field of the
+    model (a share of outliers) is left out.
+    """
+    names = {field.name for field in msgspec.structs.fields(declared)}
+    fields = dict(below)
+    noises: dict[str, dict[str, float]] = {}
+    for figure in figures:
+        name, _, part = figure.name.partition(".")
+        if part:
+            noises.setdefault(name, {})[part] = figure.value
+        elif name in names:
+            fields[name] = figure.value
+    return fields | noises

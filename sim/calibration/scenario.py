@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import msgspec
 
 from central.config import CentralConfig
-from sim.calibration.calibrate import Calibration, nested
-from sim.calibration.figures import Figure
+from sim.calibration.calibrate import Calibration
+from sim.calibration.figures import Figure, nested
 from sim.scenarios.scenario import Scenario, builtin_names
 from sim.world.config import FolderWorld, LiveWorld
 from team.config import MotionModel, Sensor

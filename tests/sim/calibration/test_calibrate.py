@@ -12,9 +12,15 @@ from typer.testing import CliRunner
 
 from central.desk.evaluation.errors import Path, on_circle
 from sim.calibration import join
-from sim.calibration.calibrate import Calibration, calibrated, with_figures
+from sim.calibration.calibrate import Calibration, calibrated
 from sim.calibration.data import Reference, poses_at
-from sim.calibration.figures import CalibrationError, Figure, groups_of, jackknifed
+from sim.calibration.figures import (
+    CalibrationError,
+    Figure,
+    groups_of,
+    jackknifed,
+    with_figures,
+)
 from sim.calibration.join import joined_team
 from sim.calibration.motion import UNITS as MOTION_UNITS
 from sim.calibration.motion import creep, fit_motion
