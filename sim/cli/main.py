@@ -20,6 +20,7 @@ from sim.cli.launch import app as launch_commands  # noqa: E402
 from sim.cli.log import app as log_tools  # noqa: E402
 from sim.cli.nodes import app as node_commands  # noqa: E402
 from sim.cli.options import FAILED, WRONG_USE  # noqa: E402
+from sim.cli.orders import app as order_commands  # noqa: E402
 from sim.cli.recorded import app as recorded_commands  # noqa: E402
 from sim.cli.rerun import app as rerun_commands  # noqa: E402
 from sim.cli.scenarios import app as scenario_commands  # noqa: E402
@@ -35,8 +36,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 for _part in (
-    launch_commands, scenario_commands, node_commands, key_commands, recorded_commands,
-    rerun_commands, compare_commands, view_commands, calibrate_commands,
+    launch_commands, scenario_commands, node_commands, order_commands, key_commands,
+    recorded_commands, rerun_commands, compare_commands, view_commands, calibrate_commands,
     import_commands, driver_commands, status_commands,
 ):  # fmt: skip
     app.add_typer(_part)

@@ -1,7 +1,6 @@
-"""One process each: router, world, robot, central, record. `launch` starts these very commands."""
+"""Commands of one process each: router, world, robot, central, record. `launch` starts them."""
 
 import logging
-import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from sim.cli.options import (
     ScenarioArgument,
     Seed,
     SpeedText,
+    check_names,
     connected,
     fail,
     over_tls,
@@ -31,19 +31,16 @@ from sim.cli.options import (
     refuse_existing,
     refuse_open_door,
     scenario_of,
+    signer_of,
 )
 from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
-from team.wire.arrays import ids
 
-NAME = "[a-z][a-z0-9_]{0,31}"
-"""A robot's name."""
 if TYPE_CHECKING:
     import threading
 
     from central.main import CentralShell
     from central.peers.main import CentreShell, PeerShell
     from team.config import RobotConfig
-    from team.keys.signing import Signer
     from team.wire.bus import Bus
 
 _LOG = logging.getLogger("teamslam")
@@ -179,8 +176,7 @@ def robot(
     if config is None:
         known = ", ".join(each.id for each in resolved.robots)
         fail(f"{scenario} has no robot {name!r}; its robots: {known}", WRONG_USE)
-    if not re.fullmatch(NAME, name):
-        fail(f"{name!r} is no robot's name", WRONG_USE)
+    check_names(resolved.team, name)
     with (
         process(f"robot-{name}") as stop,
         nullcontext() if log is None else own_log(log, resolved.team) as tap,
@@ -210,7 +206,7 @@ def _peer_shell(
 
     if fold not in get_args(FoldWhen):
         fail(f"--fold is always, request or end, not {fold!r}", WRONG_USE)
-    signer = _signer(keys, f"robot-{config.id}", scenario.team)
+    signer = signer_of(keys, f"robot-{config.id}", scenario.team)
     try:
         door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
         return PeerShell(
@@ -301,15 +297,8 @@ def _central_shell(
             admit=scenario.admits,
             store=store,
         )
-    signer = _signer(keys, "central", scenario.team)
+    signer = signer_of(keys, "central", scenario.team)
     return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer)
-
-
-def _signer(keys: Path | None, node: str, team: str) -> "Signer | None":
-    from team.keys.signing import Signer
-
-    own = None if keys is None else own_keys(keys, node, team)
-    return None if own is None else Signer(own)
 
 
 @app.command()
@@ -400,149 +389,3 @@ def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)
     return ()
-
-
-@app.command(name="map")
-def map_(
-    robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
-    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
-    ] = 60.0,
-) -> None:
-    """Ask a peer to fold the set that it has now (`--fold request`), and print the map as CSV."""
-    from team.wire.arrays import floats
-    from team.wire.bus import BusError
-    from team.wire.channels import FOLD
-    from team.wire.codec import decoded
-    from team.wire.messages import FoldRequest, FusedMap
-
-    with connected(team, connect, keys, "operator") as bus:
-        try:
-            replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
-        except BusError as error:
-            fail(str(error), FAILED)
-    if not replies:
-        fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
-    fused = decoded(replies[-1], FusedMap)
-    typer.echo("landmark,x,y")
-    means = floats(fused.means, "means").reshape(-1, 2)
-    for landmark, (x, y) in zip(ids(fused.ids, "ids").tolist(), means, strict=True):
-        typer.echo(f"{landmark},{x:.4f},{y:.4f}")
-
-
-@app.command()
-def withdraw(
-    robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
-    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
-    ] = 60.0,
-) -> None:
-    """Withdraw a robot from a running team: the map becomes that of a team that never had it.
-
-    The order is recorded and can not be undone.
-    """
-    from sim.launch.withdraw import WithdrawError
-    from sim.launch.withdraw import withdraw as order
-
-    if not re.fullmatch(NAME, robot):
-        fail(f"{robot!r} is no robot's name", WRONG_USE)
-    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
-        fail(f"{team!r} is no team's name", WRONG_USE)
-    with connected(team, connect, keys, "operator") as bus:
-        try:
-            fused = order(bus, robot, reason, patience, _signer(keys, "operator", team))
-        except WithdrawError as error:
-            fail(str(error), FAILED)
-    landmarks = len(ids(fused.ids, "ids"))
-    typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
-
-
-@app.command()
-def verdict(
-    word: Annotated[str, typer.Argument(help="same: they are one landmark; different: two.")],
-    first: Annotated[str, typer.Argument(help="robot/incarnation/submap/landmark, as r1/1/12/7.")],
-    second: Annotated[str, typer.Argument(help="The other one, likewise.")],
-    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "seen by an operator",
-    withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="Withdraw this verdict, for good.")
-    ] = False,
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
-    ] = 60.0,
-) -> None:
-    """Tell a running team that two landmarks without names are one, or that they are two.
-
-    The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
-    until it is withdrawn.
-    """
-    from sim.launch.verdict import judge, local_landmark
-    from sim.launch.withdraw import WithdrawError
-    from team.wire.messages import Judgement
-
-    if word not in ("same", "different"):
-        fail(f"{word!r} is no verdict: same or different", WRONG_USE)
-    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
-        fail(f"{team!r} is no team's name", WRONG_USE)
-    try:
-        one, two = local_landmark(first), local_landmark(second)
-    except ValueError as error:
-        fail(str(error), WRONG_USE)
-    if one == two:
-        fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
-    with connected(team, connect, keys, "operator") as bus:
-        try:
-            judgement = Judgement(first=one, second=two, same=word == "same")
-            signer = _signer(keys, "operator", team)
-            fused = judge(bus, judgement, reason, patience, signer, withdrawn=withdraw)
-        except WithdrawError as error:
-            fail(str(error), FAILED)
-    landmarks = len(ids(fused.ids, "ids"))
-    are = "are no more said to be" if withdraw else "are"
-    typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
-
-
-@app.command()
-def end(
-    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
-    without: Annotated[
-        str | None, typer.Option(help="A lost robot, for which the team no longer waits.")
-    ] = None,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    reason: Annotated[str, typer.Option(help="Why, for the log.")] = "ordered",
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
-    ] = 60.0,
-) -> None:
-    """End a live team: every driver ends its stream, and the centre publishes the final map.
-
-    With --without: end a running team without a lost robot. Its submaps so far stay in the map,
-    which names it as lost and is provisional, and every process ends with status 1. The router
-    keeps the order until the run is over, for a centre that is started again.
-    """
-    from sim.launch.withdraw import WithdrawError, end_team, give_up
-
-    if without is not None and not re.fullmatch(NAME, without):
-        fail(f"{without!r} is no robot's name", WRONG_USE)
-    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
-        fail(f"{team!r} is no team's name", WRONG_USE)
-    with connected(team, connect, keys, "operator") as bus:
-        try:
-            if without is None:
-                end_team(bus, reason, patience)
-            else:
-                give_up(bus, without, reason, patience, _signer(keys, "operator", team))
-        except WithdrawError as error:
-            fail(str(error), FAILED)
-    effect = f"nobody waits for {without} any more" if without else "the team ends"
-    typer.echo(effect)

@@ -16,6 +16,7 @@ from team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:
     from team.keys.credentials import Credentials
+    from team.keys.signing import Signer
     from team.recording.reader import Log
     from team.wire.zenoh.bus import ZenohBus
 
@@ -53,6 +54,9 @@ ASSUMED = (
 """Remarks on the built-in scenario for recorded data of unknown robots."""
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
+TeamOption = Annotated[
+    str, typer.Option(help="The team's name; a scenario's own if not set there.")
+]
 Seed = Annotated[
     int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
 ]
@@ -227,3 +231,20 @@ def scenario_of(name: str) -> Scenario:
         except ScenarioError as error:
             raise ScenarioError(f"{name}: {error}") from None
     return load(name)
+
+
+def check_names(team: str, robot: str | None = None) -> None:
+    """End the command where the name of the robot or of the team can not be one."""
+    from team.keys.roster import ROBOT, TEAM
+
+    if robot is not None and not ROBOT.fullmatch(robot):
+        fail(f"{robot!r} is no robot's name", WRONG_USE)
+    if not TEAM.fullmatch(team):
+        fail(f"{team!r} is no team's name", WRONG_USE)
+
+
+def signer_of(keys: Path | None, node: str, team: str) -> "Signer | None":
+    """The signer of a node's messages; None without keys."""
+    from team.keys.signing import Signer
+
+    return None if keys is None else Signer(own_keys(keys, node, team))

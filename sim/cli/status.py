@@ -1,20 +1,28 @@
 """`teamslam status`: the nodes of a running team."""
 
 import json
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, connected, fail
+from sim.cli.options import (
+    FAILED,
+    LOOPBACK,
+    Connect,
+    Keys,
+    TeamOption,
+    check_names,
+    connected,
+    fail,
+)
 
 app = typer.Typer()
 
 
 @app.command()
 def status(
-    team: Annotated[str, typer.Option(help="The team's name; a scenario's own if not set there.")],
+    team: TeamOption,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     seconds: Annotated[
@@ -28,8 +36,7 @@ def status(
 
     from sim.launch.presence import Presence
 
-    if not re.fullmatch("[A-Za-z0-9._-]{1,64}", team):
-        fail(f"{team!r} is no team's name", WRONG_USE)
+    check_names(team)
     presence = Presence()
     with connected(team, connect, keys, "operator") as bus:
         presence.take(bus, seconds)

@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sim.datasets.tables import DatasetError, File
+from team.keys.roster import ROBOT
 
-ROBOT_NAME = "[a-z][a-z0-9_]{0,31}"
+ROBOT_NAME = ROBOT.pattern
 STREAM_FILES = ("odometry.csv", "observations.csv")
 """A folder with one of these is a robot's."""
 ONE_ROBOT = "r1"

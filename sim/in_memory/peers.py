@@ -40,8 +40,6 @@ def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
 class _Seat:
     node: PeerRobot | PeerCentre
     boundary: Boundary
-    bytes_up: int = 0
-    bytes_down: int = 0
     reached: set[str] = field(default_factory=set)
 
 
@@ -209,7 +207,6 @@ class PeerTeam:
 
     def _send(self, sender: str, to: str, sample: Sample) -> None:
         size = len(sample.payload)
-        self.seats[sender].bytes_up += size
         for at_ns in self.air.arrivals(sender, to, size, self.now_ns):
             self._sent += 1
             heapq.heappush(self._heap, (at_ns, self._sent, sender, to, sample))
@@ -220,7 +217,6 @@ class PeerTeam:
             seat = self.seats.get(to)
             if seat is None:
                 continue
-            seat.bytes_down += len(sample.payload)
             if sample.key == ch.MEMBERS.key(seat.node.name):
                 for reply in seat.node.answer(sample.payload):
                     key = ch.CARRIED.key(seat.node.name)

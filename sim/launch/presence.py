@@ -53,7 +53,6 @@ class Presence:
 
     members: dict[str, Member] = field(default_factory=dict)
     heads: dict[str, m.StreamHead] = field(default_factory=dict)
-    is_to_end: bool = False
     has_ended: bool = False
 
     def _of(self, node: str) -> Member:
@@ -82,8 +81,6 @@ class Presence:
             case m.StreamHead():
                 head = self.heads.get(message.robot)
                 self.heads[message.robot] = later_head(message, head)
-            case m.TeamEnd():
-                self.is_to_end = True
             case m.FusedMap():
                 self.has_ended = True
             case _:

@@ -4,12 +4,13 @@ import re
 import time
 
 from sim.launch.withdraw import LOOK_S, PEERS, WithdrawError, await_fold, ordered
+from team.keys.roster import ROBOT
 from team.peers.proofs import Signs
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, Outgoing, sound
 
-_NAME = re.compile(r"([a-z][a-z0-9_]{0,31})/(\d+)/(\d+)/(\d+)")
+_NAME = re.compile(rf"({ROBOT.pattern})/(\d+)/(\d+)/(\d+)")
 
 
 def local_landmark(text: str) -> m.LocalLandmark:

@@ -1,0 +1,161 @@
+"""Commands by which an operator asks or orders a running team: map, withdraw, verdict, end."""
+
+from typing import Annotated
+
+import typer
+
+from sim.cli.options import (
+    FAILED,
+    LOOPBACK,
+    WRONG_USE,
+    Connect,
+    Keys,
+    TeamOption,
+    check_names,
+    connected,
+    fail,
+    signer_of,
+)
+from team.wire.arrays import ids
+
+Reason = Annotated[str, typer.Option(help="Why, for the log.")]
+
+app = typer.Typer()
+
+
+@app.command(name="map")
+def map_(
+    robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
+    team: TeamOption,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
+    ] = 60.0,
+) -> None:
+    """Ask a peer to fold the set that it has now (`--fold request`), and print the map as CSV."""
+    from team.wire.arrays import floats
+    from team.wire.bus import BusError
+    from team.wire.channels import FOLD
+    from team.wire.codec import decoded
+    from team.wire.messages import FoldRequest, FusedMap
+
+    with connected(team, connect, keys, "operator") as bus:
+        try:
+            replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
+        except BusError as error:
+            fail(str(error), FAILED)
+    if not replies:
+        fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
+    fused = decoded(replies[-1], FusedMap)
+    typer.echo("landmark,x,y")
+    means = floats(fused.means, "means").reshape(-1, 2)
+    for landmark, (x, y) in zip(ids(fused.ids, "ids").tolist(), means, strict=True):
+        typer.echo(f"{landmark},{x:.4f},{y:.4f}")
+
+
+@app.command()
+def withdraw(
+    robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
+    team: TeamOption,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    reason: Reason = "ordered",
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """Withdraw a robot from a running team: the map becomes that of a team that never had it.
+
+    The order is recorded and can not be undone.
+    """
+    from sim.launch.withdraw import WithdrawError
+    from sim.launch.withdraw import withdraw as order
+
+    check_names(team, robot)
+    with connected(team, connect, keys, "operator") as bus:
+        try:
+            fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    landmarks = len(ids(fused.ids, "ids"))
+    typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
+
+
+@app.command()
+def verdict(
+    word: Annotated[str, typer.Argument(help="same: they are one landmark; different: two.")],
+    first: Annotated[str, typer.Argument(help="robot/incarnation/submap/landmark, as r1/1/12/7.")],
+    second: Annotated[str, typer.Argument(help="The other one, likewise.")],
+    team: TeamOption,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    reason: Reason = "seen by an operator",
+    withdraw: Annotated[
+        bool, typer.Option("--withdraw", help="Withdraw this verdict, for good.")
+    ] = False,
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """Tell a running team that two landmarks without names are one, or that they are two.
+
+    The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
+    until it is withdrawn.
+    """
+    from sim.launch.verdict import judge, local_landmark
+    from sim.launch.withdraw import WithdrawError
+    from team.wire.messages import Judgement
+
+    if word not in ("same", "different"):
+        fail(f"{word!r} is no verdict: same or different", WRONG_USE)
+    check_names(team)
+    try:
+        one, two = local_landmark(first), local_landmark(second)
+    except ValueError as error:
+        fail(str(error), WRONG_USE)
+    if one == two:
+        fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
+    with connected(team, connect, keys, "operator") as bus:
+        try:
+            judgement = Judgement(first=one, second=two, same=word == "same")
+            signer = signer_of(keys, "operator", team)
+            fused = judge(bus, judgement, reason, patience, signer, withdrawn=withdraw)
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    landmarks = len(ids(fused.ids, "ids"))
+    are = "are no more said to be" if withdraw else "are"
+    typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
+
+
+@app.command()
+def end(
+    team: TeamOption,
+    without: Annotated[
+        str | None, typer.Option(help="A lost robot, for which the team no longer waits.")
+    ] = None,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    reason: Reason = "ordered",
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
+    ] = 60.0,
+) -> None:
+    """End a live team: every driver ends its stream, and the centre publishes the final map.
+
+    With --without: end a running team without a lost robot. Its submaps so far stay in the map,
+    which names it as lost and is provisional, and every process ends with status 1. The router
+    keeps the order until the run is over, for a centre that is started again.
+    """
+    from sim.launch.withdraw import WithdrawError, end_team, give_up
+
+    check_names(team, without)
+    with connected(team, connect, keys, "operator") as bus:
+        try:
+            if without is None:
+                end_team(bus, reason, patience)
+            else:
+                give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
+        except WithdrawError as error:
+            fail(str(error), FAILED)
+    typer.echo(f"nobody waits for {without} any more" if without else "the team ends")
