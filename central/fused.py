@@ -70,7 +70,7 @@ def receivable(fused: m.FusedMap) -> m.FusedMap:
         return fused
     refusals = []
     if not 0.0 <= fused.chi2 <= 1e300:
-        refusals.append(f"the cost of the map is not told: it is {fused.chi2:g}")
+        refusals.append(f"the cost of the map is left out: it is {fused.chi2:g}")
         fused = msgspec.structs.replace(fused, chi2=0.0, dof=0)
     fused, left_out = translate.receivable(fused)
     return msgspec.structs.replace(fused, reasons=(*fused.reasons, *refusals, *left_out))

@@ -99,7 +99,7 @@ class CentralNode:
         self._credit = None
         known = self._attendance.ordered
         self._attendance.take(message)
-        if isinstance(message, m.TeamEnd):  # who comes later hears of it from the centre
+        if isinstance(message, m.TeamEnd):  # a node that joins later gets it from the centre
             repeated = [] if known else [Outgoing(ch.TEAM_END, "", message)]
             return repeated + self._advance()
         self._credit = self._intake.take(message, self._attendance.now_ns)

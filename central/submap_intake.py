@@ -61,7 +61,7 @@ class SubmapIntake(Intake[SubmapInputs]):
     # What goes into a map.
 
     def inputs(self, closed_ns: float, now_ns: int) -> SubmapInputs:
-        """The set as it is; it grows under whoever holds it."""
+        """The set as it is now; what is returned grows with it."""
         return SubmapInputs(
             closed_ns=closed_ns,
             now_ns=now_ns,

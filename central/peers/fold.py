@@ -57,7 +57,7 @@ class PeerFold:
 
     def _begin(self) -> None:
         self.centre = self._make(self._config, self._robots)
-        for robot in self._robots:  # whoever was never in reach is as one that is lost
+        for robot in self._robots:  # a robot that was never in reach counts as lost
             for alive in (True, self._alive.get(robot, False)):
                 node = ch.robot_node(robot)
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))

@@ -141,7 +141,7 @@ def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
     if 3.0 * float(sigmas.max()) > CERTAIN_M:
         return (
             f"mount: the sensor's place on the base is not learnt (± {sigmas.max():.3f} m): in so "
-            "narrow a view it is not told from range_offset and bearing_offset",
+            "narrow a view it can not be distinguished from range_offset and bearing_offset",
         )
     if np.all(np.abs(found[:2]) <= DISTANT * sigmas):
         return ()
@@ -151,5 +151,6 @@ def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
     return (
         f"mount: the sensor is at ({at[0]:.3f}, {at[1]:.3f}) m on the base, ± {sigmas[0]:.3f} and "
         f"{sigmas[1]:.3f} m, not at ({x:g}, {y:g}): set sensor.mount = [{at[0]:.3f}, {at[1]:.3f}, "
-        f"{heading:g}] and calibrate again. Its heading is not told from bearing_offset",
+        f"{heading:g}] and calibrate again. Its heading and "
+        "bearing_offset have the same effect",
     )

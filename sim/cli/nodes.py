@@ -57,7 +57,10 @@ def router(
     listen: Annotated[str, typer.Option(help="Where to listen; port 0: any free one.")] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
-        bool, typer.Option(help="Without keys, let in whoever reaches it, not this machine alone.")
+        bool,
+        typer.Option(
+            help="Without keys, admit every process that reaches it, also from other machines."
+        ),
     ] = False,
 ) -> None:
     """The team's Zenoh router: every other process is its client. Runs until it is stopped.

@@ -148,8 +148,8 @@ def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
         fail(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT", WRONG_USE)
     if not (keys or insecure or is_loopback(listen)):
         fail(
-            f"--listen {listen}: whoever reaches it could end the run or forge its map: give "
-            "--keys DIR (see `teamslam keys`), or --insecure where nobody else can reach it",
+            f"--listen {listen}: any process that reaches it could end the run or forge its map: "
+            "give --keys DIR (see `teamslam keys`), or --insecure where nobody else can reach it",
             WRONG_USE,
         )
 

@@ -69,8 +69,8 @@ def withdraw(
 
     The order is recorded and can not be undone.
     """
-    from sim.launch.withdraw import WithdrawError
-    from sim.launch.withdraw import withdraw as order
+    from central.desk.orders import WithdrawError
+    from central.desk.orders import withdraw as order
 
     check_names(team, robot)
     with connected(team, connect, keys, "operator") as bus:
@@ -103,8 +103,8 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
     until it is withdrawn.
     """
-    from sim.launch.verdict import judge, local_landmark
-    from sim.launch.withdraw import WithdrawError
+    from central.desk.orders import WithdrawError
+    from central.desk.verdicts import judge, local_landmark
     from team.wire.messages import Judgement
 
     if word not in ("same", "different"):
@@ -147,7 +147,7 @@ def end(
     which names it as lost and is provisional, and every process ends with status 1. The router
     keeps the order until the run is over, for a centre that is started again.
     """
-    from sim.launch.withdraw import WithdrawError, end_team, give_up
+    from central.desk.orders import WithdrawError, end_team, give_up
 
     check_names(team, without)
     with connected(team, connect, keys, "operator") as bus:

@@ -45,7 +45,7 @@ def replay(
     ] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
-        bool, typer.Option(help="Without keys, let in whoever reaches our own router.")
+        bool, typer.Option(help="Without keys, admit every process that reaches our own router.")
     ] = False,
     wait: Annotated[
         float, typer.Option(help="Seconds between the router's start and the first message.")

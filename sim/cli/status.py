@@ -34,7 +34,7 @@ def status(
     from rich.console import Console
     from rich.table import Table
 
-    from sim.launch.presence import Presence
+    from central.desk.presence import Presence
 
     check_names(team)
     presence = Presence()

@@ -1,4 +1,6 @@
-"""Comma-separated tables with named columns: exact to the last bit, exact about what is wrong."""
+"""Comma-separated tables with named columns; numbers are exact to the last bit, errors name the
+cell.
+"""
 
 import csv
 from collections.abc import Callable, Iterable, Sequence
@@ -24,7 +26,7 @@ LARGEST_NAME = 2**31 - 1
 class CsvTable:
     """The cells of a table by column, as text; lines: each row's line in the file, from 1.
 
-    name: of the file, as errors have it.
+    name: of the file, for errors.
     """
 
     name: str
@@ -45,7 +47,7 @@ class CsvTable:
         return np.column_stack(taken).astype(np.float64) if taken else np.zeros((len(self), 0))
 
     def stamps(self, column: str, unit_s: Decimal = Decimal(1)) -> Int64[np.ndarray, " rows"]:
-        """Times in nanoseconds, exactly as the text says them; raises DatasetError."""
+        """Times in nanoseconds, exactly as in the text; raises DatasetError."""
         scale = unit_s * NANO
         parsed = self._parsed(column, lambda text: _stamp_ns(text, scale))
         return np.array(parsed, dtype=np.int64)
@@ -61,9 +63,10 @@ class CsvTable:
         return CsvTable(self.name, columns, [self.lines[i] for i in rows])
 
     def filled(self, needed: Sequence[str]) -> "CsvTable":
-        """Without columns that have nothing in any row; those that are needed stay.
+        """The table without columns that are empty in every row; needed columns stay.
 
-        So they do where no row has more than its first needed column: a time alone says something.
+        All columns stay where no row has more than its first needed column: a time alone is a
+        message without measurements.
         """
         empty = {name for name, cells in self.columns.items() if not any(cells)}
         if not set(self.columns) - empty - {*needed[:1]}:
@@ -72,11 +75,11 @@ class CsvTable:
         return CsvTable(self.name, columns, self.lines)
 
     def error(self, row: int, column: str, problem: str) -> DatasetError:
-        """What is wrong in one cell."""
+        """The error for one cell."""
         return DatasetError(f"{self.name}, line {self.lines[row]}, column {column}: {problem}")
 
     def fault(self, problem: str) -> DatasetError:
-        """What is wrong with its columns."""
+        """The error for the table's columns."""
         return DatasetError(f"{self.name}, line 1: {problem}")
 
     def _parsed(self, column: str, parse: Callable[[str], T]) -> list[T]:

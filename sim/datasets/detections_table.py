@@ -25,7 +25,7 @@ FILES = ("detections.csv", "labels.csv")
 def detections_of(place: File, robot: str) -> Detections | None:
     """A robot's detections without identities; None where it has none. Raises DatasetError.
 
-    Rows of one time are one scan; the ids are the labels, NO_LABEL of what nobody has labelled.
+    Rows of one time are one scan; the ids are the labels, NO_LABEL where there is no label.
     """
     table = _read(place, FILES[0], robot, COLUMNS)
     if table is None or not len(table):
@@ -53,7 +53,7 @@ def detections_of(place: File, robot: str) -> Detections | None:
 
 
 def together(named: Detections, unnamed: Detections | None) -> Detections:
-    """Both kinds of scans by time."""
+    """Scans with and without names, by time."""
     if unnamed is None:
         return named
     labelled = replace(named, hidden=np.zeros(len(named.stamps_ns), np.bool_))

@@ -1,4 +1,4 @@
-"""Known faults of distributed data sets, recognised by content and put right by name."""
+"""Known faults of distributed data sets, recognised by content and repaired by name."""
 
 import hashlib
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ ERRATA: Mapping[str, Erratum] = {
         ),
     ),
 }
-"""By content digest."""
+"""The errata by content digest."""
 
 
 def erratum_of(

@@ -11,7 +11,7 @@ r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optio
 r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
 r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
 landmarks.csv         landmark,x_m,y_m: the true ones                     (optional)
-scenario.toml         what the team is told                               (optional)
+scenario.toml         the models and options of the team                  (optional)
 """
 
 from collections.abc import Mapping, Sequence
@@ -68,7 +68,7 @@ REQUIRED = {
 def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     """The measurements of these robots; raises DatasetError.
 
-    Odometry's stamps are moved by the robot's clock_offset_s, which it puts right by itself.
+    Odometry's stamps are moved by the robot's clock_offset_s, which the robot corrects itself.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
@@ -108,13 +108,14 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
 
 
 LONG_STEP_S = 5.0
-"""Odometry that is told so seldom has times in other units, or is of little use."""
+"""Median step [s] of an odometry whose times are probably in other units."""
 
 
 @dataclass(frozen=True)
 class RobotRows:
-    """One robot's tables in order of time; looked: when it looked and saw nothing; unnamed: its
-    detections without identities.
+    """One robot's tables in order of time.
+
+    empty_ns: times of scans without a measurement. unnamed: its detections without identities.
     """
 
     robot: str
@@ -130,7 +131,7 @@ class RobotRows:
 
     @property
     def start_ns(self) -> int:
-        """Where the first measurement begins."""
+        """The time at which the first measurement begins."""
         intervals = self.intervals
         first = (
             intervals.end_ns[:1] - intervals.duration_ns[:1],
@@ -142,7 +143,7 @@ class RobotRows:
         return int(np.concatenate(first).min())
 
     def until(self, end_ns: int) -> "RobotRows":
-        """What is there up to the last odometry interval that ends at end_ns or before."""
+        """The tables up to the last odometry interval that ends at end_ns or before."""
         intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
         last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
         samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
@@ -210,7 +211,7 @@ def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detectio
 
 
 def _apart(read: Sequence[RobotRows]) -> list[str]:
-    """A word about robots that were never there at once: their clocks may be two."""
+    """A note on robots whose times do not overlap: their clocks may differ."""
     first = min(read, key=lambda each: each.start_ns)
     return [
         f"{each.robot} begins {(each.start_ns - first.start_ns) / DAY_NS:.1f} days after "
@@ -250,7 +251,7 @@ def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> R
 
 
 def _with_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:
-    """The messages with further ones that are empty."""
+    """The messages with further, empty ones at these times."""
     empty_ns = np.setdiff1d(empty_ns, seen.stamps_ns)
     stamps = np.concatenate([seen.stamps_ns, empty_ns])
     counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(empty_ns), np.int64)])

@@ -21,9 +21,11 @@ from team.config import Bounds
 FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 LONG_GAP_NS = 2_000_000_000
 WHIRLING_RAD_S = 2.0 * np.pi
-"""Who turns faster than this most of the time has hardly told radians."""
+"""A median yaw rate above this [rad/s] is probably not in radians."""
 OFF_NS = 1_000_000
-"""A duration is not the time since the row before if it differs by more, and by a hundredth."""
+"""A duration differs from the time since the row before if it does so by more than this, and by a
+hundredth.
+"""
 
 
 def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, list[str]]:
@@ -89,7 +91,9 @@ def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray
 
 
 def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
-    """Raises DatasetError for what is no duration; a note where it is not the time between rows."""
+    """Check the column duration_s: raises DatasetError for a value that is not positive; notes
+    where it is not the time between rows.
+    """
     if not rows.table.has("duration_s"):
         return
     stated = rows.table.stamps("duration_s")
@@ -107,7 +111,7 @@ def _judge_speeds(
     steps: Float[np.ndarray, "N _"],
     duration: Int64[np.ndarray, " N"],
 ) -> None:
-    """A note about motions that no robot makes: the robots refuse them."""
+    """Note motions beyond a robot's bounds, which robots refuse."""
     if form == STEERED or not len(steps):
         return
     seconds = duration * 1e-9
@@ -143,7 +147,7 @@ def _form(table: CsvTable) -> tuple[str, ...]:
 
 
 def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:
-    """How long the first row's interval lasts; as long as the second's where nothing says so."""
+    """The length of the first row's interval; the second's where no column gives it."""
     if rows.table.has("duration_s") and len(rows.table):
         return rows.table.rows([True]).stamps("duration_s")
     rows.notes.append("the first increment is taken to last as long as the second")

@@ -1,6 +1,6 @@
 """The tables of one robot in a data set's folder → its measurements in order of time.
 
-What is not handed out is dropped, and a note counts it with its reason and first line.
+Rows that are not used are dropped, and a note counts them with the reason and the first line.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ NOT_A_COVARIANCE = (
 EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
 EARLY_NS = 2_000_000_000
-"""What is seen may come so long before the odometry: the robot stood."""
+"""Longest time by which measurements may precede the odometry, while the robot stands."""
 MOST_RAD = 2.0 * np.pi + 1e-3
-"""The largest bearing, whichever way round: beyond are no radians."""
+"""The largest absolute bearing; larger values are not in radians."""
 
 
 class Rows:
@@ -61,7 +61,7 @@ class Rows:
         self.stamps_ns = self.stamps_ns[~dropped]
 
     def take_out(self, chosen: Bool[np.ndarray, " rows"]) -> Int64[np.ndarray, " chosen"]:
-        """The times of these rows, which are no fault and go elsewhere."""
+        """Remove these rows without a note; returns their times."""
         stamps: Int64[np.ndarray, " chosen"] = self.stamps_ns[chosen]
         if chosen.any():
             self.table = self.table.rows((~chosen).tolist())
@@ -69,12 +69,12 @@ class Rows:
         return stamps
 
     def equal(self, column: str, names: Sequence[str]) -> Bool[np.ndarray, " rows"]:
-        """Where a column has one of these names."""
+        """Whether each row has one of these names in a column."""
         among = set(names)
         return np.array([cell in among for cell in self.table.columns[column]], dtype=np.bool_)
 
     def note(self, chosen: Bool[np.ndarray, " rows"], what: str) -> None:
-        """A word about these rows, which stay."""
+        """Note a remark about these rows, which stay."""
         if chosen.any():
             first = int(np.flatnonzero(chosen)[0])
             self._note(int(np.count_nonzero(chosen)), what, self.table, first)
@@ -86,7 +86,7 @@ class Rows:
 
 
 def matrices(packed: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 3 3"]:
-    """Of (xx, xy, yy, xt, yt, tt)."""
+    """Symmetric matrices from packed rows (xx, xy, yy, xt, yt, tt)."""
     return packed[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
 
 
@@ -102,7 +102,7 @@ class Scans:
     covariances: Float[np.ndarray, "R 3"] | None = None
 
     def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
-        """The chosen ones."""
+        """The chosen rows."""
         return Scans(
             self.stamps_ns[chosen],
             self.ids[chosen],
@@ -126,10 +126,9 @@ def measurements_of(
     driven: tuple[int, int] | None,
 ) -> tuple[Scans, Int64[np.ndarray, " E"], list[str]]:
     """Measurements of landmarks, or of teammates as indices into the team's names (team: the robot
-    itself, and all of them); and when the robot looked and saw nothing, which a row says that has a
-    time alone.
+    itself, and all of them); and the times of rows without a measurement, where nothing was seen.
 
-    driven: when its odometry begins and ends; None: it has none. Raises DatasetError.
+    driven: the begin and end of its odometry; None: it has none. Raises DatasetError.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -171,7 +170,7 @@ def measurements_of(
 
 
 def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
-    """Raises DatasetError where none of the rows lies in the time of the odometry."""
+    """Check that a row lies in the time of the odometry; raises DatasetError."""
     first_ns, last_ns = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
     begin_ns, end_ns = driven
     if first_ns > end_ns or last_ns < begin_ns - EARLY_NS:
@@ -191,7 +190,7 @@ def _cells(table: CsvTable) -> list[tuple[str, ...]]:
 
 
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
-    """Ranges and bearings or points, with what the detector claims of them if it may."""
+    """Ranges and bearings or points, with the detector's covariances if they are allowed."""
     table, stamps = rows.table, rows.stamps_ns
     if table.has(*POLAR) and table.has(*POINTS):
         raise table.fault(
@@ -270,7 +269,9 @@ def start_of(table: CsvTable) -> StartPose | None:
 
 
 def pose_covariances(table: CsvTable) -> Float[np.ndarray, "N 3 3"]:
-    """Of a table that has one of their columns, which must have all; raises DatasetError."""
+    """The covariances of a table with all of their columns; raises DatasetError where some are
+    missing.
+    """
     missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
     if missing:
         raise table.fault(

@@ -66,8 +66,8 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
 
 
 def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
-    """Columns and rows, by the odometry's own clock: a row where each interval begins and one that
-    ends the last; of increments one where each ends.
+    """Columns and rows, by the odometry's own clock: a row at the beginning of each interval and
+    one at the end of the last; of increments one at the end of each.
     """
     intervals = stream.intervals
     ends_ns = intervals.end_ns - stream.clock_offset_ns
@@ -91,7 +91,7 @@ def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
 def _measured(
     seen: Detections, name: str, names: Sequence[object]
 ) -> tuple[Sequence[str], Iterable[Row]]:
-    """Columns and rows, message by message; one that is empty as a time alone."""
+    """Columns and rows, message by message; an empty message is a time alone."""
     columns = ["t_s", name, *(POLAR if seen.points is None else POINTS)]
     numbers = np.column_stack((seen.ranges, seen.bearings)) if seen.points is None else seen.points
     if seen.covariances is not None:
@@ -122,6 +122,6 @@ def seconds(stamp_ns: int) -> str:
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
-    """One table."""
+    """Write one table."""
     lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

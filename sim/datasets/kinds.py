@@ -1,4 +1,4 @@
-"""Which kind of data set lies at a path."""
+"""Decides which kind of data set lies at a path."""
 
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,9 @@ UTIAS_MARKER = "Barcodes.dat"
 
 
 def kind_of(path: str | Path) -> Kind:
-    """UTIAS files, CSV tables by robot or of detections; raises DatasetError for what is none."""
+    """UTIAS files, CSV tables by robot or of detections; raises DatasetError where there is
+    none.
+    """
     if unlabelled.is_unlabelled(path):
         return "unlabelled"
     if folder_files.has_tables(path):

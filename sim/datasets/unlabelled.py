@@ -109,7 +109,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
 def _of_car(
     odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
 ) -> tuple[Intervals, Detections]:
-    """A row of odometry holds until the next one; before the first, its own."""
+    """A row of odometry holds until the next one; the first also before its own time."""
     stamps, seen_ns = odometry.stamps("t_s"), detections.stamps("t_s")
     first = min(int(seen_ns.min(initial=stamps[0])), int(stamps[0]))
     values = odometry.numbers(*CAR[1:])
@@ -152,7 +152,9 @@ def _of_steps(
 def _in_the_end(
     increments: Float[np.ndarray, "I 3"], covariances: Float[np.ndarray, "I 3 3"]
 ) -> Float[np.ndarray, "I 3 3"]:
-    """Of (x, y, theta) in the frame of the pose before, as of (forward, left, turn) of the end."""
+    """Covariances of (x, y, theta) in the frame of the pose before, converted to (forward, left,
+    turn) at the end.
+    """
     c, s = np.cos(increments[:, 2]), np.sin(increments[:, 2])
     turned = np.zeros((len(increments), 3, 3))
     turned[:, 0, 0], turned[:, 0, 1], turned[:, 1, 0], turned[:, 1, 1] = c, s, -s, c
@@ -216,7 +218,9 @@ def _labels(root: Path, rows: int) -> UInt32[np.ndarray, " R"]:
 
 
 def _named(seen: Detections) -> Detections:
-    """The labels as identities, for a run to compare with; what has none is left out."""
+    """Scans with the labels as identities, for comparison; detections without a label are
+    left out.
+    """
     message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
     chosen = seen.ids != NO_LABEL
     _, first = np.unique(np.column_stack((message, seen.ids)), axis=0, return_index=True)

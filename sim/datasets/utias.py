@@ -31,9 +31,9 @@ def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     """The measurements of the robots r1, r2, … (the number is the data set's); raises DatasetError.
 
     Odometry row k acts from its time until the next row's, both odometry_delay_s and the robot's
-    clock_offset_s later; the latter the robot puts right by itself. Stamps are
-    the data set's, in nanoseconds since 1970. A robot's start pose is its ground truth at its first
-    measurement, with the world's start sigmas.
+    clock_offset_s later; the robot corrects the latter itself. Stamps are the data set's, in
+    nanoseconds since 1970. A robot's initial pose is its ground truth at its first measurement,
+    with the world's start sigmas.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
@@ -134,7 +134,7 @@ def _start(world: UtiasWorld, log: Log) -> StartPose | None:
 
 
 def _truth_notes(log: Log) -> list[str]:
-    """What can not be known for want of ground truth in time."""
+    """Notes on figures that can not be computed, for want of ground truth in time."""
     notes = []
     if start_pose(log.truth_ns, log.truth, log.start_ns) is None:
         notes.append("no ground truth at its first measurement: its start pose is not known")

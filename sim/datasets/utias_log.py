@@ -18,9 +18,7 @@ MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
 
 @dataclass(frozen=True)
 class Log:
-    """Odometry, measurements by subject and truth; start_ns: where the first of the measurements
-    begins.
-    """
+    """Odometry, measurements by subject and truth; start_ns: the begin of the first measurement."""
 
     robot: str
     subject: int

@@ -1,5 +1,5 @@
-"""Rows of UTIAS tables → measurements in order of time, with a note for all that is not handed
-out.
+"""Rows of UTIAS tables → measurements in order of time, with a note for each kind of row that is
+dropped.
 """
 
 from collections.abc import Mapping
@@ -11,13 +11,17 @@ from jaxtyping import Bool, Float, Int64, UInt32
 from sim.world.streams import Intervals
 
 LONG_GAP_NS = 2_000_000_000
-"""A gap in the odometry or the truth that is worth a note."""
+"""Least gap in the odometry or the truth that is noted."""
 
 START_WINDOW_NS = 200_000_000
-"""The start pose comes from the ground truth within this time of the robot's first measurement …"""
+"""The initial pose is computed from the ground truth within this time of the robot's first
+measurement.
+"""
 
 START_SPREAD_RAD = 0.2
-"""… whose headings are within this of each other (the base turns at most 0.58 rad/s)."""
+"""Largest difference [rad] between headings of that ground truth (the base turns at most 0.58
+rad/s).
+"""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Measurements:
     bearings: Float[np.ndarray, " R"]
 
     def where(self, chosen: Bool[np.ndarray, " R"]) -> "Measurements":
-        """The chosen ones."""
+        """The chosen rows."""
         return Measurements(
             self.stamps_ns[chosen],
             self.subjects[chosen],
@@ -150,7 +154,7 @@ def first_of_each(
     subjects: UInt32[np.ndarray, " R"],
     usable: Bool[np.ndarray, " R"],
 ) -> Bool[np.ndarray, " R"]:
-    """Of the kept measurements, the first of each (stamp, subject)."""
+    """Among the usable measurements, the first of each (stamp, subject)."""
     rows = np.flatnonzero(usable)
     order = rows[np.lexsort((subjects[rows], stamps_ns[rows]))]
     again = (np.diff(stamps_ns[order]) == 0) & (np.diff(subjects[order].astype(np.int64)) == 0)
@@ -160,7 +164,7 @@ def first_of_each(
 
 
 def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-    """The angles in (−π, π]; those that are there already keep their bits."""
+    """The angles in (−π, π]; those that are in it already keep their bits."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     turned = np.where(turned == -np.pi, np.pi, turned)
     return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)

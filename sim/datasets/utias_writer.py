@@ -11,7 +11,7 @@ from sim.world.streams import RobotStream, WorldStreams
 Row = tuple[str | float, ...]
 
 FIRST_BARCODE = 100
-"""Subject k carries the barcode 100 + k, so that one can not be taken for the other."""
+"""Subject k has the barcode 100 + k, so that barcodes and subjects can not be confused."""
 
 
 def write_utias(streams: WorldStreams, directory: Path | str) -> None:
@@ -44,7 +44,7 @@ def write_utias(streams: WorldStreams, directory: Path | str) -> None:
 
 
 def landmark_shift(streams: WorldStreams) -> int:
-    """What `write_utias` adds to the landmarks' ids."""
+    """The number that `write_utias` adds to the landmarks' ids."""
     last_robot = max(ROBOTS, len(streams.streams))
     seen = [stream.landmark_detections.ids for stream in streams.streams]
     ids = np.concatenate([streams.landmark_ids, *seen])

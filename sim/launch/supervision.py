@@ -8,9 +8,9 @@ or centre there is no map: then the run ends. Peers need no centre.
 import time
 from collections.abc import Callable, Sequence
 
+from central.desk.orders import ordered
 from sim.launch.supervisor import Ended, Supervised
 from sim.launch.watch import Watch
-from sim.launch.withdraw import ordered
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Outgoing
@@ -85,7 +85,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     if status is None:
         return
     if status > 0 and not is_final and not service.has_ended_for(END_HEARD_S):
-        return  # it may know of a provisional end that is not heard of yet
+        return  # it may know of a provisional end that has not arrived here yet
     failed_at_the_end = is_final and status > 0
     if (status == 0 and service.name != "router") or failed_at_the_end:
         service.over = True

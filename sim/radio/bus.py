@@ -75,13 +75,13 @@ class RadioBus:
             self._tap(None)
 
     def request(self, channel: ch.Channel, name: str, request: m.Message) -> None:
-        """Ask; nobody hears a question that is out of reach."""
+        """Request something; a request to a robot out of reach is dropped."""
         robot = ch.robot_of(name)
         if channel is not ch.MEMBERS or robot is None or self._reaches(robot, self._now_ns):
             self._bus.request(channel, name, request)
 
     def answer(self, channel: ch.Channel, name: str, answer: Answer) -> None:
-        """Answer; a question from out of reach has not been heard."""
+        """Answer requests; one from a robot out of reach gets nothing."""
 
         def answer_in_reach(request: bytes) -> Iterable[bytes]:
             if channel is ch.MEMBERS:

@@ -1,6 +1,4 @@
-"""The same measurements under other conditions: the recorded team's nodes, in memory, with
-changes.
-"""
+"""Runs the recorded team's nodes again in memory, on the same measurements with changes."""
 
 import msgspec
 
@@ -18,7 +16,7 @@ from team.wire.bus import Sample
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
-    """The samples of the changed run, as a recorder would have taken them.
+    """The samples of the changed run, as a recorder would record them.
 
     Raises ScenarioError for a change that has no meaning, RerunError for a log that lacks
     measurements.

@@ -1,4 +1,4 @@
-"""What is to be different when a log is computed again."""
+"""The changes of a run that is computed again."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """What is to be different; the measurements are the log's whatever is asked.
+    """The changes; the measurements are the log's in any case.
 
-    without: robots that were not there. seed: of the estimators and of the losses. loss, delay_s:
-    of submaps on their way to the centre. no_centre: when there is none. partitions: robots that
-    the centre can not reach, and when. unsafe_feedback: see `unsafe_robot`. noise: factors on the
-    standard deviations that the robots assume, by kind (`sim.recorded.noise`).
+    without: robots that are left out. seed: of the estimators and of the losses. loss, delay_s: of
+    submaps on their way to the centre. no_centre: the times without a centre. partitions: robots
+    that the centre can not reach, and when. unsafe_feedback: see `unsafe_robot`. noise: factors on
+    the standard deviations that the robots assume, by kind (`sim.recorded.noise`).
     """
 
     without: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Robots that take their odometry or their sensor for worse or better than the log's did."""
+"""Robots that assume more or less noise of their odometry or sensor than the log's did."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -15,7 +15,7 @@ KINDS: Mapping[str, str] = MappingProxyType(
         "bearing": "the bearing's standard deviation",
     }
 )
-"""What a noise may be of, and what is multiplied."""
+"""The kinds of noise, and the parameters that are multiplied."""
 
 
 def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
@@ -32,7 +32,9 @@ def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
 
 
 def _motion(motion: MotionModel, factor: float) -> MotionModel:
-    """The α are variances, all else is a standard deviation."""
+    """The motion model with its noise multiplied: the α are variances, all else is a standard
+    deviation.
+    """
 
     def scaled(noise: MotionNoise) -> MotionNoise:
         return MotionNoise(noise.per_s * factor, noise.per_m * factor, noise.per_rad * factor)

@@ -27,9 +27,9 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
 
 
 def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
-    """The measurements of a log with its scenario: its world's, or as the recorder was told it.
+    """The measurements of a log with its scenario: its world's, or the recorder's.
 
-    Of each robot the first incarnation is taken. Raises LogError, ScenarioError.
+    Of each robot the first incarnation is used. Raises LogError, ScenarioError.
     """
     log = open_log(path)
     messages = [opened(sample)[2] for sample in log.samples(CHANNELS)]
@@ -46,9 +46,9 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
 def recorded_streams(
     messages: Sequence[m.Message], source: str, clocks: Mapping[str, float] | None = None
 ) -> WorldStreams:
-    """The streams that these messages make, whatever else is among them.
+    """The streams of the measurements among these messages.
 
-    clocks: the offset of each robot's odometry [s] that is to be put right; absent: none.
+    clocks: the offset of each robot's odometry clock [s] that is corrected; absent: none.
     """
     offsets = {} if clocks is None else clocks
     measurements: dict[str, dict[int, m.Measurement]] = {}

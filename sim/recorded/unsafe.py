@@ -1,4 +1,4 @@
-"""What happens without law 1: a robot that sends what it took from the team's map as its own."""
+"""Demonstrates a violation of law 1: a robot that sends the team's map as its own information."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,11 +17,11 @@ from team.wire.arrays import check_packed_covariance
 
 
 def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
-    """A robot whose submaps begin with the team's map instead of with nothing.
+    """A robot whose submaps begin with the team's map instead of with zero information.
 
-    The map holds the robot's earlier measurements, and everyone's; each submap sends them again, so
-    they are counted again with every exchange. The mean hardly moves; the covariance loses its
-    meaning. Kept for demonstration: no scenario can choose it.
+    The map contains the robot's earlier measurements, and everyone's; each submap sends them again,
+    so they are counted again with every exchange. The mean hardly moves; the covariance loses its
+    meaning. For demonstration only: no scenario can choose it.
     """
     return RobotNode(config, exchange, replaced=_with_the_map)
 
@@ -37,7 +37,7 @@ def _with_the_map(
 
 
 def _fed(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
-    """As `with_prior`; the window alone once the covariance has been counted down to nothing."""
+    """As `with_prior`; the window alone once the covariance has become singular."""
     try:
         fed = with_prior(prior, pending, local)
         check_packed_covariance(translate.joint_bytes(fed.covariance), len(fed.mean), "covariance")

@@ -1,4 +1,4 @@
-"""The world of a log: its measurements and its truth once more, second by second of team time."""
+"""A world from a log: its measurements and its truth again, second by second of team time."""
 
 from collections import deque
 from collections.abc import Collection, Iterable
@@ -14,24 +14,24 @@ from team.wire.codec import WireError
 from team.wire.digest import configured
 
 STEP_NS = 1_000_000_000
-"""Team time between two looks at what became of the messages."""
+"""Team time between two looks at the nodes' answers."""
 _TRUTH = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
 _SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.END)
 
 
 @runtime_checkable
 class Samples(Protocol):
-    """Whatever says what a run said: a log, or a run in memory."""
+    """A source of a run's samples: a log, or a run in memory."""
 
     def samples(self, channels: Collection[ch.Channel] | None = None) -> Iterable[Sample]:
-        """What was said on these channels; on all without."""
+        """The samples of these channels; None: of all."""
 
 
 class RecordedWorld:
-    """What a log's world published, of some of its robots, in the order of team time.
+    """The messages of a log's world, for some of its robots, in the order of team time.
 
     Each robot's measurements come in the order of their counters. Raises RerunError where one is
-    not in the log, since no robot could go on behind it.
+    not in the log, since no robot could continue after it.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
@@ -82,7 +82,9 @@ class RecordedWorld:
         return loads(self._configured.configuration)
 
     def announce(self, scenario: Scenario) -> None:
-        """The scenario that `begin` will name; raises RerunError if it needs a map there is not."""
+        """Set the scenario for `begin`; raises RerunError if it needs a map that is not in
+        the log.
+        """
         if scenario.estimator in NEEDS_MAP:
             truth = [o.message for o in self._outgoing if isinstance(o.message, m.TruthLandmarks)]
             if not truth:
@@ -97,7 +99,9 @@ class RecordedWorld:
         self._outgoing.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
 
     def begin(self) -> list[Outgoing]:
-        """The scenario, the true landmarks for the evaluator, and the map if robots are told it."""
+        """The first messages: the scenario, the true landmarks for the evaluator, and the known map
+        if robots only localise themselves.
+        """
         return self._outgoing
 
     def publish(self, clock_s: float) -> list[Outgoing]:
@@ -120,7 +124,7 @@ class RecordedWorld:
         return out or self.publish(clock_s)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """A log listens to nobody."""
+        """Ignore a message: the measurements of a log do not depend on it."""
         return []
 
 

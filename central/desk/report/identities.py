@@ -41,7 +41,7 @@ def score_note(found: AssociationResult) -> str:
         f"{found.landmarks} landmarks without names, {found.duplicates} of them duplicates, "
         f"{found.duplicates_confirmed} among those of two submaps or more; pairs of robots that "
         f"share landmarks: {found.merges_right} rightly, {found.merges_wrong} wrongly; "
-        f"{found.merges_refused} attempts wait. Scored by labels that no node hears."
+        f"{found.merges_refused} attempts wait. Scored by labels that no node receives."
     )
 
 

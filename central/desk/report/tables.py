@@ -61,11 +61,11 @@ def _peers(evaluation: Evaluation) -> Table:
     return table
 
 
-PEER_HEADINGS = ("robot", "final map", "set", "at [s]", "said [B]", "heard [B]", "star", "over")
+PEER_HEADINGS = ("robot", "final map", "set", "at [s]", "sent [B]", "received [B]", "star", "over")
 PEER_NOTE = (
-    "set: submaps of all robots; at: wall time of the final map; said, heard: bytes of the set's "
-    "talk; star: those of its own submaps, as a centre would get them; over: members that came by "
-    "each teammate, its own and those that it carried"
+    "set: submaps of all robots; at: wall time of the final map; sent, received: bytes of "
+    "the set's channels; star: those of its own submaps, as a centre would get them; over: members "
+    "that came from each teammate, its own and those that it forwarded"
 )
 
 

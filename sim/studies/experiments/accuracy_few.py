@@ -41,7 +41,7 @@ SHOWN: Shown = (
     ("silent", "silent", "{:.0f}"),
     ("excluded", "excluded", "{:.0f}"),
     ("beyond", "beyond", "{:.0f}"),
-    ("beyond_silent", "untold", "{:.0f}"),
+    ("beyond_silent", "unwarned", "{:.0f}"),
     ("alarms", "alarms", "{:.0f}"),
 )
 
@@ -64,9 +64,9 @@ def outcome(options: Options, results: Results) -> Outcome:
         tuple((name, *cells_of(of_case, SHOWN)) for name, of_case in figures.items()),
         "warned: maps with a warning; wrong: in another minimum than the truth; silent: wrong, and "
         "without a warning; excluded: the submaps exclude the truth (1 in 1000 by chance); beyond: "
-        "the truth is outside the map's own 99.9 % ellipsoid, untold: and no warning; alarms: maps "
-        "that are none of these, with a warning of more than a weakly placed robot or a nonlinear "
-        "covariance",
+        "the truth is outside the map's own 99.9 % ellipsoid, unwarned: and no warning; alarms: "
+        "maps that are none of these, with a warning of more than a weakly placed robot or a "
+        "nonlinear covariance",
     )
     goals = [
         Goal(

@@ -7,11 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from central.config import CentralConfig
+from central.desk import orders
+from central.desk.orders import WithdrawError, give_up, withdraw
+from central.desk.verdicts import judge, local_landmark
 from central.node import CentralNode
 from sim.cli.main import app
-from sim.launch import withdraw as orders
-from sim.launch.verdict import judge, local_landmark
-from sim.launch.withdraw import WithdrawError, give_up, withdraw
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
@@ -83,7 +83,7 @@ def test_an_order_that_is_not_followed_says_why(
 
 
 def test_a_robot_that_nobody_knows_can_not_be_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(WithdrawError, match=r"no robot r9; heard of: r3"):
+    with pytest.raises(WithdrawError, match=r"no robot r9; its robots: r3"):
         ordered(monkeypatch, robot="r9")
 
 
@@ -121,7 +121,7 @@ def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(
     try:
         give_up(MemoryBus(network), "r3", "it fell into the water", 30.0)
         monkeypatch.setattr(orders, "CENTRE_S", 0.2)
-        with pytest.raises(WithdrawError, match="the team has no robot r9; heard of: r3"):
+        with pytest.raises(WithdrawError, match="the team has no robot r9; its robots: r3"):
             give_up(MemoryBus(network), "r9", "", 1.0)
     finally:
         over.set()

@@ -138,7 +138,7 @@ def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
         raise WithdrawError(NO_CENTRE)
     robots.discard(_PEER)
     known = ", ".join(sorted(robots)) or "none"
-    raise WithdrawError(f"the team has no robot {robot}; heard of: {known}")
+    raise WithdrawError(f"the team has no robot {robot}; its robots: {known}")
 
 
 def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:

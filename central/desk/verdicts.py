@@ -3,7 +3,7 @@
 import re
 import time
 
-from sim.launch.withdraw import LOOK_S, PEERS, WithdrawError, await_fold, ordered
+from central.desk.orders import LOOK_S, PEERS, WithdrawError, await_fold, ordered
 from team.keys.roster import ROBOT
 from team.peers.proofs import Signs
 from team.wire import channels as ch
