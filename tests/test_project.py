@@ -18,6 +18,8 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from tests import sizes
+
 ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests"
 PACKAGES = ("team", "central", "sim")
@@ -348,3 +350,10 @@ def test_linear_algebra_has_one_thread() -> None:
     np.linalg.inv(np.eye(64))  # the library is loaded and has made its threads
     pools = threadpoolctl.threadpool_info()
     assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} == {1}
+
+
+def test_each_long_module_and_function_has_its_reason() -> None:
+    assert [name for name, _, reason in sizes.rows() if not reason] == []
+    source = "def long():\n" + "    pass\n" * sizes.LONG_FUNCTION
+    assert list(sizes.long_functions(source)) == [("long", sizes.LONG_FUNCTION + 1)]
+    assert sizes.reason("central/node.py") == ""

@@ -48,7 +48,8 @@ VAGUE = {
     "parted": "separated",
     "elsewhere": "name the place",
 }
-"""Participles that do not name a thing, and what is said instead; for identifiers of `team`."""
+"""Participles that do not name a thing, and what is used instead; for identifiers of PRODUCT."""
+PRODUCT = ("team/", "central/", "sim/")
 ON_THE_WIRE = ("team/wire/messages/", "team/wire/channels.py")
 """Where fields and keys are named as logs have them."""
 DRIVERS = ("team/driver/", "team/ros2/", "team/ros2_driver.py")
@@ -119,11 +120,11 @@ def test_no_name_has_a_word_that_the_field_has_a_better_one_for():
     assert found == []
 
 
-def test_an_identifier_of_team_names_a_thing_and_no_vague_participle():
+def test_an_identifier_names_a_thing_and_no_vague_participle():
     found = [
         f"{name}:{line}: {each}: {VAGUE[word]}"
         for name, tree in sources()
-        if name.startswith("team/") and not name.startswith((*ON_THE_WIRE, *DRIVERS))
+        if name.startswith(PRODUCT) and not name.startswith((*ON_THE_WIRE, *DRIVERS))
         for line, each in names_of(tree)
         for word in sorted(parts_of(each) & VAGUE.keys())
     ]

@@ -21,7 +21,7 @@ STARTING_S = 60.0
 """A starting process without any message for this long [s] is named: a busy machine is slow."""
 MEASURE_S = 2.0
 """Time [s] between two measurements of the processes' memory; the last is at the final map."""
-END_HEARD_S = 1.0
+END_DELAY_S = 1.0
 """Time [s] after a process's end within which the final map may still arrive here."""
 LEAVING_S = 60.0
 """A process that still runs this long [s] after the final map is ended, and named."""
@@ -84,7 +84,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     status = service.child.exit
     if status is None:
         return
-    if status > 0 and not is_final and not service.has_ended_for(END_HEARD_S):
+    if status > 0 and not is_final and not service.has_ended_for(END_DELAY_S):
         return  # it may know of a provisional end that has not arrived here yet
     failed_at_the_end = is_final and status > 0
     if (status == 0 and service.name != "router") or failed_at_the_end:
