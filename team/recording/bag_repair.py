@@ -35,11 +35,11 @@ def bag_repaired(path: Path, out: Path) -> BagReport:
     try:
         with path.open("rb") as source, out.open("wb") as target:
             writer = Writer(target)
-            begun = False
+            has_started = False
             for record in _records(StreamReader(source, emit_chunks=True), damaged):
                 if isinstance(record, Header):
                     writer.start(profile=record.profile)
-                    begun = True
+                    has_started = True
                 elif isinstance(record, Schema) and record.id not in schemas:
                     schemas[record.id] = writer.register_schema(
                         record.name, record.encoding, record.data
@@ -60,7 +60,7 @@ def bag_repaired(path: Path, out: Path) -> BagReport:
                         record.publish_time,
                         record.sequence,
                     )
-            if begun:
+            if has_started:
                 writer.finish()  # type: ignore[no-untyped-call]  # mcap has no type here
     finally:
         if not messages:
