@@ -60,13 +60,15 @@ class Link:
         self._moved = threading.Condition()
         self._trouble: Exception | None = None
         self._failure: Exception | None = None
+        self._unheard = False
         self._attempt_s = ATTEMPT_S
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
 
     def open(self, patience_s: float) -> None:
         """Start the thread; returns once the router is reached and raises the reason if it is
-        not.
+        not; without patience returns at once, and the first reason is logged.
         """
+        self._unheard = not patience_s
         self._attempt_s = patience_s or ATTEMPT_S
         self._thread.start()
         until = time.monotonic() + patience_s + SECOND_PATIENCE_S
@@ -118,8 +120,9 @@ class Link:
                 self._connected()
                 self._trouble = None
             except (BusError, KeysError) as error:
-                if self._up.is_set():
+                if self._up.is_set() or self._unheard:
                     _LOG.warning("%s", error)
+                self._unheard = False
                 self._trouble = error
                 self._leaving.wait(AGAIN_S)
             except Exception as error:  # whoever hands over the next measurement is told

@@ -346,7 +346,7 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
         with driver._lock:
             driver._journal.mark("ended")
         wait_until(complete)
-        assert driver.end(patience_s=5.0)
+        assert driver.end(patience_s=60.0)  # as long as a busy machine takes
         assert {n for _, n in robot.got} == set(range(1 + 39 + 14))
         with pytest.raises(DriverError, match="is closed"):
             driver.odometry(9.0, 0.0, 0.0)
@@ -354,7 +354,7 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
 
 
 def test_a_router_that_is_not_there_is_named_and_a_driver_that_goes_on_does_not_wait_for_it(
-    tmp_path,
+    tmp_path, caplog
 ):
     options = {"team": "lab", "connect": "tcp/127.0.0.1:1", "file": tmp_path / "a"}
     with pytest.raises(DriverError, match=r"no router answers at tcp/127\.0\.0\.1:1"):
@@ -364,6 +364,7 @@ def test_a_router_that_is_not_there_is_named_and_a_driver_that_goes_on_does_not_
     first.close()
     again = Driver("r1", **options)  # killed and started again where there is no network
     again.odometry(1.1, 0.5, 0.0)
+    wait_until(lambda: caplog.text.count("no router answers at tcp/127.0.0.1:1") == 2)
     again.close()
     assert again.last_time == 1.1
 
