@@ -12,7 +12,7 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import Sensor
 from team.estimation.compiled import compiled
-from team.estimation.gaussian import cholesky_factor, whitened
+from team.estimation.gaussian import EPSILON, cholesky_factor, whitened
 from team.estimation.geometry import compose, tangent, wrapped
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of
@@ -141,9 +141,35 @@ def joint_innovation(
 
 
 def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Innovation:
-    L = cholesky_factor(S, "the prediction of measurements")
-    white = whitened(L, error)
-    return Innovation(float(white @ white), len(error))
+    squared = _normalised_square(error, S)
+    if not math.isfinite(squared):  # rank and finiteness are judged there
+        white = whitened(cholesky_factor(S, "the prediction of measurements"), error)
+        squared = float(white @ white)
+    return Innovation(squared, len(error))
+
+
+@compiled
+def _normalised_square(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> float:
+    """νᵀ S⁻¹ ν by the Cholesky factor of S; NaN where a pivot is not above rounding."""
+    m = len(error)
+    L, white = np.empty((m, m)), np.empty(m)
+    total = 0.0
+    for j in range(m):
+        for k in range(j):
+            rest = S[j, k]
+            for i in range(k):
+                rest -= L[j, i] * L[k, i]
+            L[j, k] = rest / L[k, k]
+        pivot, rest = S[j, j], error[j]
+        for i in range(j):
+            pivot -= L[j, i] * L[j, i]
+            rest -= L[j, i] * white[i]
+        if not pivot > m * EPSILON * S[j, j]:
+            return math.nan
+        L[j, j] = math.sqrt(pivot)
+        white[j] = rest / L[j, j]
+        total += white[j] * white[j]
+    return total
 
 
 @compiled
@@ -171,10 +197,9 @@ def _predictive(
     for i in range(count):
         root = math.sqrt(weights[i])
         _predict(
-            compose(poses[i], motion), means[i], L, slots, measurements, errors[:, i],
+            poses[i], motion, root, means[i], L, slots, measurements, errors[:, i],
             A[:, 4 * i : 4 * i + 3], of_landmark[:, :, i],
         )  # fmt: skip
-        A[:, 4 * i : 4 * i + 3] *= root
         for k in range(len(slots)):
             r, b = 2 * k, 2 * k + 1
             distance = measurements[k, 0] - errors[r, i]
@@ -192,9 +217,7 @@ def _predictive(
         A[j, 3::4] = np.sqrt(weights) * errors[j]
     for j in range(m):
         for k in range(j + 1):
-            total = 0.0
-            for column in range(4 * count):
-                total += A[j, column] * A[k, column]
+            total = _inner(A[j], A[k])
             if slots[j // 2] == slots[k // 2]:
                 for i in range(count):
                     xx, xy, yy = covariances[i, slots[j // 2]]
@@ -207,8 +230,23 @@ def _predictive(
 
 
 @compiled
+def _inner(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> float:
+    """Σ aᵢ bᵢ of a multiple of four terms, in four sums that do not wait for each other."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for i in range(0, len(a), 4):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+    total: float = (s0 + s1) + (s2 + s3)
+    return total
+
+
+@compiled
 def _predict(
-    pose: Float[np.ndarray, "3"],
+    start: Float[np.ndarray, "3"],
+    motion: Float[np.ndarray, "3"],
+    root: float,
     means: Float[np.ndarray, "L 2"],
     L: Float[np.ndarray, "3 3"],
     slots: Int64[np.ndarray, " n"],
@@ -217,20 +255,29 @@ def _predict(
     of_motion: Float[np.ndarray, "m 3"],
     of_landmark: Float[np.ndarray, "m 2"],
 ) -> None:
-    """One particle's z − ẑ and the Jacobians Hₓ L and Hₗ of ẑ, all in place."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    """One particle's z − ẑ at start ∘ motion, and the Jacobians Hₓ L √w and Hₗ of ẑ, all in place.
+
+    root: √w of the particle's weight.
+    """
+    c, s = math.cos(start[2]), math.sin(start[2])
+    x = start[0] + c * motion[0] - s * motion[1]
+    y = start[1] + s * motion[0] + c * motion[1]
+    heading = start[2] + motion[2]
+    c, s = math.cos(heading), math.sin(heading)
+    l00, l10, l11 = root * L[0, 0], root * L[1, 0], root * L[1, 1]
+    l20, l21, l22 = root * L[2, 0], root * L[2, 1], root * L[2, 2]
     for k in range(len(slots)):
         r, b = 2 * k, 2 * k + 1
-        distance, ex, ey = seen((pose[0], pose[1], pose[2]), means[slots[k]])
+        distance, ex, ey = seen((x, y, heading), means[slots[k]])
         u, v = c * ex + s * ey, c * ey - s * ex
         errors[r] = measurements[k, 0] - distance
         errors[b] = wrapped(measurements[k, 1] - math.atan2(v, u))
-        of_motion[r, 0] = -u * L[0, 0] - v * L[1, 0]
-        of_motion[r, 1] = -v * L[1, 1]
+        of_motion[r, 0] = -u * l00 - v * l10
+        of_motion[r, 1] = -v * l11
         of_motion[r, 2] = 0.0
-        of_motion[b, 0] = (v * L[0, 0] - u * L[1, 0]) / distance - L[2, 0]
-        of_motion[b, 1] = -u * L[1, 1] / distance - L[2, 1]
-        of_motion[b, 2] = -L[2, 2]
+        of_motion[b, 0] = (v * l00 - u * l10) / distance - l20
+        of_motion[b, 1] = -u * l11 / distance - l21
+        of_motion[b, 2] = -l22
         of_landmark[r, 0], of_landmark[r, 1] = ex, ey
         of_landmark[b, 0], of_landmark[b, 1] = -ey / distance, ex / distance
 
@@ -242,9 +289,11 @@ def _centred(
     """The weighted mean, of angles on the circle; the values become deviations from it."""
     mean, sine, cosine = 0.0, 0.0, 0.0
     for i in range(len(values)):
-        mean += weights[i] * values[i]
-        sine += weights[i] * math.sin(values[i])
-        cosine += weights[i] * math.cos(values[i])
+        if is_angle:
+            sine += weights[i] * math.sin(values[i])
+            cosine += weights[i] * math.cos(values[i])
+        else:
+            mean += weights[i] * values[i]
     if is_angle:
         mean = math.atan2(sine, cosine)
     for i in range(len(values)):

@@ -7,6 +7,7 @@ import pytest
 
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.consistency import chi2_interval
+from team.estimation.gaussian import NotACovarianceError
 from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
@@ -74,6 +75,16 @@ def test_it_is_the_error_in_the_metric_of_the_mixtures_prediction(count):
     found = innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
     assert found.dof == 6
     assert found.squared == pytest.approx(error @ np.linalg.solve(S, error), rel=1e-3)
+
+
+def test_a_prediction_that_is_no_covariance_is_refused():
+    of = particles(7)
+    without_number = dataclasses.replace(of, covariances=np.full_like(of.covariances, np.nan))
+    with pytest.raises(NotACovarianceError, match="not finite"):
+        innovation(without_number, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+    exact = Sensor(range_sigma=1e-12, bearing_sigma=1e-12)  # one landmark, seen twice
+    with pytest.raises(NotACovarianceError, match="not positive definite"):
+        innovation(of, INCREMENT, exact, IDS, RANGES, BEARINGS)
 
 
 def test_another_frame_gives_the_same():
