@@ -40,8 +40,10 @@ def status(
     presence = Presence()
     with connected(team, connect, keys, "operator") as bus:
         presence.take(bus, seconds)
+        others = [] if presence.members else bus.other_teams()
     if not presence.members:
-        fail(f"nobody of the team {team} is at {connect}: see --team, --connect", FAILED)
+        but = f", but of {', '.join(others)}" if others else ""
+        fail(f"nobody of the team {team} is at {connect}{but}: see --team, --connect", FAILED)
     rows = _rows(presence)
     table = Table("node", "there", "state", "measured", "per s", "taken", "clock [s]")
     for row in rows:

@@ -146,6 +146,12 @@ class Link:
             bus.watch_alive()
             shell.answer(ch.MEASUREMENTS, self._node.journal.robot, self._node.measurements)
             self._hear(shell, bus)
+            others = [] if self._node.alive else bus.other_teams()
+            if others:
+                _LOG.warning(
+                    "%s: nobody of the team %s is at %s, but of %s: is it the right team?",
+                    self._node.journal.robot, self._team, self._connect, ", ".join(others),
+                )  # fmt: skip
             shell.begin()
             self._up.set()
             self._trouble, self._attempt_s = None, ATTEMPT_S

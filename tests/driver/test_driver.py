@@ -9,7 +9,9 @@ from itertools import count
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from sim.cli.main import app
 from sim.scenarios.scenario import load
 from team import Driver, DriverError, DriverWarning, MeasurementError
 from team.wire import channels as ch
@@ -367,6 +369,21 @@ def test_a_router_that_is_not_there_is_named_and_a_driver_that_goes_on_does_not_
     wait_until(lambda: caplog.text.count("no router answers at tcp/127.0.0.1:1") == 2)
     again.close()
     assert again.last_time == 1.1
+
+
+def test_a_driver_of_a_team_that_is_not_there_names_those_that_are(tmp_path, caplog):
+    with router() as endpoint:
+        there = Driver("r1", team="lab", connect=endpoint, file=tmp_path / "a")
+        mistaken = Driver("r2", team="lap", connect=endpoint, file=tmp_path / "b")
+        said = f"r2: nobody of the team lap is at {endpoint}, but of lab: is it the right team?"
+        wait_until(lambda: said in caplog.text)
+        status = CliRunner().invoke(
+            app, ["status", "--team", "lap2", "--connect", endpoint, "--seconds", "0.5"]
+        )
+        assert f"nobody of the team lap2 is at {endpoint}, but of lab, lap:" in status.output
+        mistaken.close()
+        there.close()
+    assert "r1: nobody" not in caplog.text
 
 
 PAGE = (ROOT / "docs" / "your_robot.md").read_text()

@@ -332,6 +332,14 @@ class ZenohBus:
         replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
 
+    def other_teams(self) -> list[str]:
+        """The teams whose processes are at this router, but for the bus's own."""
+        self._check_open()
+        key = f"team/*/{ALIVE.key('**')}"
+        replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        return sorted({each.split("/")[1] for each in keys if not each.startswith(self._prefix)})
+
     def _check_open(self) -> None:
         if self._closed.is_set():
             raise BusError("the bus is closed")
