@@ -23,6 +23,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.caching import IndexDataCacheFile
 
 from team.estimation.compiled_once import compile_once
 from team.sources import sources_of
@@ -52,8 +53,23 @@ def _cache_of_its_own(dispatcher: Any) -> Path:
     cache, program = dispatcher._cache, program_of(dispatcher.py_func)
     line = f"-{dispatcher.py_func.__code__.co_firstlineno}."
     name = f"{cache._impl.filename_base.replace(line, '.', 1)}-{program}"
-    cache._cache_file = type(cache._cache_file)(cache._cache_path, name, program)
+    files: Any = _CacheFile
+    cache._cache_file = files(cache._cache_path, name, program)
     return Path(cache._cache_path) / f"{name}.lock"
+
+
+class _CacheFile(IndexDataCacheFile):
+    """The files of one kernel's cache.
+
+    They name the classes of the kernel's arguments, records included, which are no part of its
+    program: code whose classes have other names now is compiled anew, as what is not there.
+    """
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            return dict(super()._load_index())  # type: ignore[no-untyped-call] # Numba's
+        except (AttributeError, ImportError):
+            return {}
 
 
 _CALLERS: ContextVar[tuple[Callable[..., object], ...]] = ContextVar("callers", default=())

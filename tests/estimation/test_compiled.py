@@ -5,10 +5,17 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from team.estimation.compiled import CircularKernelsError, _sources, compiled, program_of
+from team.estimation.compiled import (
+    CircularKernelsError,
+    _CacheFile,
+    _sources,
+    compiled,
+    program_of,
+)
 
 INNER = """
 from team.estimation.compiled import compiled
@@ -188,3 +195,19 @@ def test_a_kernel_may_call_itself_and_a_circle_of_kernels_is_named(
     assert module.factorial(5) == 120
     with pytest.raises(CircularKernelsError, match=r"kernels\.even -> .*odd -> .*even; make them"):
         program_of(module.even.py_func)
+
+
+def test_code_that_names_a_class_that_is_gone_is_compiled_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A record of a kernel's arguments got another name: every command with an older cache
+    failed.
+    """
+    module = ModuleType("records_of_kernels")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec("class Record: pass", vars(module))
+    index = _CacheFile(str(tmp_path), "kernel", "program")
+    index._save_index({("signature", module.Record): "kernel.1.nbc"})
+    assert list(index._load_index().values()) == ["kernel.1.nbc"]
+    del module.Record
+    assert index._load_index() == {}
