@@ -31,9 +31,9 @@ def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
     of_the_team: tuple[tuple[str, Callable[[Evaluation], str]], ...] = (
         ("rule", lambda e: "–" if e.map is None else e.map.rule),
         ("landmarks in the final map", lambda e: "–" if e.map is None else f"{len(e.map.ids)}"),
-        ("landmark RMSE [m]", lambda e: _of_errors(e.map, "rmse_m", ".4f")),
-        ("… after rigid alignment [m]", lambda e: _of_errors(e.map, "aligned_rmse_m", ".4f")),
-        ("map NEES per dof", lambda e: _of_errors(e.map, "nees_per_dof", ".4g")),
+        ("landmark RMSE [m]", lambda e: _of_errors(e, "rmse_m", ".4f")),
+        ("… after rigid alignment [m]", lambda e: _of_errors(e, "aligned_rmse_m", ".4f")),
+        ("map NEES per dof", lambda e: _of_errors(e, "nees_per_dof", ".4g")),
         (
             "joint cost per dof",
             lambda e: _shown(None if e.map is None else e.map.cost_per_dof, ".4g"),
@@ -43,11 +43,14 @@ def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
     )
     rows = [(name, of(recorded), of(changed)) for name, of in of_the_team]
     for name in sorted(recorded.robots.keys() | changed.robots.keys()):
-        a, b = recorded.robots.get(name), changed.robots.get(name)
+        a, b = (
+            None if run.arbitrary_frame else run.robots.get(name) for run in (recorded, changed)
+        )
         rows.append((f"{name}: online position RMSE [m]", _online(a), _online(b)))
         rows.append((f"{name}: smoothed position RMSE [m]", _smoothed(a), _smoothed(b)))
         rows.append((f"{name}: heading RMSE, smoothed [°]", _heading(a), _heading(b)))
-        rows.append((f"{name}: uplink [bytes/step]", _uplink(a), _uplink(b)))
+        first, second = (_uplink(run.robots.get(name)) for run in (recorded, changed))
+        rows.append((f"{name}: uplink [bytes/step]", first, second))
     return rows
 
 
@@ -101,8 +104,11 @@ def _draw(axis: "Axes", fused: MapResult, colour: str, label: str, marker: str) 
     draw_ellipses(axis, fused.means, landmark_blocks(fused.covariance), colour)
 
 
-def _of_errors(fused: MapResult | None, name: str, form: str) -> str:
-    errors = None if fused is None else fused.errors
+def _of_errors(run: Evaluation, name: str, form: str) -> str:
+    """A figure of the map's errors; of a map in an arbitrary frame only the aligned ones."""
+    errors = None if run.map is None else run.map.errors
+    if run.arbitrary_frame and name != "aligned_rmse_m":
+        errors = None
     return _shown(None if errors is None else getattr(errors, name), form)
 
 

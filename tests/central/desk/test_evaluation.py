@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
 from central.desk.evaluation.evaluation import evaluate, to_json
+from central.desk.side_by_side import comparison_rows
 from sim.scenarios.scenario import Scenario
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.translate import joint_bytes
@@ -436,3 +437,12 @@ def test_what_a_driver_never_got_is_a_note() -> None:
     assert not evaluate(
         world_log(scenario()) + samples([Outgoing(ch.STATUS, "source/r1", none)])
     ).notes
+
+
+def test_a_comparison_of_maps_in_an_arbitrary_frame_has_aligned_errors_only() -> None:
+    run = evaluate(joined_log(scenario(robots=2), 0.3))
+    assert {row[0]: row[1] for row in comparison_rows(run, run)}["landmark RMSE [m]"] != "–"
+    rows = {row[0]: row[1] for row in comparison_rows(*[replace(run, arbitrary_frame=True)] * 2)}
+    assert rows["landmark RMSE [m]"] == rows["map NEES per dof"] == "–"
+    assert rows["r1: smoothed position RMSE [m]"] == "–"
+    assert rows["… after rigid alignment [m]"] != "–"
