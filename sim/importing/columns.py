@@ -68,10 +68,10 @@ FILE_NAMES: Mapping[str, Sequence[str]] = {
     "landmarks": ("landmark",),
     "start": ("start",),
 }
-"""What a file's name says of its kind."""
+"""Parts of file names by the kind of table that they indicate."""
 PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "truth", "gt", "tag",
             "marker", "landmark")  # fmt: skip
-"""Words before a column's name that say nothing more than its file: odom_x, pose.position.y."""
+"""Words before a column's name that repeat its file's kind: odom_x, pose.position.y."""
 
 
 def load_map(path: Path) -> Map:

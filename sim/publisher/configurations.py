@@ -62,8 +62,8 @@ class Configurations:
         """Whether a node of the scenario has announced another configuration, and never the right
         one.
 
-        Where it has, another process, or a stranger, speaks in its name: a warning, as whoever is
-        not in the scenario, but nobody keeps the world from beginning so.
+        Where both have arrived, another process, or a stranger, uses the node's name: that is a
+        warning, as for nodes that are not in the scenario, but the world begins.
         """
         return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 

@@ -194,10 +194,11 @@ class WorldNode:
         self.finished = self.finished or (agreed and central)
 
     def _note_too_far(self, progress: m.Progress, source: Source) -> None:
-        """Who counts further than there is has all that there is: a stranger published the rest.
+        """Treat progress beyond the published measurements as complete: a stranger published the
+        rest.
 
-        Otherwise the world would wait for ever for the credit of a robot or a recorder that took
-        what a stranger has sent.
+        Otherwise the world would wait without end for the credit of a robot or a recorder that took
+        a stranger's messages.
         """
         if progress.node == "recorder":
             stream = (progress.robot, progress.incarnation)

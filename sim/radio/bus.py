@@ -1,9 +1,11 @@
-"""A robot's bus as its radio would be: over a router, what is out of reach is dropped at the door.
+"""Simulates a robot's radio at its bus: over a router, messages from robots out of reach are
+dropped on arrival.
 
-The world, which alone knows where everyone is, says beforehand who reaches whom (`world/radio`).
-A message counts as sent at its stamp: so a run does not depend on how fast the team is driven. What
-is lost is decided by the bytes of the message and its receiver. Only what robots and their drivers
-say is carried by radio; the world, the recorder and the operator are the test bench's.
+The world, which alone knows all positions, announces in advance which robots reach each other
+(`world/radio`). A message counts as sent at its stamp, so a run does not depend on the speed of
+team time. The bytes of a message and its receiver decide whether it is lost. Only messages of
+robots and their drivers go by radio; the world, the recorder and the operator belong to the test
+bench.
 """
 
 import heapq
@@ -27,7 +29,7 @@ _RADIO = {
 
 
 class RadioBus:
-    """A bus of one robot behind a radio; everything else is its bus's own."""
+    """The bus of one robot behind a simulated radio."""
 
     def __init__(self, bus: Bus, robot: str, radio: Radio, reach: Reach | None = None) -> None:
         self._bus = bus
@@ -50,7 +52,7 @@ class RadioBus:
         return getattr(self._bus, name)
 
     def publish(self, out: Outgoing) -> int:
-        """Publish; a robot's last word says that its stream has ended."""
+        """Publish; a robot's `Done` message marks the end of its stream."""
         self._now_ns = max(self._now_ns, out.message.stamp_ns)
         self._done = self._done or out.channel is ch.ROBOT_DONE
         self._tap(self.tap)
@@ -60,14 +62,16 @@ class RadioBus:
             self._tap(None)
 
     def _tap(self, tap: Tap | None) -> None:
-        """A robot's own log has what the radio let through, not what came to its door."""
+        """Record in the robot's own log the messages that the radio delivered, not those that it
+        dropped.
+        """
         if hasattr(self._bus, "tap"):
             self._bus.tap = tap
 
     def ask(
         self, channel: ch.Channel, name: str, request: m.Message, timeout_s: float
     ) -> list[bytes]:
-        """Ask and wait: who is asked so is of the test bench, or the robot's own source."""
+        """Request and wait; such requests go to the test bench, or to the robot's own source."""
         self._tap(self.tap)
         try:
             return self._bus.ask(channel, name, request, timeout_s)
@@ -93,7 +97,9 @@ class RadioBus:
         self._bus.answer(channel, name, answer_in_reach)
 
     def receive(self, timeout_s: float) -> list[Sample]:
-        """What the radio lets through, and who has come into reach or left it."""
+        """The messages that the radio delivers, and the tokens of robots that have come into reach
+        or left it.
+        """
         through: list[Sample] = []
         for sample in self._bus.receive(timeout_s):
             found = ch.channel_of(sample.key)
@@ -114,7 +120,9 @@ class RadioBus:
         return received
 
     def _sender(self, channel: ch.Channel, name: str) -> str | None:
-        """The other robot that says something by radio; None: it is not by radio, or our own."""
+        """The other robot that publishes on this key by radio; None: it is not by radio, or our
+        own.
+        """
         if channel.name not in _RADIO:
             return None
         robot = ch.robot_of(name) if channel.template.startswith("{node}") else name
@@ -156,7 +164,9 @@ class RadioBus:
         self._tokens[robot] = decoded(sample.payload, m.Liveliness).alive
 
     def _changes(self) -> list[Sample]:
-        """A robot is there for another one while it lives and is in reach."""
+        """The liveliness tokens of robots that have come into reach or left it: a robot is alive
+        for another while it lives and is in reach.
+        """
         changed = []
         for robot, alive in self._tokens.items():
             there = alive and self._reaches(robot, self._now_ns)
@@ -174,7 +184,7 @@ def behind_radio(bus: Bus, robot: str, radio: Radio) -> Bus:
 
 
 def plan_of(reach: Reach) -> m.RadioPlan:
-    """What the world says of who reaches whom."""
+    """The world's announcement of which robots reach each other."""
     import numpy as np
 
     return m.RadioPlan(
@@ -186,7 +196,7 @@ def plan_of(reach: Reach) -> m.RadioPlan:
 
 
 def reach_in(payload: bytes) -> Reach | None:
-    """Who reaches whom, as the world has said it."""
+    """Which robots reach each other, by the world's announcement."""
     import numpy as np
 
     try:

@@ -75,5 +75,7 @@ def _is_struct(declared: Any) -> bool:
 
 
 def _here(name: str, at: str) -> bool:
-    """The known fields; those that the scenario has once are known at the top only."""
+    """Whether a field is known at this place; those that the scenario has once are known at the top
+    only.
+    """
     return not at or name not in TOP_LEVEL

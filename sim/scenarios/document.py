@@ -26,7 +26,7 @@ from team.config import RobotConfig
 MAX_ROBOTS = 100
 UTIAS_ROBOTS = 5
 ANY_ROBOT = "any_robot"
-"""The robot whose models are those of each robot of a data set that is not known yet."""
+"""Stands for each robot of a data set that is not known yet."""
 
 Fields = dict[str, Any]
 
@@ -66,9 +66,10 @@ def named_document(name: str) -> tuple[Fields, str]:
 
 
 def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
-    """Defaults merged below every robot, names given; `known`: the fields of a scenario.
+    """The fields with defaults merged below every robot and names given; `known`: the fields of a
+    scenario.
 
-    What the user wrote is checked where it was written, so that an error names that place.
+    The user's values are checked where they were written, so that an error names that place.
     """
     for name in document:
         check_known(name, [*known, "base", "defaults", "robot_count"], "")
@@ -157,7 +158,7 @@ def _based(document: Fields) -> Fields:
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
-    """Tables are merged at every depth; all else is replaced by what lies above."""
+    """Tables merged at every depth; other values are replaced by those above."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)

@@ -1,6 +1,6 @@
 """A scenario: the world, the team's robots with their models, the centre and the seed.
 
-Users write TOML (`sim.scenarios.document` says how); processes hand the resolved scenario on as
+Users write TOML (`sim.scenarios.document` has the form); processes receive the resolved scenario as
 JSON (`dumps`, `loads`).
 """
 
@@ -104,11 +104,10 @@ def with_options(
     comm_range_m: float | None = None,
     identities: str | None = None,
 ) -> Scenario:
-    """The scenario with what a command line changes; None leaves it as it is.
+    """The scenario with the changes of a command line; None leaves a field as it is.
 
-    peers, centre: that there are peers, or no centre. robots: the first so many; further ones
-    repeat the scenario's robots in turn, with new ids.
-    Raises ScenarioError.
+    peers, centre: whether there are peers, and a centre. robots: their number; further ones repeat
+    the scenario's robots in turn, with new ids. Raises ScenarioError.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
@@ -137,7 +136,7 @@ def with_options(
 
 
 def _profile_of(scenario: Scenario) -> AssociationProfile:
-    """The thresholds of association in the lengths of the coarsest of the robots' sensors."""
+    """The thresholds of association, in the lengths of the coarsest of the robots' sensors."""
     world = scenario.world
     seen_m = world.visible_to_m if isinstance(world, SimulatedWorld) else None
     far_m = FAR_M if seen_m is None else seen_m
@@ -163,7 +162,9 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
 
 
 def _kind_of(path: str, otherwise: str) -> str:
-    """The kind of a data set; what can not be told is found wrong when it is read."""
+    """The kind of a data set; `otherwise` where it can not be determined, so that reading it names
+    the fault.
+    """
     from sim.datasets.kinds import kind_of
     from sim.datasets.tables import DatasetError
 
@@ -174,7 +175,9 @@ def _kind_of(path: str, otherwise: str) -> str:
 
 
 def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
-    """The robots that the data set has; where it has none of them, its own after their pattern."""
+    """The robots that the data set has; where it has none of them, its own robots by the pattern of
+    these.
+    """
     chosen = [robot for robot in robots if robot["id"] in names]
     return chosen or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
 
@@ -207,7 +210,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
 
 
 def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
-    """So many robots: the first ones as they are, further ones after their pattern in turn."""
+    """As many robots: the first ones as they are, further ones by their pattern in turn."""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
     unused = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
@@ -238,7 +241,9 @@ def _converted(fields: Fields) -> Scenario:
 
 
 def _filled(scenario: Scenario) -> Scenario:
-    """The seed, the estimator and the rule handed to the robots and the centre; all of it valid."""
+    """The scenario with its seed, estimator and rule set in the robots and the centre, and
+    validated.
+    """
     if (scenario.estimator, scenario.fusion) not in PAIRS:
         raise ScenarioError(
             f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
@@ -284,7 +289,7 @@ def _filled(scenario: Scenario) -> Scenario:
 
 
 def _check_way_points(robots: int, world: SimulatedWorld) -> None:
-    """Check that robots without a path of their own drive between random way-points for ever."""
+    """Check that robots without a path of their own drive between random way-points without end."""
     width = world.size_m if world.radius_m is None else 2.0 * world.radius_m
     endless = robots > len(world.paths) and not world.way_point_count
     if endless and world.way_point_tolerance_m > 0.5 * width:

@@ -65,9 +65,9 @@ def scenario_beside(path: str | Path) -> str:
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
-    """The scenario without the robots that its data set has no files of, and that in words.
+    """The scenario without the robots that have no files in its data set, and a note on them.
 
-    Of a set that has files of none of them nothing is left out: reading it says what is wrong.
+    Where no robot has files nothing is left out, so that reading the data set names the fault.
     Raises DatasetError.
     """
     world = scenario.world
@@ -105,8 +105,8 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
 def noise_seed(scenario: Scenario) -> int:
     """The key of the world's random numbers, from the scenario's name and its seed.
 
-    So two scenarios share no noise: what holds over the seeds of one and of the other are two
-    findings, not one finding twice. It is a positive integer of 63 bits.
+    So two scenarios have independent noise: results over the seeds of both are two findings. It is
+    a positive integer of 63 bits.
     """
     text = f"{scenario.name}/{scenario.seed}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

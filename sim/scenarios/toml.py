@@ -13,9 +13,9 @@ from team.config import RobotConfig
 
 
 def data_set_scenario(scenario: Scenario) -> str:
-    """The same robots and centre for the data set in the folder where this text lies.
+    """The same robots and centre for the data set in the folder of this text.
 
-    The robots are called r1, r2, … as in every UTIAS world. What is as by default is left out.
+    The robots are called r1, r2, … as in every UTIAS world. Fields with their default are left out.
     """
     head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
     robots = [
@@ -29,7 +29,7 @@ def data_set_scenario(scenario: Scenario) -> str:
 
 
 def folder_scenario(scenario: Scenario) -> str:
-    """The same robots and centre for the folder of CSV tables where this text lies."""
+    """The same robots and centre for the folder of CSV tables that contains this text."""
     head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
     robots = [
         {"id": robot.id} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
@@ -47,7 +47,7 @@ def folder_scenario(scenario: Scenario) -> str:
 def _chosen(
     value: msgspec.Struct, declared: type[msgspec.Struct], without: tuple[str, ...]
 ) -> dict[str, Any]:
-    """The fields that are not as by default, tables within them too."""
+    """The fields that differ from their default, in inner tables, too."""
     chosen: dict[str, Any] = {}
     for field in msgspec.structs.fields(declared):
         part = getattr(value, field.name)

@@ -1,4 +1,4 @@
-"""Who reaches whom by radio: by true distance, or in given windows of time."""
+"""Which robots reach each other by radio: by true distance, or in given windows of time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from sim.world.config import Radio
 from sim.world.streams import RobotStream
 
 PERIOD_NS = 1_000_000_000
-"""Who is in reach is looked at so often [ns of team time]."""
+"""Period of team time [ns] for which the reach is constant."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Who reaches whom: row t is for first_ns + t · PERIOD_NS and the period behind it.
+    """Which robots reach each other: row t holds from first_ns + t · PERIOD_NS for one period.
 
     pairs: T × P, of the robots two by two in their order. ends_ns: when each robot's stream ends.
     """
@@ -27,7 +27,7 @@ class Reach:
     ends_ns: dict[str, int]
 
     def between(self, one: str, other: str, now_ns: int) -> bool:
-        """Whether two robots reach each other at a time; behind the last row as in it."""
+        """Whether two robots reach each other at a time; after the last row as in it."""
         if one == other or one not in self.ends_ns or other not in self.ends_ns:
             return True
         if now_ns >= max(self.ends_ns[one], self.ends_ns[other]):
@@ -39,7 +39,9 @@ class Reach:
 
 
 def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
-    """Who reaches whom in a world; raises ValueError where a range needs a truth that is none."""
+    """Which robots reach each other in a world; raises ValueError where a range needs a truth that
+    does not exist.
+    """
     robots = tuple(stream.robot for stream in streams)
     first_ns = min((int(s.stamps_ns[0]) for s in streams if len(s)), default=0)
     ends_ns = {s.robot: int(s.stamps_ns[-1]) if len(s) else first_ns for s in streams}

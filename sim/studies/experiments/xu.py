@@ -63,12 +63,12 @@ Reading = Literal["stated", "exact", "coded"]
 
 
 class Panel(NamedTuple):
-    """One world of a figure, its methods, and what the thesis says of each in metres.
+    """One world of a figure, its methods, and the thesis' figures in metres.
 
-    noise: of the odometry, (m, rad) in a step; None: as the scenario has it.
-    reading: how the thesis is taken. "stated": its text. "exact": the same, but the odometry has no
-    error, while the filters believe that it has. "coded": its appendix' program (`as_coded`).
-    printed: by the method's name, the largest error that the text or the picture names.
+    noise: of the odometry, (m, rad) in a step; None: the scenario's. reading: the interpretation of
+    the thesis. "stated": its text. "exact": the same with exact odometry, while the filters assume
+    noise. "coded": its appendix' program (`as_coded`). printed: by the method's name, the largest
+    error in the text or the picture.
     """
 
     name: str
@@ -168,7 +168,9 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
 
 
 def _telling(scenario: Scenario) -> Scenario:
-    """A filter over the whole run says its map at every step; it has no windows otherwise."""
+    """The scenario with a map at every step of a filter over the whole run, which has no
+    windows.
+    """
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, window_s=STEP_S))
@@ -197,7 +199,9 @@ def as_coded(scenario: Scenario) -> Scenario:
 
 
 def with_particles(scenario: Scenario, particles: int) -> Scenario:
-    """The same with so many particles for every robot, and for a filter at the centre."""
+    """The scenario with this number of particles for every robot, and for a filter at the
+    centre.
+    """
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, particles=particles))
@@ -208,7 +212,7 @@ def with_particles(scenario: Scenario, particles: int) -> Scenario:
 
 
 def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
-    """The same with odometry noise of (m, rad) in a step of a second."""
+    """The scenario with odometry noise of (m, rad) in a step of a second."""
     replace = msgspec.structs.replace
     motion = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
     robots = tuple(
@@ -259,7 +263,9 @@ def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
 def drawing(
     title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
 ) -> Callable[[Path], None]:
-    """What draws the medians with their bands, and one run within its bound; unit: of the times."""
+    """A function that draws the medians with their bands, and one run with its bound; unit: of the
+    times.
+    """
 
     def draw(path: Path) -> None:
         _draw(path, title, panel, found, unit)

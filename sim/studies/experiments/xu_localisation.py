@@ -1,9 +1,10 @@
-"""Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a map that is known.
+"""Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
 
-Its figures 3.2 to 3.5 are those of Fox et al. 2000, without figures. Here the same is shown on the
-thesis' own world: the three steps of the filter one by one at the end of a blind stretch, and a
-start anywhere. The states are those of `team.estimation.baselines.localisation`; the motions and
-measurements are what the robot of such a run hears, cut into keyframes as at every node.
+Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here the same is shown on the
+thesis' own world: the three steps of the filter one by one at the end of a stretch without
+measurements, and a start anywhere. The states are those of
+`team.estimation.baselines.localisation`; the motions and measurements are those that the robot of
+such a run receives, cut into keyframes as in every node.
 """
 
 from collections.abc import Mapping
@@ -52,7 +53,7 @@ PARTICLES = 1000
 ANYWHERE_PARTICLES = 20_000
 ANYWHERE_STEPS = (0, 1, 40)
 DRAWN = 2000
-"""Particles of a picture; more would be one blot."""
+"""Most particles of a picture."""
 STAGES = ("prediction", "update", "resampling")
 _COST_S = 1.0
 
@@ -166,7 +167,7 @@ def _alone(seed: int, particles: int) -> Scenario:
 
 
 def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
-    """Clouds are kept for the picture of the first seed only."""
+    """A run of one seed; clouds are stored for the picture of the first seed only."""
     return Task(
         f"sim.studies.experiments.xu_localisation:{work}",
         {"world": msgspec.to_builtins(scenario), "clouds": seed == options.seeds[0]},
@@ -177,7 +178,7 @@ def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
 
 @dataclass(frozen=True)
 class _Run:
-    """What a robot hears in a run, the map that it is told, and where it truly is."""
+    """The keyframes that a robot receives in a run, its known map, and its true poses."""
 
     scenario: Scenario
     keyframes: list[RobotKeyframe]
@@ -304,7 +305,7 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 
 def _summary(state: Localisation, true: np.ndarray) -> Figures:
-    """The error of the cloud's mean and what the cloud believes of it."""
+    """The error of the cloud's mean, and the cloud's own covariance."""
     mean, covariance = localisation.pose_gaussian(state)
     off = mean[:2] - true[:2]
     return {

@@ -40,7 +40,7 @@ STEPS = 500
 class MapFigure(NamedTuple):
     """Maps of some methods at some steps: one run drawn, and the error over the seeds.
 
-    shown: the methods, each in its measurement of the thesis.
+    shown: the methods, each with its reading of the thesis.
     """
 
     title: str
@@ -93,7 +93,7 @@ class MapFigure(NamedTuple):
         return _run(method, reading, options.seeds[0], self.steps)
 
     def _pictures(self, label: str, run: Figures, seed: int) -> list[Picture]:
-        """One for each step, lettered as in the source where there are several."""
+        """A picture for each step, lettered as in the source where there are several."""
         name = label.replace(" ", "-").replace(",", "").lower()
         pictures = []
         for k, shot in enumerate(run["shots"]):
@@ -114,7 +114,7 @@ def _run(method: Method, reading: Reading, seed: int, shots: tuple[int, ...] = (
 
 
 def _named(method: Method, reading: Reading) -> str:
-    """The method's name with its reading, if it does not say it."""
+    """The method's name with its reading, unless the name has it."""
     return method.name if "," in method.name else f"{method.name}, {_READ[reading]}"
 
 
