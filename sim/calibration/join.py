@@ -10,6 +10,7 @@ from jaxtyping import Float, Int64
 from central.desk.evaluation.errors import Path, on_circle
 from central.tick_fold import join_settings
 from sim.calibration.data import interval_of, scan_of
+from sim.calibration.figures import CalibrationError
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import (
     OBSERVATIONS,
@@ -63,7 +64,8 @@ def joined_team(
     island only.
 
     Between two window ends a path is the particles' mean, moved so that it ends at the joined pose.
-    progress: called with the name of each robot whose windows are done.
+    progress: called with the name of each robot whose windows are done. Raises CalibrationError
+    where there is no submap.
     """
     tracks = {}
     for each in world.streams:
@@ -79,6 +81,11 @@ def joined_team(
         for robot, windows in tracks.items()
         for t in windows
     ]
+    if not contributions:
+        raise CalibrationError(
+            "no robot has odometry and measurements of landmarks that make a submap: without "
+            "ground truth `calibrate` learns from the joined map"
+        )
     tick_ns = round(scenario.central.tick_s * 1e9)
     ticks: dict[int, list[Contribution]] = {}
     for contribution in sorted(contributions, key=lambda c: c.key):

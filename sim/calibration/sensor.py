@@ -280,8 +280,8 @@ def _persistence(
     seconds: Float[np.ndarray, " n"],
     relative: Float[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """(white share, correlation time [s]) of errors in units of σ; (1, 0) where there is no
-    correlation.
+    """(white share, correlation time [s]) of errors in units of σ; (1, 0) where no correlation
+    lasts to a landmark's next measurement.
     """
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
@@ -306,7 +306,10 @@ def _persistence(
 
     bounds = ([0.0, np.log(0.05)], [0.99, np.log(1e3)])
     found = least_squares(misfit, [0.5, np.log(5.0)], bounds=bounds)
-    return 1.0 - float(found.x[0]), float(np.exp(found.x[1]))
+    share, time_s = float(found.x[0]), float(np.exp(found.x[1]))
+    if time_s < lags[0]:  # gone by the next measurement, so any share at all fits as well
+        return 1.0, 0.0
+    return 1.0 - share, time_s
 
 
 def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[str, float]:

@@ -139,10 +139,16 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 def _as_read(folder: Path) -> list[str]:
     """What there is of each robot, and what its tables have that can not be used."""
+    from sim.datasets.tables import DatasetError
     from sim.scenarios.scenario import load, with_options
     from sim.scenarios.source import scenario_beside, streams_of
 
     streams = streams_of(with_options(load(scenario_beside(folder)), dataset=folder))
+    if not any(len(stream.intervals.end_ns) for stream in streams.streams):
+        raise DatasetError(
+            "no robot has odometry, so there is nothing to run: `--columns FILE` names the files "
+            "and columns of its [odometry] (docs/your_data.md)"
+        )
     lines = list(streams.notes)
     for stream in streams.streams:
         seen, teammates = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)

@@ -185,10 +185,22 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
         raise ValueError(f"{text[:SHOWN]!r} is not a time in numbers") from None
     if not value.is_finite() or abs(value) > LARGEST * 1e9:
         raise ValueError(
-            f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s; of "
-            "nanoseconds a map of columns makes seconds (scale = 1e-9)"
+            f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s"
+            f"{_unit_of(abs(value) / 10**9)}"
         )
     return int(value.to_integral_value())
+
+
+def _unit_of(seconds: Decimal) -> str:
+    """What a time since 1970 that was read as seconds was given in, and the remedy."""
+    for unit, scale in (
+        ("milliseconds", "1e-3"),
+        ("microseconds", "1e-6"),
+        ("nanoseconds", "1e-9"),
+    ):
+        if seconds.is_finite() and seconds * Decimal(scale) <= LARGEST:
+            return f"; of {unit} since 1970 a map of columns makes seconds (scale = {scale})"
+    return ""
 
 
 def _landmark(text: str) -> int:

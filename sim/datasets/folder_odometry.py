@@ -22,6 +22,8 @@ FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 LONG_GAP_NS = 2_000_000_000
 WHIRLING_RAD_S = 2.0 * np.pi
 """A median yaw rate above this [rad/s] is probably not in radians."""
+SHORTEST_S, LONGEST_S = 1e-4, 5.0
+"""A median odometry interval outside these is probably not in seconds."""
 OFF_NS = 1_000_000
 """A duration differs from the time since the row before if it does so by more than this, and by a
 hundredth.
@@ -69,6 +71,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
         intervals = Intervals(ends, duration, forward, yaw_rate, steered=form == STEERED)
     else:
         intervals = moved(ends, duration, steps, claims)
+    _judge_pace(rows, duration)
     _judge_speeds(rows, form, steps, duration)
     return intervals, rows.notes
 
@@ -103,6 +106,18 @@ def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
     rows.note(
         off, "whose duration_s is not the time since the row before: it is taken to last as long"
     )
+
+
+def _judge_pace(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
+    """Note intervals whose usual length says that times are not in seconds."""
+    if not len(duration):
+        return
+    usual_s = float(np.median(duration)) * 1e-9
+    if not SHORTEST_S <= usual_s <= LONGEST_S:
+        rows.notes.append(
+            f"an odometry interval lasts {usual_s:.3g} s most of the time: of times in other units "
+            "a map of columns makes seconds (scale = 1e-3 for milliseconds)"
+        )
 
 
 def _judge_speeds(

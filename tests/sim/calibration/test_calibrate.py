@@ -33,6 +33,7 @@ from sim.recorded.streams import recorded_streams
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.world.config import SimulatedWorld
 from sim.world.streams import (
+    ODOMETRY,
     Detections,
     Intervals,
     RobotStream,
@@ -194,6 +195,13 @@ def test_the_sensors_figures_come_out_of_measurements_within_their_uncertainty()
     assert found["bearing_outliers"].value == pytest.approx(0.03, abs=0.01)
 
 
+@pytest.mark.parametrize("seed", [5, 11])
+def test_white_errors_are_not_taken_for_a_correlation_that_is_gone_by_the_next_measurement(
+    seed: int,
+) -> None:
+    assert fit_sensor([seeing(seed)])["bearing_white"] > 0.9
+
+
 def test_leaving_out_gives_the_standard_error_of_a_mean(bases: list[Reference]) -> None:
     marks = {each.name: float(i**2) for i, each in enumerate(bases)}
     (figure,) = jackknifed(
@@ -321,6 +329,18 @@ def test_the_joined_teams_paths_and_landmarks_lie_where_the_robots_were() -> Non
     assert world.landmarks is not None
     truth = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
     assert max(np.hypot(*(place - truth[i])) for i, place in joined.landmarks.items()) < 1.0
+
+
+def test_a_team_without_submaps_is_an_error_with_a_text() -> None:
+    team = scenario(robots=2)
+    world = streams(team)
+    standing = []
+    for stream in world.streams:
+        left = stream.kinds != ODOMETRY
+        kinds, stamps, rows = (each[left] for each in (stream.kinds, stream.stamps_ns, stream.rows))
+        standing.append(replace(stream, kinds=kinds, stamps_ns=stamps, rows=rows))
+    with pytest.raises(CalibrationError, match="no robot has odometry and measurements"):
+        joined_team(replace(world, streams=tuple(standing)), team)
 
 
 def logged_often(world: WorldStreams, pieces: int) -> WorldStreams:

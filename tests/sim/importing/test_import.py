@@ -234,6 +234,47 @@ def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_ex
     assert "is out of bounds" in refused
 
 
+@pytest.mark.parametrize(
+    ("stamp", "words"),
+    [
+        (
+            "1763800000000",
+            "of milliseconds since 1970 a map of columns makes seconds (scale = 1e-3)",
+        ),
+        ("1763800000000000", "of microseconds since 1970"),
+        ("1763800000000000000", "of nanoseconds since 1970"),
+    ],
+)
+def test_times_in_another_unit_are_refused_with_that_unit(
+    tmp_path: Path, stamp: str, words: str
+) -> None:
+    odometry = tmp_path / "odometry.csv"
+    odometry.write_text(f"t_s,forward_m_s,yaw_rate_rad_s\n{stamp},1,0\n")
+    refused = run(tmp_path, "-o", tmp_path / "set").exception
+    assert isinstance(refused, DatasetError)
+    assert words in str(refused)
+
+
+def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(
+    tmp_path: Path,
+) -> None:
+    odometry = tmp_path / "odometry.csv"
+    head = "t_s,forward_m_s,yaw_rate_rad_s\n"
+    odometry.write_text(head + "0,1,0\n100,1,0\n200,1,0\n")
+    assert (
+        "an odometry interval lasts 100 s most of the time"
+        in run(tmp_path, "-o", tmp_path / "slow").output
+    )
+    odometry.write_text(head + "0,1,0\n0.1,1,0\n0.2,1,0\n")
+    assert "most of the time" not in run(tmp_path, "-o", tmp_path / "good").output
+    odometry.unlink()
+    (tmp_path / "observations.csv").write_text("t_s,landmark,range_m,bearing_rad\n0,7,2,0\n")
+    refused = run(tmp_path, "-o", tmp_path / "still").exception
+    assert isinstance(refused, DatasetError)
+    assert "no robot has odometry" in str(refused)
+    assert not (tmp_path / "still").exists()
+
+
 def test_a_map_is_proposed_from_the_columns_names(tmp_path: Path) -> None:
     wheels, *_ = files(tmp_path)
     tags = tmp_path / "tags.csv"
