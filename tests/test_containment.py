@@ -41,12 +41,12 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimator that raises at one odometry, in the middle of what it changes."""
     whole = HybridEstimator.drive
 
-    def drive(self, stamp_ns, *motion, **how):  # type: ignore[no-untyped-def]
-        if stamp_ns == BROKEN_NS:
+    def drive(self, interval, **how):  # type: ignore[no-untyped-def]
+        if interval.end_ns == BROKEN_NS:
             self._slam.sequence += 7
             self._slam._segmenter = None
             raise ZeroDivisionError("no way")
-        return whole(self, stamp_ns, *motion, **how)
+        return whole(self, interval, **how)
 
     monkeypatch.setattr(HybridEstimator, "drive", drive)
 
@@ -69,7 +69,7 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
         ("ZeroDivisionError", "no way", BROKEN_NS)
     }
     for fault in told:
-        assert re.fullmatch(r"team\.robot\.front_end:FrontEnd\.drive:\d+", fault.place)
+        assert re.fullmatch(r"team\.robot\.front_end:BoundedEstimator\.drive:\d+", fault.place)
     assert_each_measurement_once(samples)
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)
