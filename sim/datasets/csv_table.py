@@ -192,15 +192,12 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
 
 
 def _unit_of(seconds: Decimal) -> str:
-    """What a time since 1970 that was read as seconds was given in, and the remedy."""
-    for unit, scale in (
-        ("milliseconds", "1e-3"),
-        ("microseconds", "1e-6"),
-        ("nanoseconds", "1e-9"),
-    ):
-        if seconds.is_finite() and seconds * Decimal(scale) <= LARGEST:
-            return f"; of {unit} since 1970 a map of columns makes seconds (scale = {scale})"
-    return ""
+    """What a time since 1970 that was read as seconds was probably given in, and the remedy."""
+    unit, scale = "nanoseconds", "1e-9"
+    for each, by in (("microseconds", "1e-6"), ("milliseconds", "1e-3")):
+        if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:
+            unit, scale = each, by
+    return f"; of {unit} a map of columns makes seconds (scale = {scale})"
 
 
 def _landmark(text: str) -> int:
