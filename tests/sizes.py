@@ -32,6 +32,7 @@ REASONS = {
     "team/estimation/models.py": "the models of motion and of the sensor, with their Jacobians",
     "team/estimation/hybrid_slam/keyframes.py": "one cut of the stream into keyframes",
     "team/estimation/hybrid_slam/landmarks_along_paths.py": KERNEL,
+    "team/estimation/hybrid_slam/innovation.py": "one innovation: what is predicted, and its test",
     "team/estimation/hybrid_slam/window.py": "one window from its opening to its moments",
     "team/estimation/map_joining/submap_graph.py": "one graph: its index arithmetic is one table",
     "team/estimation/map_joining/gauss_newton.py": "one cost with its robust weights",
