@@ -12,7 +12,7 @@ of the age."""
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """The fold after a tick; tested: its number of submaps when no suspect was last found.
+    """The fold after a tick; tested: its number of submaps when suspects were last tested.
 
     number: of the ticks that were taken, this one included.
     """
@@ -44,7 +44,7 @@ class Checkpoints:
 
     @property
     def tested(self) -> int:
-        """Number of submaps in the fold when no suspect was last found."""
+        """Number of submaps in the fold when suspects were last tested; 0 if they never were."""
         return self.taken[-1].tested if self.taken else 0
 
     def push(self, tick: int, fold: Fold) -> None:
@@ -55,7 +55,7 @@ class Checkpoints:
         self.taken = thinned((*older, new))
 
     def note_tested(self, size: int) -> None:
-        """Note that there was no suspect in the last fold with this number of submaps."""
+        """Note that suspects were tested in the last fold, which has this number of submaps."""
         self.taken = (*self.taken[:-1], replace(self.taken[-1], tested=size))
 
     def back_to(self, tick: float) -> None:

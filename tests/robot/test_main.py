@@ -161,15 +161,18 @@ def test_where_no_source_answers_the_message_itself_is_believed() -> None:
     assert (shell.node.incarnation, shell.node.next_measurement) == (3, 1)
 
 
+class Published(Source):
+    """A source that has its initial pose and one odometry interval to give."""
+
+    def answer(self, request: bytes) -> list[bytes]:
+        super().answer(request)
+        wanted = decoded(request, m.MeasurementsRequest)
+        there = [self.start, msgspec.structs.replace(odometry(1, "r1"), incarnation=1)]
+        return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
+
+
 def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on() -> None:
     """A stranger's far end made the robot wait for ever; an early one made it leave."""
-
-    class Published(Source):
-        def answer(self, request: bytes) -> list[bytes]:
-            super().answer(request)
-            wanted = decoded(request, m.MeasurementsRequest)
-            there = [self.start, msgspec.structs.replace(odometry(1, "r1"), incarnation=1)]
-            return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
 
     network = MemoryNetwork()
     source, viewer = Published(network), MemoryBus(network)
@@ -194,13 +197,6 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on() -> N
 @pytest.mark.parametrize("state", ["ended", "open"])
 def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state: str) -> None:
     """A stranger's head of a driver that is not there: the robot waited, and asked for nothing."""
-
-    class Published(Source):
-        def answer(self, request: bytes) -> list[bytes]:
-            super().answer(request)
-            wanted = decoded(request, m.MeasurementsRequest)
-            there = [self.start, msgspec.structs.replace(odometry(1, "r1"), incarnation=1)]
-            return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
 
     network = MemoryNetwork()
     source, viewer = Published(network), MemoryBus(network)
