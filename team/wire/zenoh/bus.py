@@ -27,7 +27,7 @@ from team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
 from team.wire.channels import ALIVE, REPLIES, TALLY, Channel, row_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.messages import Liveliness, Message, Tally
-from team.wire.zenoh.delivery import Publisher, declared, subscribe
+from team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
 from team.wire.zenoh.queries import Queries, Question, Reply
 from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
 from team.wire.zenoh.session import RouterAccess, client
@@ -37,6 +37,8 @@ if TYPE_CHECKING:  # a node without keys needs none of it
 
 _ATTACHMENT = struct.Struct("<qqq")
 _ALIVE_TIMEOUT_S = 5.0
+_FLUSH = "router/flush"
+_FLUSH_S = 10.0  # that a closing bus waits for a router that reads slowly, or is stopped
 MOST_WAITING = 1_000
 """Number of samples that wait for an observing node before dispensable ones are dropped.
 
@@ -106,8 +108,25 @@ class ZenohBus:
             with suppress(BusError):
                 self._tell_tally()
             self._closed.set()
+            self._flush()
             self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
             self._queue.put(None)
+
+    def _flush(self) -> None:
+        """Waits until the router has received what was published: a closing session may drop what
+        its link has not sent yet.
+
+        The query follows the samples on their link, and nobody answers it, so its end comes from
+        the router. Without a link it ends at once.
+        """
+        with suppress(zenoh.ZError):
+            for _ in self._session.get(
+                self._prefix + _FLUSH,
+                priority=PRIORITY,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                timeout=_FLUSH_S,
+            ):
+                pass
 
     def _tell_tally(self) -> None:
         """Reports to a recorder the number of samples of each key: the last ones may have been

@@ -18,8 +18,9 @@ from team.wire.channels import Channel, row_of
 _HEARTBEAT_S = 0.25
 _BLOCK = zenoh.CongestionControl.BLOCK
 _RELIABLE = zenoh.Reliability.RELIABLE
-_PRIORITY = zenoh.Priority.DATA  # one for all, so that the order across keys is kept
-_REPLIES = ext.RepliesConfig(congestion_control=_BLOCK, priority=_PRIORITY)
+PRIORITY = zenoh.Priority.DATA
+"""The priority of all samples: one for all, so that the order across keys is preserved."""
+_REPLIES = ext.RepliesConfig(congestion_control=_BLOCK, priority=PRIORITY)
 Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
 
@@ -32,14 +33,14 @@ def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
         return session.declare_publisher(
             prefix + key,
             congestion_control=_BLOCK,
-            priority=_PRIORITY,
+            priority=PRIORITY,
             reliability=_RELIABLE,
         )
     return ext.declare_advanced_publisher(
         session,
         prefix + key,
         congestion_control=_BLOCK,
-        priority=_PRIORITY,
+        priority=PRIORITY,
         reliability=_RELIABLE,
         cache=ext.CacheConfig(max_samples=cache_size(row), replies_config=_REPLIES),
         # Periodic, not sporadic: a sporadic heartbeat that falls into a cut is never repeated.
