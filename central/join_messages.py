@@ -3,6 +3,8 @@ their paths.
 """
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,7 +20,9 @@ from team import translate
 from team.config import UNNAMED
 from team.estimation.contribution import Stream
 from team.estimation.map_joining import marginals
+from team.estimation.map_joining.associating import IslandView
 from team.estimation.map_joining.association.landmarks import Decision
+from team.estimation.map_joining.distinctness import maybe_the_same
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
 from team.estimation.map_joining.refusal import refusals
@@ -108,17 +112,33 @@ def _landmarks(
     return ids, means, translate.block_bytes(blocks)
 
 
-def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> list[int]:
-    """The landmarks of the map, by ascending id."""
+class Shown(NamedTuple):
+    """The landmarks of a map, by ascending id.
+
+    undecided: landmarks that are left out since each may be one with another, which is shown.
+    """
+
+    ids: Sequence[int] = ()
+    undecided: Mapping[int, int] = MappingProxyType({})
+
+
+def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
+    """The landmarks of the map; the final one has only those that are known to be different."""
     if not fold.contributions:
-        return []
+        return Shown()
+    if tail != "final":
+        return Shown(marginals.confirmed(fold, config.landmark_submaps))
     most = len(fold.main.graph.submaps) + fold.departed
-    unnamed = min(CONFIRMED_BY, most) if tail == "final" else 1
-    return marginals.confirmed(fold, config.landmark_submaps, unnamed)
+    ids = marginals.confirmed(fold, config.landmark_submaps, min(CONFIRMED_BY, most))
+    unnamed = [id_ for id_ in ids if id_ >= UNNAMED]
+    if not unnamed:
+        return Shown(ids)
+    undecided = maybe_the_same(IslandView(fold.main, fold.landmarks), unnamed)
+    return Shown([id_ for id_ in ids if id_ not in undecided], undecided)
 
 
 def reasons(
-    fold: Fold, shown: Sequence[int], biases: Sequence[BiasEstimate], landmark_submaps: int
+    fold: Fold, shown: Shown, biases: Sequence[BiasEstimate], landmark_submaps: int
 ) -> tuple[str, ...]:
     """Why robots and landmarks are not in the map, and warnings about it, in words."""
     return (
@@ -126,23 +146,31 @@ def reasons(
         *_worded(refusals(fold)),
         *fold.warnings,
         *_worded([_awaited(each) for each in _waiting(fold)]),
-        *_unconfirmed(fold, shown, landmark_submaps),
+        *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
 
 
-def _unconfirmed(fold: Fold, shown: Sequence[int], landmark_submaps: int) -> tuple[str, ...]:
+def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...]:
     """Landmarks left out of the map, in words."""
-    known = fold.main.graph.landmarks.keys() if fold.contributions else set[int]()
-    out = sorted(known - set(shown))
-    if not out:
+    if not fold.contributions:
         return ()
-    needed = landmark_submaps if out[-1] < UNNAMED else max(landmark_submaps, CONFIRMED_BY)
-    named = ", ".join(str(id_) for id_ in out[:NAMED]) + (", …" if len(out) > NAMED else "")
-    return (
-        f"left out, {needed} submaps that agree needed: "
-        f"{len(out)} of {len(known)} landmarks ({named})",
+    known = fold.main.graph.landmarks.keys()
+    out = sorted(known - {*shown.ids, *shown.undecided})
+    needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
+    pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
+    return tuple(
+        f"left out, {why}: {len(named)} of {len(known)} landmarks ({_listed(named)})"
+        for why, named in (
+            (f"{needed} submaps that agree needed", [str(id_) for id_ in out]),
+            ("may be one with another landmark", pairs),
+        )
+        if named
     )
+
+
+def _listed(named: Sequence[str]) -> str:
+    return ", ".join(named[:NAMED]) + (", …" if len(named) > NAMED else "")
 
 
 def priors(

@@ -120,7 +120,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         fused = team_map(
             fold,
             tail,
-            shown,
+            shown.ids,
             digest=digest,
             members=ticks.members(fold),
             withdrawn=ticks.withdrawn,
@@ -131,13 +131,13 @@ class JoinRule(FusionRule[SubmapInputs]):
             biases=biases,
             reasons=self.reasons,
         )
-        self.landmarks = len(shown)
+        self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)
         if final:
             with_it = self._sound(trajectories(fold, digest, inputs.submaps))
             return [*with_it, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
         sent_priors = None if inputs.recorded else self._sent_priors
-        with_it = self._sound(priors(fold, shown, fused, sent_priors))
+        with_it = self._sound(priors(fold, shown.ids, fused, sent_priors))
         return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *with_it]
 
     def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:

@@ -5,7 +5,7 @@ not count. Pairs are counted by detections: two of one label in one landmark are
 of one label in two landmarks a missed one, two of two labels in one a wrong one.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +64,8 @@ class AssociationResult:
 
     label_of: the label of each of the map's unnamed landmarks; UNKNOWN where there is none.
     duplicates: landmarks beyond the first of a label; confirmed: those of them with at least two
-    submaps, and all of an estimator without submaps. merges_right, merges_wrong: pairs of robots
+    submaps, and all of an estimator without submaps; shown: those of them that the final map has.
+    merges_right, merges_wrong: pairs of robots
     that share landmarks in the map, by whether at least half of those that have labels from both
     are one; merges_refused: attempts that wait. left_out: labelled detections that are in no
     submap. clutter_in_map: others that are in one.
@@ -76,6 +77,7 @@ class AssociationResult:
     landmarks: int
     duplicates: int
     duplicates_confirmed: int
+    duplicates_shown: int
     merges_right: int
     merges_wrong: int
     merges_refused: int
@@ -100,12 +102,13 @@ def association_result(log: Collected) -> AssociationResult | None:
     several = len({place[:3] for place in identity}) > 1
     named = [label_of[number] for number in label_of if label_of[number] != UNKNOWN]
     confirmed = [
-        label_of[number]
+        number
         for number in label_of
         if label_of[number] != UNKNOWN and (len(submaps[number]) > 1 or not several)
     ]
     final = log.sound(log.last(ch.FINAL_MAP))
     decisions = final.decisions if isinstance(final, m.FusedMap) else ()
+    in_map = {*ids(final.ids, "ids").tolist()} if isinstance(final, m.FusedMap) else {*confirmed}
     right, wrong = _merges(label, places, identity)
     return AssociationResult(
         pairs=_pairs(label[known], joined[known]),
@@ -113,13 +116,18 @@ def association_result(log: Collected) -> AssociationResult | None:
         label_of=label_of,
         landmarks=len(label_of),
         duplicates=len(named) - len(set(named)),
-        duplicates_confirmed=len(confirmed) - len(set(confirmed)),
+        duplicates_confirmed=_beyond_the_first(confirmed, label_of),
+        duplicates_shown=_beyond_the_first(in_map.intersection(confirmed), label_of),
         merges_right=right,
         merges_wrong=wrong,
         merges_refused=sum(each.kind == "waits" for each in decisions),
         left_out=int(np.count_nonzero(known & (local < 0))),
         clutter_in_map=int(np.count_nonzero(~known & (local >= 0))),
     )
+
+
+def _beyond_the_first(numbers: Collection[int], label_of: Mapping[int, int]) -> int:
+    return len(numbers) - len({label_of[number] for number in numbers})
 
 
 def association_json(result: AssociationResult) -> dict[str, object]:
@@ -139,6 +147,7 @@ def association_json(result: AssociationResult) -> dict[str, object]:
         "landmarks": result.landmarks,
         "duplicates": result.duplicates,
         "duplicates_confirmed": result.duplicates_confirmed,
+        "duplicates_shown": result.duplicates_shown,
         "merges_right": result.merges_right,
         "merges_wrong": result.merges_wrong,
         "merges_refused": result.merges_refused,

@@ -65,6 +65,7 @@ def test_the_report_has_the_scores_inside_windows_and_over_all() -> None:
         landmarks=9,
         duplicates=2,
         duplicates_confirmed=1,
+        duplicates_shown=0,
         merges_right=4,
         merges_wrong=0,
         merges_refused=3,
