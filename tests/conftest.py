@@ -14,6 +14,7 @@ from jaxtyping import install_import_hook
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 
+import tests.kernels
 import tests.shapes
 
 # The same examples in every run: what fails once fails again. HYPOTHESIS_SEARCH=1 finds new ones.
@@ -30,6 +31,14 @@ def pytest_runtest_setup() -> None:
 
 
 SYSTEM = "tests/system/"
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Notes which kernels the import of the tests has called: test_compiled.py looks at it.
+
+    In a fresh clone one worker would compile them, and the others wait for it.
+    """
+    session.config.stash[tests.kernels.AT_IMPORT] = tests.kernels.called()
 
 
 FIRST = (SYSTEM, "tests/recording/", "tests/keys/", "tests/wire/")

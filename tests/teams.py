@@ -2,7 +2,7 @@
 
 import random
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -162,6 +162,32 @@ def of(out: Sequence[Outgoing], channel: ch.Channel) -> list[m.Message]:
 def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
     """What a lonely robot sends for fusion."""
     return of(driven(RobotNode(config(each.robot, **options)), published(each)), ch.SUBMAP)
+
+
+class Submaps(Mapping[str, list[m.Submap]]):
+    """What each of some lonely robots sends for fusion; computed for the test that asks first.
+
+    At import it would need kernels, which one worker would compile while the others wait for them.
+    """
+
+    def __init__(self, streams: Sequence[RobotStream]) -> None:
+        self._streams = {each.robot: each for each in streams}
+        self._submaps: dict[str, list[m.Submap]] = {}
+
+    def __getitem__(self, robot: str) -> list[m.Submap]:
+        if robot not in self._submaps:
+            self._submaps[robot] = submaps_of(self._streams[robot])
+        return self._submaps[robot]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._streams)
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def every(self) -> list[m.Submap]:
+        """Those of all robots, one robot after the other."""
+        return [submap for submaps in self.values() for submap in submaps]
 
 
 @dataclass

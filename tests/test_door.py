@@ -15,13 +15,13 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
 from team.wire.digest import configured
-from tests.support import examples
-from tests.teams import of, published, stream, submaps_of, world_of
+from tests.support import examples, submap
+from tests.teams import Submaps, of, published, stream, world_of
 
 HUGE = 2**62
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
-SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+SUBMAPS = Submaps(list(STREAMS.values()))
 END = m.End(
     stamp_ns=0,
     streams=tuple(
@@ -75,7 +75,7 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
     return [*said, (ch.END, "", END)]
 
 
-STRANGE = msgspec.structs.replace(SUBMAPS["r1"][0], robot="r9")
+STRANGE = msgspec.structs.replace(submap(0), robot="r9")
 ATTACKS = [
     (ch.SUBMAP, "r9", STRANGE, "of r9, not in this team"),
     (

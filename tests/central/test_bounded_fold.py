@@ -19,11 +19,10 @@ from team.estimation.map_joining.joining import EMPTY_FOLD
 from team.estimation.map_joining.relinearising import is_due
 from team.wire.codec import encoded
 from team.wire.digest import digest_of
-from tests.teams import stream, submaps_of
+from tests.teams import Submaps, stream
 
 CONFIG = CentralConfig(tick_s=4.0)
-SUBMAPS = {name: submaps_of(stream(name, 40, y=y)) for name, y in (("r1", 0.0), ("r2", 1.0))}
-ALL = [each for submaps in SUBMAPS.values() for each in submaps]
+SUBMAPS = Submaps([stream(name, 40, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -54,7 +53,7 @@ def bits(fold):
 
 def straight(bounded=True):
     ticks = fresh(bounded)
-    for each in ALL:
+    for each in SUBMAPS.every():
         add(ticks, each)
     ticks.take_until(float("inf"))
     return ticks
@@ -63,7 +62,7 @@ def straight(bounded=True):
 @pytest.fixture(scope="module")
 def expected():
     fold = straight().fold
-    assert fold.departed > 0.5 * len(ALL)
+    assert fold.departed > 0.5 * len(SUBMAPS.every())
     return bits(fold)
 
 
@@ -72,7 +71,7 @@ def expected():
 def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(expected, random):
     ticks = fresh()
     waiting = {name: list(submaps) for name, submaps in SUBMAPS.items()}
-    order = [each.robot for each in ALL]
+    order = [each.robot for each in SUBMAPS.every()]
     random.shuffle(order)
     for robot in order:
         add(ticks, waiting[robot].pop(0))

@@ -11,10 +11,10 @@ from team.config import UNNAMED
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_ids, ids
-from tests.teams import broadcasts, of, published, stream, submaps_of
+from tests.teams import Submaps, broadcasts, of, published, stream
 
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
-SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+SUBMAPS = Submaps(list(STREAMS.values()))
 FALSE = 9
 """The name of a landmark that is not there."""
 END_NS = 15_000_000_000

@@ -14,13 +14,12 @@ from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
-from tests.teams import broadcasts, of, published, stream, submaps_of
+from tests.teams import Submaps, broadcasts, of, published, stream
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=6.0)
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
-SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+SUBMAPS = Submaps(list(STREAMS.values()))
 STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
-ALL = [submap for submaps in SUBMAPS.values() for submap in submaps]
 END_NS = 15_000_000_000
 
 
@@ -33,7 +32,7 @@ def rule(config=CONFIG, starts=("r1", "r2")):
 
 def whole(config=CONFIG):
     found = rule(config)
-    for submap in ALL:
+    for submap in SUBMAPS.every():
         found.intake.take_submap(submap)
     return found
 
@@ -102,7 +101,7 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
         for k in range(3)
     ]
     assert not any(each.provisional for each in maps)
-    for submap in ALL:
+    for submap in SUBMAPS.every():
         found.intake.take_submap(submap)
     config = CentralConfig(tick_s=100.0, broadcast_s=3.0)
     assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
@@ -120,7 +119,7 @@ def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
     maps = [of(out, ch.FUSED_MAP)[0] for out in said]
     assert [sum(each.sequence + 1 for each in fused.members) for fused in maps] == [1, 2, 3]
     assert all(fused.provisional for fused in maps)
-    for submap in ALL:
+    for submap in SUBMAPS.every():
         found.intake.take_submap(submap)
     assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
 
@@ -192,7 +191,7 @@ def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
 
 def test_a_refused_submap_changes_no_bit_and_says_why():
     found = rule()
-    for submap in ALL:
+    for submap in SUBMAPS.every():
         found.intake.take_submap(submap)
         other = msgspec.structs.replace(submap, mean=submap.mean[:-8] + bytes(8))
         assert found.intake.take_submap(other) == submap.sequence + 1

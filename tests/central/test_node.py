@@ -9,11 +9,11 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.digest import digest_of
-from tests.teams import of, published, stream, submaps_of
+from tests.teams import Submaps, of, published, stream
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=3.0)
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
-SUBMAPS = {name: submaps_of(each) for name, each in STREAMS.items()}
+SUBMAPS = Submaps(list(STREAMS.values()))
 STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
 END = m.End(
     stamp_ns=0,

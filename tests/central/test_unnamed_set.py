@@ -1,5 +1,6 @@
 """Law 2 where landmarks have no names: the map is a function of the set of submaps and verdicts."""
 
+from functools import cache
 from itertools import permutations
 
 import numpy as np
@@ -21,7 +22,8 @@ CONFIG = CentralConfig(association=AssociationProfile(recent=4), withdraw_above=
 RING = 20.0
 
 
-def _team() -> dict[str, list[m.Submap]]:
+@cache
+def two_robots() -> dict[str, list[m.Submap]]:
     """Two robots with unknown initial poses on one ring, the second behind the first."""
     rng = np.random.default_rng(8)
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 80))
@@ -45,12 +47,9 @@ def _team() -> dict[str, list[m.Submap]]:
     return found
 
 
-TEAM = _team()
-
-
 def _rule() -> Scheduler:
     rule = Scheduler(JoinRule(CONFIG, bytes(8), ("r1", "r2")))
-    for robot in TEAM:
+    for robot in two_robots():
         start = m.InitialPose(
             stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
         )
@@ -80,8 +79,8 @@ def _final(rule: Scheduler) -> m.FusedMap:
 @pytest.fixture(scope="module")
 def final() -> m.FusedMap:
     rule = _rule()
-    for robot in TEAM:
-        for submap in TEAM[robot]:
+    for robot in two_robots():
+        for submap in two_robots()[robot]:
             rule.intake.take(submap, 0)
     return _final(rule)
 
@@ -91,10 +90,10 @@ def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(
 ) -> None:
     rule = _rule()
     for k in range(8):
-        rule.intake.take(TEAM["r2"][k], 0)
+        rule.intake.take(two_robots()["r2"][k], 0)
         if k % 3 == 2:
-            broadcasts(rule, TEAM["r2"][k].stamp_ns, TEAM["r2"][k].stamp_ns)
-    for submap in reversed(TEAM["r1"]):
+            broadcasts(rule, two_robots()["r2"][k].stamp_ns, two_robots()["r2"][k].stamp_ns)
+    for submap in reversed(two_robots()["r1"]):
         rule.intake.take(submap, 0)
     assert encoded(_final(rule)) == encoded(final)
     assert final.memberships
@@ -106,7 +105,7 @@ def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() 
     for order in permutations(("r1", "r2", "verdict")):
         rule = _rule()
         for what in order[:3]:
-            for message in [_verdict()] if what == "verdict" else TEAM[what]:
+            for message in [_verdict()] if what == "verdict" else two_robots()[what]:
                 rule.intake.take(message, 0)
         if order[0] == "r1":
             maps.append(_final(rule))
@@ -119,7 +118,7 @@ def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said
 ) -> None:
     for order in ((_verdict(), _verdict(withdrawn=True)), (_verdict(withdrawn=True), _verdict())):
         rule = _rule()
-        for message in (*TEAM["r1"], order[0], *TEAM["r2"], order[1]):
+        for message in (*two_robots()["r1"], order[0], *two_robots()["r2"], order[1]):
             rule.intake.take(message, 0)
         found = _final(rule)
         assert found.verdicts == ()
@@ -132,9 +131,9 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedM
         (robot, 1): m.InitialPose(
             stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
         )
-        for robot in TEAM
+        for robot in two_robots()
     }
-    submaps = {(robot, 1): TEAM[robot] for robot in TEAM}
+    submaps = {(robot, 1): two_robots()[robot] for robot in two_robots()}
     told = verdict_of(_verdict().judgement)
     inputs = SubmapInputs(starts=starts, submaps=submaps, verdicts=(told,))
     with_verdict = rule.rule.fuse(inputs, "final")[-1].message
@@ -149,13 +148,17 @@ def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been(
     """Whenever the order comes: before its submaps, among them, behind a broadcast."""
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
     alone = _rule()
-    for submap in TEAM["r1"]:
+    for submap in two_robots()["r1"]:
         alone.intake.take(submap, 0)
     wanted = _final(alone)
     maps = []
     for at in (0, 5, 16):
         rule = _rule()
-        both = [each for pair in zip(TEAM["r1"], TEAM["r2"], strict=True) for each in pair]
+        both = [
+            each
+            for pair in zip(two_robots()["r1"], two_robots()["r2"], strict=True)
+            for each in pair
+        ]
         for k, message in enumerate([*both[:at], order, *both[at:]]):
             rule.intake.take(message, 0)
             if k % 6 == 5:

@@ -9,6 +9,7 @@ from types import ModuleType
 
 import pytest
 
+from team.estimation import geometry
 from team.estimation.compiled import (
     CircularKernelsError,
     _CacheFile,
@@ -16,6 +17,7 @@ from team.estimation.compiled import (
     compiled,
     program_of,
 )
+from tests import kernels
 
 INNER = """
 from team.estimation.compiled import compiled
@@ -38,6 +40,13 @@ if __name__ == "__main__":
     input()
     print(kernel(10.0), sum(kernel.stats.cache_hits.values()))
 """
+
+
+def test_no_kernel_is_called_while_the_tests_are_imported(pytestconfig: pytest.Config) -> None:
+    """In a fresh clone one worker would compile it, and all others wait before their first test."""
+    assert pytestconfig.stash[kernels.AT_IMPORT] == []
+    geometry.wrapped(4.0)
+    assert "team.estimation.geometry.wrapped" in kernels.called()
 
 
 def computed(folder: Path, processes: int = 1) -> list[tuple[float, int]]:
