@@ -72,6 +72,8 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         door = "".join(f" {word}" for word in plan.door)
         endpoint, connected = entered(router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES))
         watch.place = f"--team {team} --connect {endpoint}{door}"
+        at = f'team="{team}", connect="{endpoint}"'
+        watch.call = at if plan.keys is None else f'{at}, keys="{plan.keys}"'
         with connected as bus:
             bus.subscribe(ch.STATUS)
             bus.subscribe(ch.FUSED_MAP)

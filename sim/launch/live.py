@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -22,8 +23,12 @@ if TYPE_CHECKING:
 
 LINE_S = 5.0
 """Wall time between two plain lines."""
+REPEAT_S = 60.0
+"""Wall time after which a line is repeated that says nothing new."""
 SETTLED_S = 5.0
 """A warning that a node withdraws sooner [s], as while a team starts, is not printed as a line."""
+UNIX_S = 1e9
+"""Team times from here on are Unix times: 1e9 s is in 2001."""
 PATIENCE_S = 8.0
 """Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
 
@@ -55,6 +60,8 @@ class _Lines:
         self._since: dict[str, float] = {}
         self._last: Watch | None = None
         self._noted = 0
+        self._line = ""
+        self._line_s = 0.0
 
     def show(self, watch: Watch) -> None:
         if self._last is None and watch.place:
@@ -72,20 +79,26 @@ class _Lines:
         if now < self._due or watch.world is None:
             return
         self._due = now + LINE_S
-        world = watch.world.figures
+        line = self._progress(watch, watch.world)
+        if line != self._line or now - self._line_s >= REPEAT_S:
+            self._line, self._line_s = line, now
+            self._print(watch, line)
+
+    def _progress(self, watch: Watch, world: m.Status) -> str:
+        """The line on how far the team is; of what a live team waits for it says who and what."""
         robots = [s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")]
-        if watch.world.state == "waiting":
-            self._print(watch, f"waiting: {len(robots)} of {watch.robots} robots")
-            return
+        if world.state == "waiting":
+            lacking = world.warnings if _is_live(watch) and len(robots) >= watch.robots else ()
+            self._shown |= {without_decimals(f"{DRIVERS}: {text}") for text in lacking}
+            return "; ".join(lacking) or f"waiting: {len(robots)} of {watch.robots} robots"
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
         consistency = _consistency(watch)
-        self._print(
-            watch,
-            f"{_share(watch):>4}  team time {world.get('team_time_s', 0.0):.0f} s, "
+        return (
+            f"{_share(watch):>4}  {_team_time(world)}, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
-            f"{'; ' if consistency else ''}{consistency}",
+            f"{'; ' if consistency else ''}{consistency}"
         )
 
     def end(self) -> None:
@@ -110,14 +123,33 @@ class _Lines:
         )
 
 
-def _done(watch: Watch) -> float:
-    """The share of the world's measurements that the robots have consumed; the world may be far
-    ahead of them.
+def _taken(watch: Watch) -> tuple[float, float]:
+    """How many of the world's measurements the robots have consumed, and their number; the world
+    may be far ahead of them.
     """
     total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
     robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
     taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
-    return min(taken / total, 1.0) if total else 0.0
+    return min(taken, total), total
+
+
+def _done(watch: Watch) -> float:
+    """The share of the world's measurements that the robots have consumed."""
+    taken, total = _taken(watch)
+    return taken / total if total else 0.0
+
+
+def _is_live(watch: Watch) -> bool:
+    """Whether drivers measure, and no world."""
+    return watch.world is not None and watch.world.node == DRIVERS
+
+
+def _team_time(world: m.Status) -> str:
+    """The team's time in words: the time of day (UTC) where it is Unix time."""
+    seconds = world.figures.get("team_time_s", 0.0)
+    if seconds < UNIX_S:
+        return f"team time {seconds:,.0f} s"
+    return f"team time {datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _warnings(watch: Watch) -> list[str]:
@@ -144,8 +176,10 @@ def _warnings(watch: Watch) -> list[str]:
 
 def _share(watch: Watch) -> str:
     """The progress in words: it is not known how much drivers will measure yet."""
-    live = watch.world is not None and watch.world.node == DRIVERS
-    return f"{_done(watch):.0%}" + " of what came so far" * live
+    if not _is_live(watch):
+        return f"{_done(watch):.0%}"
+    taken, total = _taken(watch)
+    return f"{taken:,.0f} of {total:,.0f} measurements mapped"
 
 
 def _view(title: str, watch: Watch) -> Group:
@@ -162,7 +196,7 @@ def _view(title: str, watch: Watch) -> Group:
         bar.add_row(
             ProgressBar(total=1.0, completed=_done(watch), width=36),
             _share(watch),
-            f"team time {world.figures.get('team_time_s', 0.0):,.0f} s, {world.node} {world.state}",
+            f"{_team_time(world)}, {world.node} {world.state}",
         )
         parts.append(bar)
     if robots:

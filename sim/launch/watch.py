@@ -1,6 +1,7 @@
 """The state of a running team: its nodes' last statuses, its map, and events of its processes."""
 
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 TURN_S = 0.1
 DRIVERS = "drivers"
 """The drivers of a live team, as one node."""
+SILENT_S = 10.0
+"""A driver without a status for longer than this [s] is named: it sends one each second."""
 _PROGRESS = ("measurements", "submaps", "messages")
 """Figures of a status that grow with the node's progress."""
 
@@ -34,8 +37,8 @@ class Watch:
     """The state of the team while it runs: the last status of each node, and the last map.
 
     robots: their number. drivers: of a live team, whose drivers are waited for. errors: of poses
-    and map, where there is truth. place: the options by which other commands reach the team. notes:
-    events of processes, in words. restarts: how often each process was started again. given_up: the
+    and map, where there is truth. place: the options by which other commands reach the team. call:
+    the same as a driver's program has them. notes: events of processes, in words. restarts: how often each process was started again. given_up: the
     nodes that were given up. last_message: the time of each node's last status. peers: the robots
     that are to have a final map of their own; concluded: those that have it; concluded_s: since
     when. signer: signs orders, where there are keys.
@@ -48,6 +51,7 @@ class Watch:
     robots: int = 0
     errors: "LiveErrors" = field(default_factory=_no_errors)
     place: str = ""
+    call: str = ""
     notes: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     given_up: list[str] = field(default_factory=list)
@@ -65,21 +69,41 @@ class Watch:
         if self.drivers is None:
             return self.statuses.get("world")
         there = [s for node, s in self.statuses.items() if node.startswith("source/")]
-        named = {status.node.removeprefix("source/") for status in there}
-        missing = sorted(set(self.drivers) - named)
         figures = {
             "of": sum(status.figures.get("measurements", 0.0) for status in there),
             "team_time_s": max((s.figures.get("team_time_s", 0.0) for s in there), default=0.0),
         }
-        waiting = (f"waiting for the drivers of {', '.join(missing)}",) if missing else ()
         states = {status.state for status in there}
         return m.Status(
             stamp_ns=max((status.stamp_ns for status in there), default=0),
             node=DRIVERS,
             state=states.pop() if len(states) == 1 else "measuring" if states else "waiting",
             figures=figures,
-            warnings=waiting,
+            warnings=tuple(self._drivers_lacking(there)),
         )
+
+    def _drivers_lacking(self, there: Sequence[m.Status]) -> Iterator[str]:
+        """Which drivers of a live team are waited for, and what to do; of `there` the statuses."""
+        missing = sorted(set(self.drivers or ()) - {_robot(status) for status in there})
+        if missing:
+            first = missing[0]
+            yield (
+                f"waiting for the driver{'s' * (len(missing) > 1)} of {', '.join(missing)}: start "
+                f'the program that has Driver("{first}", {self.call}), or, of a ROS 2 robot, '
+                f"teamslam driver {first} --ros2 FILE {self.place}; teamslam end --without "
+                f"{first} {self.place} goes on without it"
+            )
+        now = time.monotonic()
+        for status in sorted(there, key=_robot):
+            robot = _robot(status)
+            silent = now - self.last_message.get(status.node, now) > SILENT_S
+            if status.state == "left" or (silent and status.state != "ended"):
+                yield (
+                    f"the driver of {robot} is away: start it again with its file, or go on by "
+                    f"teamslam end --without {robot} {self.place}"
+                )
+            elif status.state == "waiting":
+                yield f"the driver of {robot} is there and has handed over no odometry yet"
 
     @property
     def is_over(self) -> bool:
@@ -136,3 +160,8 @@ class Watch:
         statuses = [self.statuses[name] for name in names if name in self.statuses]
         figures = [status.figures.get(name, 0.0) for status in statuses for name in _PROGRESS]
         return sum(figures)
+
+
+def _robot(status: m.Status) -> str:
+    """The robot of a driver's status."""
+    return status.node.removeprefix("source/")

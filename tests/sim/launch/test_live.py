@@ -35,10 +35,43 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     assert place.endswith("by --team t --connect tcp/127.0.0.1:1")
     assert waiting.endswith("] waiting: 1 of 3 robots")
     assert " 50%  team time 0 s, 2 robots" in running
-    watch.drivers = ("r1",)  # nobody knows how much drivers will measure yet
-    watch.statuses["source/r1"] = status("source/r1", "measuring", measurements=60.0)
-    lines.show(watch)
-    assert "% of what came so far  team time" in " ".join(out.getvalue().split("\n")[-3:])
+
+
+def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repeats_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(live, "LINE_S", 0.0)
+    monkeypatch.setattr(live, "SETTLED_S", 0.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=100))
+    place, call = "--team lab --connect tcp/[::1]:9", 'team="lab", connect="tcp/[::1]:9"'
+    watch = Watch(robots=2, drivers=("r1", "r2"), place=place, call=call, began=-1e9)
+
+    def shown() -> list[str]:
+        begin = len(out.getvalue())
+        lines.show(watch)
+        lines.show(watch)
+        return out.getvalue()[begin:].splitlines()
+
+    for robot in ("r1", "r2"):
+        watch.statuses[f"robot/{robot}"] = status(f"robot/{robot}", "waiting")
+    waiting = shown()[-1]
+    assert "waiting for the drivers of r1, r2: start the program" in waiting
+    assert f'Driver("r1", {call})' in waiting
+    assert f"teamslam driver r1 --ros2 FILE {place}" in waiting
+    watch.statuses["source/r1"] = status("source/r1", "waiting")
+    come = shown()[-1]
+    assert "waiting for the driver of r2" in come
+    assert "r1 is there and has handed over no odometry" in come
+    watch.statuses["source/r1"] = status(
+        "source/r1", "measuring", measurements=60.0, team_time_s=1.7e9
+    )
+    watch.statuses["robot/r1"] = status("robot/r1", "mapping", measurements=30.0)
+    (running,) = shown()
+    assert "30 of 60 measurements mapped  team time 2023-11-14 22:13:20 UTC" in running
+    watch.statuses["source/r2"] = status("source/r2", "left")
+    assert "the driver of r2 is away: start it again" in shown()[0]
+    assert any("the driver of r2 is away" in line for line in printed(watch, 300))
 
 
 def told(robots: int, *, truth: bool) -> Watch:
