@@ -10,17 +10,11 @@ from scipy.optimize import minimize
 from central.desk.evaluation.errors import on_circle
 from sim.calibration.data import Reference, poses_at, sinc
 from sim.calibration.figures import CalibrationError, huber
+from sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S
 
-SPAN_S = 10.0
-"""Length [s] of the spans over which errors are taken: errors of one command are correlated for
-seconds.
-"""
 STEPS = 40
 """Number of steps of a span, each an arc (or a rotation and a chord) of the true path."""
 STEP_S = SPAN_S / STEPS
-LEAST_SPANS = 30
-LEAST_WAY_M = 0.05
-"""A span with a shorter logged path [m] has no motion."""
 ROUNDS = 4
 STANDING_M_S = 1e-3
 """Speeds below this [m/s] count as standing."""

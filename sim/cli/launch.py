@@ -13,6 +13,7 @@ import typer
 from sim.cli.importing import imported_into, is_foreign
 from sim.cli.options import (
     ANY_PORT,
+    ASSUMED_NAME,
     FAILED,
     LOOPBACK,
     WRONG_USE,
@@ -40,6 +41,7 @@ from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 if TYPE_CHECKING:
     from sim.launch.launch import Outcome
     from sim.launch.plan import Plan
+    from sim.world.streams import WorldStreams
 
 COMPILING_S = 3.0
 """Time [s] between two lines about kernels that are being compiled."""
@@ -138,7 +140,9 @@ def launch(
     if pieces is not None:
         check_pieces(resolved)
     resolved, missing = with_present_robots(resolved)
-    _check_world(resolved)
+    streams = _checked_world(resolved)
+    if name == ASSUMED_NAME and dataset is not None and streams is not None:
+        typer.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == ANY_PORT:
         listen = LOOPBACK  # drivers have to find it
     for text in (*scenario_warnings(resolved), *([missing] if missing else [])):
@@ -208,13 +212,29 @@ def _keep_showing(url: str, log: Path) -> None:
         stop.wait()
 
 
-def _check_world(scenario: Scenario) -> None:
-    """Check the data set before any process starts."""
+def _checked_world(scenario: Scenario) -> "WorldStreams | None":
+    """The streams of a data set, which is checked before any process starts."""
     from sim.scenarios.source import streams_of
     from sim.world.config import FolderWorld, UtiasWorld
 
-    if isinstance(scenario.world, UtiasWorld | FolderWorld):
-        streams_of(scenario)
+    return streams_of(scenario) if isinstance(scenario.world, UtiasWorld | FolderWorld) else None
+
+
+def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
+    """How the robots' own models come into a data set that has none."""
+    from sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
+
+    found = moving_stretches(streams.streams)
+    if found >= LEAST_SPANS:
+        return (
+            f"`teamslam calibrate {dataset} -o {dataset / 'scenario.toml'}` learns your robots' "
+            "own from the data"
+        )
+    return (
+        f"the data have {found} stretch{'es' * (found != 1)} of {SPAN_S:.0f} s with "
+        f"motion, and `teamslam calibrate` needs {LEAST_SPANS}: write what you know of your robots "
+        f"into {dataset / 'scenario.toml'} (docs/your_data.md), or record more"
+    )
 
 
 def _check_writable(path: Path) -> None:

@@ -46,12 +46,13 @@ Keys = Annotated[
         metavar="DIR",
     ),
 ]
+ASSUMED_NAME = "recorded"
+"""The built-in scenario for recorded data of robots that nobody has calibrated yet."""
 ASSUMED = (
     "the built-in one `recorded` is taken. It assumes odometry that is off by 5 cm and 2° after a "
-    "metre and by 6° after a radian, ranges by 5 cm and 2 %, bearings by 1.7°. `teamslam calibrate "
-    "FOLDER -o FOLDER/scenario.toml` learns your robots' own from the data"
+    "metre and by 6° after a radian, ranges by 5 cm and 2 %, bearings by 1.7°"
 )
-"""Remarks on the built-in scenario for recorded data of unknown robots."""
+"""What that scenario assumes."""
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
 TeamOption = Annotated[
@@ -215,7 +216,7 @@ def scenario_for(dataset: Path) -> str:
     from sim.scenarios.source import scenario_beside
 
     name = scenario_beside(dataset)
-    if name == "recorded":
+    if name == ASSUMED_NAME:
         typer.echo(f"no scenario given, and no scenario.toml in {dataset}: {ASSUMED}", err=True)
     elif name != "utias":
         typer.echo(f"scenario: {name}", err=True)

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
+from sim.cli import launch
 from sim.cli.main import app
 from sim.importing.columns import load_map
 from sim.scenarios.scenario import load, with_options
@@ -41,6 +44,20 @@ def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.Mo
     assert [stream.robot for stream in world.streams] == ["r1", "r2"]
     assert all(len(stream.landmark_detections.ids) == 2400 for stream in world.streams)
     assert world.landmarks is not None
+    assert "`teamslam calibrate my_set -o my_set/scenario.toml` learns" in (
+        launch._how_to_learn(Path("my_set"), world)
+    )
+    short = [
+        replace(each, intervals=each.intervals.where(each.intervals.end_ns < 100_000_000_000))
+        for each in world.streams
+    ]
+    found = moving_stretches(short)
+    assert 0 < found < LEAST_SPANS
+    advice = launch._how_to_learn(Path("my_set"), replace(world, streams=tuple(short)))
+    assert f"have {found} stretches of 10 s" in advice
+    assert f"needs {LEAST_SPANS}: write what you know" in advice
+    page = (ROOT / "docs" / "your_data.md").read_text("utf-8")
+    assert f"{LEAST_SPANS} stretches of {SPAN_S:.0f} s" in page
 
 
 def test_the_scenario_and_the_map_of_the_page_are_sound(
