@@ -12,14 +12,14 @@ import numpy as np
 from team import Driver
 
 name, folder, team, endpoint, *pause = sys.argv[1:]
-events = []
+events, speed = [], [0.0, 0.0]
 for kind in ("observations", "odometry"):
     rows = list(csv.reader((Path(folder) / f"{kind}.csv").open()))[1:]
     for t, group in groupby(rows, lambda row: row[0]):
         events.append((Decimal(t), kind, [float(x) for row in group for x in row[1:] if x]))
-start = [float(x) for x in (Path(folder) / "start.csv").read_text().split()[1].split(",")]
+given = Path(folder) / "start.csv"  # without this file the landmarks place the robot
+start = [float(x) for x in given.read_text().split()[1].split(",")] if given.exists() else None
 
-speed = [0.0, 0.0]
 with Driver(name, team=team, connect=endpoint, start=start) as robot:
     for t, kind, numbers in sorted(events):  # what is seen at a time, then how it has moved
         if kind == "odometry":

@@ -15,6 +15,10 @@ from team.wire.newer import later_head
 LOOK_S = 0.1
 APART_S = 1.0
 """Clocks that differ by more than this [s] are named: no measurement is on its way for so long."""
+PAST_S = 3600.0
+"""Stamps that are further from the machine's own clock [s] are those of recorded data."""
+DRIFT = 0.1
+"""A clock that goes faster or slower by this share of the time is no clock: a lag that changes."""
 
 
 @dataclass
@@ -22,11 +26,14 @@ class Member:
     """One node: its liveliness, its last status, and what it counted in which time.
 
     clock_s: its team time less its machine's wall clock; None where it reports no team time.
+    drift: by how much that has changed per second of the observation.
     """
 
     alive: bool = False
     status: m.Status | None = None
     clock_s: float | None = None
+    drift: float = 0.0
+    _clock: tuple[float, float] | None = field(default=None, repr=False)
     _first: tuple[float, float] | None = field(default=None, repr=False)
     _last: tuple[float, float] | None = field(default=None, repr=False)
 
@@ -38,6 +45,10 @@ class Member:
         self._first = self._first or self._last
         measured = status.node.startswith("source/") and status.state == "measuring"
         self.clock_s = 1e-9 * (status.stamp_ns - wall_ns) if measured else None
+        if self.clock_s is not None:
+            self._clock = began_s, offset_s = self._clock or (1e-9 * wall_ns, self.clock_s)
+            lasted_s = 1e-9 * wall_ns - began_s
+            self.drift = (self.clock_s - offset_s) / lasted_s if lasted_s > 0.0 else 0.0
 
     @property
     def rate(self) -> float | None:
@@ -123,10 +134,8 @@ class Presence:
         for node, ahead_s in sorted(clocks.items()):
             if abs(ahead_s) > APART_S and len(clocks) > 1:
                 way = "ahead of" if ahead_s > 0 else "behind"
-                advice.append(
-                    f"{node} stamps {abs(ahead_s):.1f} s {way} the others: set its machine's clock "
-                    "(NTP, PTP), or stamp with the clock that the others have"
-                )
+                remedy = _remedy(self.members[node], behind=ahead_s < 0.0)
+                advice.append(f"{node} stamps {abs(ahead_s):.1f} s {way} the others: {remedy}")
         for node, member in sorted(self.members.items()):
             if member.alive and member.status is not None:
                 advice += [f"{node}: {warning}" for warning in member.status.warnings]
@@ -148,3 +157,28 @@ class Presence:
                 f"on by teamslam end --without {robot}"
             )
         return advice
+
+
+def _remedy(member: Member, *, behind: bool) -> str:
+    """What to do about a driver whose stamps are not the others': of recorded data, and of a lag
+    that changes, no clock is to be set.
+    """
+    if abs(member.clock_s or 0.0) > PAST_S:
+        if not behind:
+            return "recorded data, of which the others began later or go slower; the map waits"
+        return (
+            "recorded data, which began later or go slower: the map waits for them; a program that "
+            "is started again need not begin anew, but may go on after robot.last_time"
+        )
+    if behind and abs(member.drift) > DRIFT:
+        way = "catches up" if member.drift > 0.0 else "falls further behind"
+        return (
+            f"it lags and {way}: its program hands over what lies back; started again, it may go "
+            "on after robot.last_time"
+        )
+    return (
+        "set its machine's clock (NTP, PTP), or stamp with the clock that the others have; or its "
+        "program lags behind what it measures"
+        if behind
+        else "set its machine's clock (NTP, PTP), or stamp with the clock that the others have"
+    )

@@ -126,7 +126,9 @@ def _judge_speeds(
     steps: Float[np.ndarray, "N _"],
     duration: Int64[np.ndarray, " N"],
 ) -> None:
-    """Note motions beyond a robot's bounds, which robots refuse."""
+    """Note motions beyond a robot's bounds, which robots refuse; raises DatasetError where the
+    usual turn is one of degrees.
+    """
     if form == STEERED or not len(steps):
         return
     seconds = duration * 1e-9
@@ -134,6 +136,12 @@ def _judge_speeds(
         speed, rate = np.abs(steps).T
     else:
         speed, rate = np.hypot(*steps[:, :2].T) / seconds, np.abs(steps[:, 2]) / seconds
+    turning = rate[rate > 0.0]
+    if len(turning) > 1 and np.median(turning) > WHIRLING_RAD_S:
+        raise rows.table.fault(
+            f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: of "
+            "degrees a map of columns makes radians (scale = 0.017453292519943295)"
+        )
     bounds = Bounds()
     fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)
     first = 1 if form == POSES else 0
@@ -144,12 +152,6 @@ def _judge_speeds(
         f"beyond {bounds.speed_m_s:g} m/s or {bounds.yaw_rate_rad_s:g} rad/s, which a robot "
         "refuses: metres, radians and seconds are meant",
     )
-    turning = rate[rate > 0.0]
-    if not fast.any() and len(turning) and np.median(turning) > WHIRLING_RAD_S:
-        rows.notes.append(
-            f"it turns by {np.median(turning):.1f} rad/s most of the time: of degrees a map of "
-            "columns makes radians (scale = 0.017453292519943295)"
-        )
 
 
 def _form(table: CsvTable) -> tuple[str, ...]:

@@ -36,29 +36,44 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 Map = dict[str, Table]
 
-SYNONYMS: Mapping[str, Sequence[str]] = {
-    "t_s": ("t", "time", "times", "timestamp", "stamp", "sec", "secs", "seconds"),
-    "forward_m_s": ("v", "vx", "speed", "velocity", "forward", "linear", "linear_x"),
-    "yaw_rate_rad_s": ("w", "omega", "wz", "yaw_rate", "yawrate", "angular", "angular_z", "gyro_z"),
-    "x_m": ("x", "pos_x", "px", "easting"),
-    "y_m": ("y", "pos_y", "py", "northing"),
-    "theta_rad": ("theta", "yaw", "heading", "phi", "orientation"),
-    "dx_m": ("dx", "delta_x"),
-    "dy_m": ("dy", "delta_y"),
-    "dtheta_rad": ("dtheta", "dyaw", "delta_theta", "delta_yaw"),
-    "wheel_speed_m_s": ("rear_wheel_speed", "wheel_speed"),
-    "steering_rad": ("steering", "steering_angle", "steer"),
-    "landmark": ("id", "tag", "tag_id", "marker", "marker_id", "barcode", "landmark_id", "subject"),
-    "teammate": ("robot", "robot_id", "other"),
-    "range_m": ("range", "r", "distance", "dist", "rho"),
-    "bearing_rad": ("bearing", "beta", "angle", "azimuth"),
+SYNONYMS: Mapping[str, str] = {
+    "t_s": "t time times timestamp stamp sec secs seconds ts epoch unix unix_time header_stamp",
+    "forward_m_s": "v vx v_x vel vel_x speed velocity forward forward_speed forward_velocity "
+    "forward_vel linear linear_x lin_x linear_vel linear_velocity linear_velocity_x lin_vel "
+    "ground_speed longitudinal longitudinal_speed speed_x velocity_x",
+    "yaw_rate_rad_s": "w w_z wz omega omega_z yaw_rate yaw_vel yaw_velocity turn_rate turning_rate "
+    "rotation_rate rot_rate rot_vel heading_rate theta_dot yaw_dot dtheta_dt vth vtheta v_theta "
+    "angular angular_z ang_z angular_speed angular_vel angular_velocity angular_velocity_z ang_vel "
+    "gyro gyro_z gyr gyr_z gz gyro_yaw imu_gyro imu_gyro_z imu_yaw_rate "
+    "imu_angular_velocity_z",
+    "x_m": "x pos_x x_pos px easting east",
+    "y_m": "y pos_y y_pos py northing north",
+    "theta_rad": "theta yaw heading phi psi orientation angle_z rot_z",
+    "dx_m": "dx delta_x",
+    "dy_m": "dy delta_y",
+    "dtheta_rad": "dtheta dyaw delta_theta delta_yaw dphi dheading delta_heading",
+    "wheel_speed_m_s": "rear_wheel_speed wheel_speed wheel_velocity",
+    "steering_rad": "steering steering_angle steer steer_angle",
+    "landmark": "id ids tag tag_id marker marker_id barcode landmark_id lm lm_id subject feature "
+    "feature_id beacon beacon_id fiducial fiducial_id aruco aruco_id apriltag apriltag_id target "
+    "target_id",
+    "teammate": "robot robot_id other other_robot teammate_id neighbour neighbor",
+    "range_m": "range ranges r distance dist rho rng",
+    "bearing_rad": "bearing bearings beta angle azimuth brg",
 }
+"""Names of columns, in words between which nothing, a mark or a capital letter may stand."""
+DEGREE = "0.017453292519943295"
 UNITS = {
-    "s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9",
-    "m": "1", "mm": "1e-3", "cm": "1e-2", "rad": "1", "deg": "0.017453292519943295",
-    "m_s": "1", "rad_s": "1", "deg_s": "0.017453292519943295", "mps": "1", "rps": "1",
+    "s": "1", "sec": "1", "ms": "1e-3", "msec": "1e-3", "us": "1e-6", "usec": "1e-6", "ns": "1e-9",
+    "nsec": "1e-9", "nanos": "1e-9", "m": "1", "mm": "1e-3", "cm": "1e-2", "km": "1e3",
+    "rad": "1", "radians": "1", "deg": DEGREE, "degrees": DEGREE,
+    "m_s": "1", "mps": "1", "cm_s": "1e-2", "mm_s": "1e-3", "km_h": "0.2777777777777778",
+    "kmh": "0.2777777777777778", "kph": "0.2777777777777778", "rad_s": "1", "rad_sec": "1",
+    "rps": "1", "deg_s": DEGREE, "deg_sec": DEGREE, "dps": DEGREE,
 }  # fmt: skip
 """The factor to our unit, by the unit at the end of a column's name."""
+LARGEST_S = 1e11
+"""Times from here on are no seconds: as Unix times, 1e11 s is in the year 5138, 1e11 ms in 1973."""
 KINDS = ("odometry", "observations", "sightings", "truth", "landmarks", "start")
 FILE_NAMES: Mapping[str, Sequence[str]] = {
     "odometry": ("odom", "wheel", "encoder"),
@@ -70,7 +85,8 @@ FILE_NAMES: Mapping[str, Sequence[str]] = {
 }
 """Parts of file names by the kind of table that they indicate."""
 PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "truth", "gt", "tag",
-            "marker", "landmark")  # fmt: skip
+            "marker", "landmark", "twist", "encoder", "measured", "measurement", "header",
+            "field")  # fmt: skip
 """Words before a column's name that repeat its file's kind: odom_x, pose.position.y."""
 
 
@@ -124,8 +140,11 @@ def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
     for name, table in files.items():
         kind, columns = _kind(name, list(table.columns))
         if kind is None:
-            lacking.append(f"{name}: no table of ours: it has {', '.join(table.columns)}")
+            lacking.append(
+                f"{name}: no table of ours by its columns' names: {', '.join(table.columns)}"
+            )
             continue
+        columns |= _clock(columns.get("t_s", ""), table)
         if kind in kinds:
             lacking.append(f"{name}: might be {kind}, too")
             continue
@@ -161,10 +180,11 @@ def _kind(name: str, header: Sequence[str]) -> tuple[str | None, dict[str, str]]
 
 def _near(ours: str, header: Sequence[str]) -> str | None:
     """The column whose name is close to ours, if there is one."""
+    names = {_joined(name) for name in SYNONYMS.get(ours, "").split()}
+    names.add(_joined(_without_unit(ours)[0]))
     for theirs in header:
         bare, scale = _without_unit(theirs)
-        names = {*SYNONYMS.get(ours, ()), _without_unit(ours)[0]}
-        if theirs == ours or bare in names or _without_prefix(bare) in names:
+        if theirs == ours or _joined(bare) in names or _joined(_without_prefix(bare)) in names:
             if scale == "1" or theirs == ours:
                 return f'"{theirs}"'
             return f'{{ column = "{theirs}", scale = {scale} }}'
@@ -173,7 +193,8 @@ def _near(ours: str, header: Sequence[str]) -> str | None:
 
 def _without_unit(name: str) -> tuple[str, str]:
     """A column's name in small letters without its unit, and the factor of the unit."""
-    plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
+    plain = re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
     for unit in sorted(UNITS, key=len, reverse=True):
         if plain.endswith(f"_{unit}"):
             return plain.removesuffix(f"_{unit}"), UNITS[unit]
@@ -183,3 +204,22 @@ def _without_unit(name: str) -> tuple[str, str]:
 def _without_prefix(name: str) -> str:
     first, _, rest = name.partition("_")
     return _without_prefix(rest) if rest and first in PREFIXES else name
+
+
+def _joined(name: str) -> str:
+    return name.replace("_", "")
+
+
+def _clock(chosen: str, table: CsvTable) -> dict[str, str]:
+    """The column of times with a scale, where its name has no unit and its numbers are no
+    seconds.
+    """
+    cells = table.columns.get(chosen.strip('"'), [])
+    try:
+        largest = abs(float(cells[0]))
+    except (IndexError, ValueError):
+        return {}
+    power = 0
+    while largest >= LARGEST_S and power < 9:
+        largest, power = largest * 1e-3, power + 3
+    return {"t_s": f"{{ column = {chosen}, scale = 1e-{power} }}"} if power else {}

@@ -4,7 +4,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -15,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from central.desk.evaluation.events import without_decimals
-from sim.launch.watch import DRIVERS, Watch
+from sim.launch.watch import DRIVERS, Watch, team_time
 from team.wire import messages as m
 
 if TYPE_CHECKING:
@@ -27,8 +26,6 @@ REPEAT_S = 60.0
 """Wall time after which a line is repeated that says nothing new."""
 SETTLED_S = 5.0
 """A warning that a node withdraws sooner [s], as while a team starts, is not printed as a line."""
-UNIX_S = 1e9
-"""Team times from here on are Unix times: 1e9 s is in 2001."""
 PATIENCE_S = 8.0
 """Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
 
@@ -96,7 +93,7 @@ class _Lines:
         landmarks = 0 if fused is None else len(fused.ids) // 4
         consistency = _consistency(watch)
         return (
-            f"{_share(watch):>4}  {_team_time(world)}, "
+            f"{_share(watch):>4}  {team_time(world)}, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
             f"{'; ' if consistency else ''}{consistency}"
         )
@@ -144,14 +141,6 @@ def _is_live(watch: Watch) -> bool:
     return watch.world is not None and watch.world.node == DRIVERS
 
 
-def _team_time(world: m.Status) -> str:
-    """The team's time in words: the time of day (UTC) where it is Unix time."""
-    seconds = world.figures.get("team_time_s", 0.0)
-    if seconds < UNIX_S:
-        return f"team time {seconds:,.0f} s"
-    return f"team time {datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
-
-
 def _warnings(watch: Watch) -> list[str]:
     """The failures, and the nodes' warnings; absent nodes are warned of after PATIENCE_S only.
 
@@ -196,7 +185,7 @@ def _view(title: str, watch: Watch) -> Group:
         bar.add_row(
             ProgressBar(total=1.0, completed=_done(watch), width=36),
             _share(watch),
-            f"{_team_time(world)}, {world.node} {world.state}",
+            f"{team_time(world)}, {world.node} {world.state}",
         )
         parts.append(bar)
     if robots:

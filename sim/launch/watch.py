@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from central.desk.peers_as_centre import PeersAsCentre
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 TURN_S = 0.1
 DRIVERS = "drivers"
 """The drivers of a live team, as one node."""
+UNIX_S = 1e9
+"""Team times from here on are Unix times: 1e9 s is in 2001."""
 SILENT_S = 10.0
 """A driver without a status for longer than this [s] is named: it sends one each second."""
 _PROGRESS = ("measurements", "submaps", "messages")
@@ -38,10 +41,11 @@ class Watch:
 
     robots: their number. drivers: of a live team, whose drivers are waited for. errors: of poses
     and map, where there is truth. place: the options by which other commands reach the team. call:
-    the same as a driver's program has them. notes: events of processes, in words. restarts: how often each process was started again. given_up: the
-    nodes that were given up. last_message: the time of each node's last status. peers: the robots
-    that are to have a final map of their own; concluded: those that have it; concluded_s: since
-    when. signer: signs orders, where there are keys.
+    the same as a driver's program has them. notes: events of processes, in words. restarts: how
+    often each process was started again. given_up: the nodes that were given up. last_message: the
+    time of each node's last status. peers: the robots that are to have a final map of their own;
+    concluded: those that have it; concluded_s: since when. signer: signs orders, where there are
+    keys.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -165,3 +169,11 @@ class Watch:
 def _robot(status: m.Status) -> str:
     """The robot of a driver's status."""
     return status.node.removeprefix("source/")
+
+
+def team_time(world: m.Status) -> str:
+    """The team's time in words: the time of day (UTC) where it is Unix time."""
+    seconds = world.figures.get("team_time_s", 0.0)
+    if seconds < UNIX_S:
+        return f"team time {seconds:,.0f} s"
+    return f"team time {datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -2,6 +2,7 @@
 
 import difflib
 import math
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
@@ -52,11 +53,16 @@ def check_known(name: str, known: list[str], at: str) -> None:
     if name in known:
         return
     where = f"at {at}" if at else "at the top"
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean `{close[0]}`?" if close else ""
+    hint = close(name, known)
     if name in TOP_LEVEL:
         hint = f"; `{name}` is said once for the whole team, at the top of the file"
     raise ScenarioError(f"unknown field `{name}` {where}; known: {', '.join(known)}{hint}")
+
+
+def close(name: object, known: Iterable[str]) -> str:
+    """A question whether the closest known name is meant; empty where none is close."""
+    found = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean `{found[0]}`?" if found else ""
 
 
 def plain(error: msgspec.ValidationError, at: str = "") -> ScenarioError:

@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from central.config import CentralConfig
-from sim.scenarios.checks import ScenarioError, check_fields, check_known, plain
+from sim.scenarios.checks import ScenarioError, check_fields, check_known, close, plain
 from team.config import RobotConfig
 
 MAX_ROBOTS = 100
@@ -136,7 +136,7 @@ def _parsed(text: str) -> Fields:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"not valid TOML: {error}") from None
+        raise ScenarioError(f"not valid TOML: {error}; texts stand in quotes") from None
 
 
 def _based(document: Fields) -> Fields:
@@ -147,7 +147,12 @@ def _based(document: Fields) -> Fields:
     base = document["base"]
     if base not in builtin_names():
         known = ", ".join(builtin_names())
-        raise ScenarioError(f"expected a built-in scenario, got {base!r} at base; known: {known}")
+        hint = close(base, builtin_names())
+        if isinstance(base, str) and base.endswith(".toml"):
+            hint = "; a file can not be a base: copy what you need of it"
+        raise ScenarioError(
+            f"expected a built-in scenario, got {base!r} at base; known: {known}{hint}"
+        )
     below = _builtin(base)
     kind = own["world"].get("kind") if isinstance(own.get("world"), dict) else None
     if kind is not None and kind != below.get("world", {}).get("kind"):

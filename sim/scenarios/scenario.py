@@ -22,12 +22,11 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
+from sim.scenarios.worlds import WORLDS, check_world
 from sim.world.config import (
-    FolderWorld,
     LiveWorld,
     Radio,
     SimulatedWorld,
-    UnlabelledWorld,
     UtiasWorld,
     World,
 )
@@ -42,13 +41,6 @@ __all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads
 
 FAR_M = 10.0
 """The end of a sensor's range where nothing gives it."""
-WORLDS: dict[str, type[World]] = {
-    "simulated": SimulatedWorld,
-    "utias": UtiasWorld,
-    "folder": FolderWorld,
-    "live": LiveWorld,
-    "unlabelled": UnlabelledWorld,
-}
 
 
 class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -220,13 +212,7 @@ def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
 
 def _converted(fields: Fields) -> Scenario:
     """Plain fields → a scenario whose parts fit together; raises ScenarioError."""
-    world = checked_table(fields.get("world", {}), "world")
-    kind = world.get("kind")
-    if not isinstance(kind, str) or kind not in WORLDS:
-        known = ", ".join(f'"{each}"' for each in WORLDS)
-        got = "nothing" if kind is None else repr(kind)
-        raise ScenarioError(f"expected one of {known}, got {got} at world.kind")
-    check_fields(world, WORLDS[kind], "world")
+    check_world(checked_table(fields.get("world", {}), "world"))
     for choice, declared in (
         ("estimator", Estimator),
         ("fusion", FusionRule),

@@ -47,6 +47,8 @@ JUMP_S = 86_400.0
 AHEAD_S = 10.0
 """A landmark measurement may be stamped this far [s] ahead of the odometry; beyond it the two are
 taken to have different clocks."""
+LIKELY_RAD_S = 4.0 * np.pi
+"""A yaw rate beyond two turns a second is taken to be in degrees, unless bounds are given."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -64,7 +66,8 @@ class Driver:
     knows; start_covariance: 3 × 3, None where it is exactly known. landmarks: their numbers, if
     they are known beforehand. latency_s: what is seen may come so much later than newer odometry.
     patience_s: how long to wait for the router where the file is new; 0: not at all, it may come
-    later. bounds: what is physically sensible.
+    later. bounds: what is physically sensible; without them a yaw rate beyond LIKELY_RAD_S is
+    refused, too.
 
     Times `t` are seconds of one clock for the whole team, as of Unix time. Raises DriverError where
     it can not begin; each call raises MeasurementError for what can not be a measurement.
@@ -89,6 +92,7 @@ class Driver:
             raise DriverError(f"{robot!r} is no robot's name: {measured.NAMED}")
         self.robot = robot
         self._bounds = Bounds() if bounds is None else bounds
+        self._fastest_turn = LIKELY_RAD_S if bounds is None else self._bounds.yaw_rate_rad_s
         self._start = _start_of(robot, start, start_covariance)
         self._known = None if landmarks is None else frozenset(landmarks)
         self._lock = threading.Lock()
@@ -142,7 +146,14 @@ class Driver:
         Without a duration: since the last call; the first such call says when the robot begins.
         """
         stamp_ns, length_ns = _times(t, duration, "odometry")
-        v, w = measured.pair(forward, yaw_rate, f"odometry of {self.robot} at {t} s")
+        what = f"odometry of {self.robot} at {t} s"
+        v, w = measured.pair(forward, yaw_rate, what)
+        if abs(w) > self._fastest_turn:
+            raise MeasurementError(
+                f"{what}: a yaw rate of {w:g} rad/s is {abs(w) / (2.0 * np.pi):.1f} turns a "
+                f"second: yaw rates are in radians, and {w:g} degrees are {np.radians(w):.3g}; for "
+                "a robot that does turn so give bounds=Bounds(yaw_rate_rad_s=…)"
+            )
         with self._lock:
             lasts_ns = self._until(stamp_ns, length_ns, "odometry")
             seconds = 1e-9 * (lasts_ns or 10**9)

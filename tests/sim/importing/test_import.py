@@ -10,9 +10,11 @@ from typer.testing import CliRunner, Result
 
 from sim.cli.importing import readable
 from sim.cli.main import app
+from sim.datasets.csv_table import CsvTable
 from sim.datasets.folder_writer import write_folder
 from sim.datasets.tables import DatasetError
 from sim.datasets.utias_writer import write_utias
+from sim.importing.columns import proposed
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import scenario_beside, streams_of
 from sim.world.streams import WorldStreams
@@ -232,6 +234,42 @@ def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_ex
     columns.write_text(columns.read_text().replace("scale = 1e-", "scale = 1e+"))
     refused = str(run(logs, "-o", tmp_path / "x", "--columns", columns).exception)
     assert "is out of bounds" in refused
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "expected"),
+    [
+        (
+            "time,speed,gyro",
+            "1763800000123,1,0",
+            'forward_m_s = "speed"|yaw_rate_rad_s = "gyro"|t_s = { column = "time", scale = 1e-3 }',
+        ),
+        (
+            "ts,groundSpeed (km/h),imu_gyro_z_dps",
+            "2,1,0",
+            't_s = "ts"|{ column = "groundSpeed (km/h)", scale = 0.2777777777777778 }'
+            '|yaw_rate_rad_s = { column = "imu_gyro_z_dps", scale = 0.017453292519943295 }',
+        ),
+        (
+            "header.stamp,twist.twist.linear.x,twist.twist.angular.z",
+            "1763800000123456789,1,0",
+            'forward_m_s = "twist.twist.linear.x"|yaw_rate_rad_s = "twist.twist.angular.z"'
+            "|scale = 1e-9",
+        ),
+        ("timestamp,velX,yawRate", "2,1,0", 'forward_m_s = "velX"|yaw_rate_rad_s = "yawRate"'),
+        (
+            "seconds,fiducial_id,distance_mm,bearing_degrees",
+            "2,1,0,0",
+            'landmark = "fiducial_id"|{ column = "distance_mm", scale = 1e-3 }|0.01745',
+        ),
+    ],
+)
+def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: str) -> None:
+    names = header.split(",")
+    columns = dict(zip(names, [[cell] for cell in row.split(",")], strict=True))
+    text, lacking = proposed({"log.csv": CsvTable("log.csv", columns, [2])})
+    assert not lacking
+    assert [each for each in expected.split("|") if each not in text] == []
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,13 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
         (
             "seed = 1",
-            'expected one of "simulated", "utias", "folder", "live", "unlabelled"',
+            'no kind of world: put base = "recorded" (or another built-in scenario: dlr, ',
+        ),
+        ("world = { kind = 'lve' }", "got 'lve' at world.kind; did you mean `live`?"),
+        (
+            "base = 'recorded'\n[world]\nadmit = true",
+            '`admit` is no field of a world of kind "folder", which this file or its base has, but '
+            'of kind = "live" at world; known: path',
         ),
         ("world = { kind = [1] }", "got [1] at world.kind"),
         ("world = 3", "expected a table, got int at world"),
@@ -256,6 +262,8 @@ UTIAS = 'world = { kind = "utias" }\n'
             "base = 'thesys'",
             "expected a built-in scenario, got 'thesys' at base; known: dlr, downs-10, ",
         ),
+        ("base = 'thesys'", "did you mean `thesis`?"),
+        ("base = 'my.toml'", "a file can not be a base: copy what you need of it"),
         ("estimator = 'hybrid-thesis'\n" + SMALL, "valid: hybrid + join, hybrid + kalman, "),
     ],
 )

@@ -1,0 +1,54 @@
+"""The kinds of world that a scenario may have, and what is wrong with one of none of them."""
+
+import msgspec
+
+from sim.scenarios.checks import ScenarioError, check_fields, close
+from sim.scenarios.document import Fields, builtin_names
+from sim.world.config import (
+    FolderWorld,
+    LiveWorld,
+    SimulatedWorld,
+    UnlabelledWorld,
+    UtiasWorld,
+    World,
+)
+
+WORLDS: dict[str, type[World]] = {
+    "simulated": SimulatedWorld,
+    "utias": UtiasWorld,
+    "folder": FolderWorld,
+    "live": LiveWorld,
+    "unlabelled": UnlabelledWorld,
+}
+
+
+def check_world(world: Fields) -> None:
+    """Check the kind of a world and the names of its fields; raises ScenarioError."""
+    kind = world.get("kind")
+    if not isinstance(kind, str) or kind not in WORLDS:
+        raise ScenarioError(_which(kind))
+    for name in world:
+        kinds = [each for each in WORLDS if name in _fields(each)]
+        if kinds and kind not in kinds:
+            belongs = " or ".join(f'"{each}"' for each in kinds)
+            raise ScenarioError(
+                f'`{name}` is no field of a world of kind "{kind}", which this file or its base '
+                f"has, but of kind = {belongs} at world; known: {', '.join(_fields(kind))}"
+            )
+    check_fields(world, WORLDS[kind], "world")
+
+
+def _fields(kind: str) -> list[str]:
+    return [field.name for field in msgspec.structs.fields(WORLDS[kind])]
+
+
+def _which(kind: object) -> str:
+    """What is wrong with this kind of world, which is none that is known."""
+    known = ", ".join(f'"{each}"' for each in WORLDS)
+    if kind is not None:
+        return f"expected one of {known}, got {kind!r} at world.kind{close(kind, WORLDS)}"
+    return (
+        'no kind of world: put base = "recorded" (or another built-in scenario: '
+        f"{', '.join(builtin_names())}) at the top of the file, or a table [world] with kind = "
+        f'one of {known}; "live" is for robots with drivers, "folder" for CSV tables'
+    )
