@@ -17,6 +17,7 @@ from functools import lru_cache
 import numpy as np
 
 from team.config import Bias
+from team.estimation import elementary
 from team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from team.estimation.map_joining.condensed_factor import SubmapCost
 from team.estimation.map_joining.marginals import Agreement, BiasEstimate
@@ -145,7 +146,7 @@ def _misscale(scale: Scale, limit: float) -> str:
     value = scale.value
     if value <= 0.0:
         return ""
-    if abs(math.log(value)) <= max(math.log(limit), SCALE_SIGMAS * scale.log_sigma):
+    if abs(elementary.log(value)) <= max(elementary.log(limit), SCALE_SIGMAS * scale.log_sigma):
         return ""
     digits, much = (1, "much") if value > 1.0 else (2, "little")
     return (

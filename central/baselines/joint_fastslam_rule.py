@@ -9,6 +9,7 @@ from central.baselines.measurement_rules import MapContent, MeasurementRule
 from central.baselines.team_keyframes import RobotKeyframe
 from central.config import CentralConfig
 from team.config import RobotConfig
+from team.estimation import dense
 from team.estimation.baselines import joint_fastslam
 from team.estimation.baselines.joint_fastslam import JointFastSlam
 from team.estimation.baselines.robot_step import RobotStep
@@ -83,7 +84,7 @@ class JointFastSlamRule(MeasurementRule):
 def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> RobotStep:
     """An initial pose with this covariance in (x, y, θ): a motion by nothing with its noise."""
     G = tangent(pose[2])
-    own = G.T @ covariance @ G
+    own = dense.product(dense.product(G.T, covariance), G)
     nothing = np.empty(0)
     start = Increment(np.zeros(3), 0.5 * (own + own.T))
     return RobotStep(robot, start, config.sensor, np.empty(0, np.uint32), nothing, nothing)

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import dense, elementwise
 from team.estimation.gaussian import (
     NO_LANDMARKS,
     LandmarkGaussian,
@@ -150,11 +151,13 @@ def _kalman_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
     in_a, in_b = _shared(a, b)
     R = b.covariance[np.ix_(in_b, in_b)]
     innovation = information(a.covariance[np.ix_(in_a, in_a)] + R, "two maps' difference")
-    gain = a.covariance[:, in_a] @ innovation
-    moved = a.means.ravel() + gain @ (b.means.ravel()[in_b] - a.means.ravel()[in_a])
+    gain = dense.product(a.covariance[:, in_a], innovation)
+    moved = a.means.ravel() + dense.product(gain, b.means.ravel()[in_b] - a.means.ravel()[in_a])
     rest = np.eye(2 * len(a.ids))
     rest[:, in_a] -= gain
-    covariance = rest @ a.covariance @ rest.T + gain @ R @ gain.T
+    covariance = dense.product(dense.product(rest, a.covariance), rest.T) + dense.product(
+        dense.product(gain, R), gain.T
+    )
     updated = LandmarkGaussian(a.ids, moved.reshape(-1, 2), 0.5 * (covariance + covariance.T))
     return _carried(b, updated)
 
@@ -185,9 +188,10 @@ def _intersected_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) 
         info_b = information(b.covariance[np.ix_(in_b, in_b)], "a map's common landmarks")
         omega = _least(lambda w: _size(w * info_a + (1.0 - w) * info_b, criterion))
         spread = information(omega * info_a + (1.0 - omega) * info_b, "the intersection")
-        mean = spread @ (
-            omega * (info_a @ a.means.ravel()[in_a])
-            + (1.0 - omega) * (info_b @ b.means.ravel()[in_b])
+        mean = dense.product(
+            spread,
+            omega * (dense.product(info_a, a.means.ravel()[in_a]))
+            + (1.0 - omega) * (dense.product(info_b, b.means.ravel()[in_b])),
         )
         common = LandmarkGaussian(a.ids[in_a[::2] // 2], mean.reshape(-1, 2), spread)
     return _carried(b, _carried(a, common))
@@ -198,7 +202,7 @@ def _size(metric: Float[np.ndarray, "n n"], criterion: str) -> float:
     if criterion == "trace":
         return float(np.trace(information(metric, "the intersection")))
     factor = cholesky_factor(metric, "the intersection")
-    return float(-2.0 * np.log(np.diag(factor)).sum())
+    return float(-2.0 * elementwise.log(np.diag(factor)).sum())
 
 
 def _least(size: Callable[[float], float]) -> float:

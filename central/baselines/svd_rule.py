@@ -17,6 +17,7 @@ from central.fused import fused_message, version_entry
 from central.rule import FusionRule, Tail
 from central.submap_intake import SubmapInputs, SubmapIntake
 from team import translate
+from team.estimation import dense, elementwise
 from team.estimation.baselines import svd_joining
 from team.estimation.baselines.svd_joining import (
     NO_PAIRS,
@@ -224,6 +225,8 @@ def _seen(
         pairs = sightings.get((min(stream, other), max(stream, other)))
         if pairs is not None:
             theirs, own = pairs if other < stream else (pairs.in_b, pairs.in_a)
-            c, s = np.cos(frame[2]), np.sin(frame[2])
-            found.append(PointPairs(theirs @ np.array([[c, s], [-s, c]]) + frame[:2], own))
+            s, c = elementwise.sin_and_cos(frame[2])
+            found.append(
+                PointPairs(dense.product(theirs, np.array([[c, s], [-s, c]])) + frame[:2], own)
+            )
     return PointPairs(*(np.concatenate(each) for each in zip(*found, strict=True)))

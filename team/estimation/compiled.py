@@ -38,10 +38,21 @@ def compiled(function: F) -> F:
     wrapped function is compiled.
     """
     kernel = inspect.unwrap(function)
-    dispatcher: Any = numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel)
+    dispatcher: Any = numba.njit(
+        cache=True, fastmath=False, error_model="numpy", forceinline=kernel in _INLINED
+    )(kernel)
     if dispatcher is not kernel:  # with NUMBA_DISABLE_JIT it is the function itself
         compile_once(dispatcher, lambda: _cache_of_its_own(dispatcher))
     return cast(F, dispatcher)
+
+
+def inlined(function: F) -> F:
+    """`compiled`, and a part of each kernel that calls it: so a loop of calls can be vectorised."""
+    _INLINED.add(inspect.unwrap(function))
+    return compiled(function)
+
+
+_INLINED: set[Callable[..., object]] = set()
 
 
 def _cache_of_its_own(dispatcher: Any) -> Path:
@@ -106,7 +117,7 @@ def program_of(kernel: Callable[..., object]) -> str:
 def _digest_of(kernel: Callable[..., object]) -> str:
     digest = hashlib.blake2b(digest_size=8)
     _add_code(digest, kernel.__code__, kernel.__doc__)
-    digest.update(repr((kernel.__defaults__, kernel.__kwdefaults__)).encode())
+    digest.update(repr((kernel.__defaults__, kernel.__kwdefaults__, kernel in _INLINED)).encode())
     for chain in sorted(_globals(kernel.__code__)):
         _add_meant(digest, kernel, chain)
     if kernel.__closure__:

@@ -10,13 +10,14 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.compiled import compiled
+from team.estimation import elementary
+from team.estimation.compiled import compiled, inlined
 
 Pose = Float[np.ndarray, "3"]
 Point = Float[np.ndarray, "2"]
 
 
-@compiled
+@inlined
 def wrapped(angle: float) -> float:
     """The same direction in (−π, π]."""
     turns = math.floor((math.pi - angle) / (2.0 * math.pi))
@@ -26,7 +27,7 @@ def wrapped(angle: float) -> float:
 @compiled
 def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
     """a_from_c = a_from_b ∘ b_from_c."""
-    c, s = math.cos(a_from_b[2]), math.sin(a_from_b[2])
+    s, c = elementary.sin_and_cos(a_from_b[2])
     return np.array(
         [
             a_from_b[0] + c * b_from_c[0] - s * b_from_c[1],
@@ -39,7 +40,7 @@ def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
 @compiled
 def inverse(a_from_b: Pose) -> Pose:
     """b_from_a."""
-    c, s = math.cos(a_from_b[2]), math.sin(a_from_b[2])
+    s, c = elementary.sin_and_cos(a_from_b[2])
     return np.array(
         [
             -c * a_from_b[0] - s * a_from_b[1],
@@ -52,7 +53,7 @@ def inverse(a_from_b: Pose) -> Pose:
 @compiled
 def between(a_from_b: Pose, a_from_c: Pose) -> Pose:
     """b_from_c = a_from_b⁻¹ ∘ a_from_c: the motion from b to c, seen in b."""
-    c, s = math.cos(a_from_b[2]), math.sin(a_from_b[2])
+    s, c = elementary.sin_and_cos(a_from_b[2])
     dx, dy = a_from_c[0] - a_from_b[0], a_from_c[1] - a_from_b[1]
     return np.array([c * dx + s * dy, -s * dx + c * dy, wrapped(a_from_c[2] - a_from_b[2])])
 
@@ -60,7 +61,7 @@ def between(a_from_b: Pose, a_from_c: Pose) -> Pose:
 @compiled
 def transformed(a_from_b: Pose, point_in_b: Point) -> Point:
     """The point's coordinates in frame a."""
-    c, s = math.cos(a_from_b[2]), math.sin(a_from_b[2])
+    s, c = elementary.sin_and_cos(a_from_b[2])
     return np.array(
         [
             a_from_b[0] + c * point_in_b[0] - s * point_in_b[1],
@@ -69,7 +70,7 @@ def transformed(a_from_b: Pose, point_in_b: Point) -> Point:
     )
 
 
-@compiled
+@inlined
 def swept(forward: float, left: float, turn: float) -> tuple[float, float]:
     """V(turn)·(forward, left): where a constant twist leads in unit time, without an allocation.
 
@@ -81,8 +82,8 @@ def swept(forward: float, left: float, turn: float) -> tuple[float, float]:
         a = 1.0 - square / 6.0
         b = turn * (0.5 - square / 24.0)
     else:
-        a = math.sin(turn) / turn
-        b = (1.0 - math.cos(turn)) / turn
+        s, c = elementary.sin_and_cos(turn)
+        a, b = s / turn, (1.0 - c) / turn
     return a * forward - b * left, b * forward + a * left
 
 
@@ -101,19 +102,19 @@ def logarithm(pose: Pose) -> Pose:
     """Log: SE(2) → R³, the inverse of `exponential` for |theta| < π."""
     turn = wrapped(pose[2])
     half = 0.5 * turn
-    a = 1.0 - half * half / 3.0 if abs(turn) < 1e-4 else half / math.tan(half)
+    a = 1.0 - half * half / 3.0 if abs(turn) < 1e-4 else half / elementary.tan(half)
     return np.array([a * pose[0] + half * pose[1], -half * pose[0] + a * pose[1], turn])
 
 
 @compiled
 def adjoint(a_from_b: Pose) -> Float[np.ndarray, "3 3"]:
     """Ad with T ∘ Exp(xi) = Exp(Ad_T xi) ∘ T: carries a perturbation from the right to the left."""
-    c, s = math.cos(a_from_b[2]), math.sin(a_from_b[2])
+    s, c = elementary.sin_and_cos(a_from_b[2])
     return np.array([[c, -s, a_from_b[1]], [s, c, -a_from_b[0]], [0.0, 0.0, 1.0]])
 
 
 @compiled
 def tangent(heading: float) -> Float[np.ndarray, "3 3"]:
     """∂(x, y, theta)/∂xi of pose ∘ Exp(xi) for a pose of this heading."""
-    c, s = math.cos(heading), math.sin(heading)
+    s, c = elementary.sin_and_cos(heading)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -5,7 +5,6 @@ xi ~ N(0, C): p' = T Exp(xi) p forward of the node, p' = (T Exp(xi))⁻¹ p wher
 its covariance grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import Sensor
+from team.estimation import dense, elementary
 from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import information
 from team.estimation.geometry import Pose, inverse, transformed, wrapped
@@ -70,16 +70,18 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     marker's position on the teammate (marker_sigma) and of that of the drift.
     """
     range_variance, bearing_variance = noise(sensor, distance)
-    own = sensor.marker_sigma**2 + drift * drift
+    own = elementary.squared(sensor.marker_sigma) + drift * drift
     turn = _turn(bearing)
-    spread = np.diag([range_variance + own, bearing_variance * distance**2 + own])
-    return CarriedPoint(distance * turn[:, 0], turn @ spread @ turn.T)
+    spread = np.diag([range_variance + own, bearing_variance * elementary.squared(distance) + own])
+    return CarriedPoint(distance * turn[:, 0], dense.product(dense.product(turn, spread), turn.T))
 
 
 def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
     """A point that the sensor sees, in the frame of the base on which it is mounted."""
     turn = _turn(float(mount[2]))
-    return CarriedPoint(transformed(mount, seen.point), turn @ seen.covariance @ turn.T)
+    return CarriedPoint(
+        transformed(mount, seen.point), dense.product(dense.product(turn, seen.covariance), turn.T)
+    )
 
 
 def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
@@ -88,8 +90,10 @@ def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
     """
     T = node_from_here.mean
     turn = _turn(float(T[2]))
-    J = turn @ np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]])
-    spread = turn @ seen.covariance @ turn.T + J @ node_from_here.covariance @ J.T
+    J = dense.product(turn, np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]]))
+    spread = dense.product(dense.product(turn, seen.covariance), turn.T) + dense.product(
+        dense.product(J, node_from_here.covariance), J.T
+    )
     return CarriedPoint(transformed(T, seen.point), spread)
 
 
@@ -101,12 +105,14 @@ def carried_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
     point = transformed(T, seen.point)
     turn = _turn(float(T[2]))
     J = np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
-    spread = turn @ seen.covariance @ turn.T + J @ here_from_node.covariance @ J.T
+    spread = dense.product(dense.product(turn, seen.covariance), turn.T) + dense.product(
+        dense.product(J, here_from_node.covariance), J.T
+    )
     return CarriedPoint(point, spread)
 
 
 def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
-    c, s = math.cos(angle), math.sin(angle)
+    s, c = elementary.sin_and_cos(angle)
     return np.array([[c, -s], [s, c]])
 
 
@@ -118,14 +124,14 @@ def reduced(
     The median of each, bearings relative to the first one; the covariance is the mean of theirs, as
     for one measurement: a camera repeats its error on a marker from one moment to the next.
     """
-    ranges = [max(math.hypot(*each.point), NEAREST_M) for each in carried]
-    bearings = [math.atan2(each.point[1], each.point[0]) for each in carried]
+    ranges = [max(elementary.hypot(*each.point), NEAREST_M) for each in carried]
+    bearings = [elementary.atan2(each.point[1], each.point[0]) for each in carried]
     offsets = [wrapped(bearing - bearings[0]) for bearing in bearings]
     total = np.zeros((2, 2))
     for each, distance in zip(carried, ranges, strict=True):
         x, y = each.point / distance
         polar = np.array([[x, y], [-y / distance, x / distance]])
-        total += polar @ each.covariance @ polar.T
+        total += dense.product(dense.product(polar, each.covariance), polar.T)
     bearing = wrapped(bearings[0] + float(np.median(offsets)))
     mean = total / len(carried)
     return np.array([float(np.median(ranges)), bearing]), 0.5 * (mean + mean.T)

@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from team.config import Alphas, MotionModel, MotionNoise, Sensor
+from team.estimation import elementary, elementwise
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Point, Pose, adjoint, compose, exponential, inverse, wrapped
 
 NEAREST_M = 1e-3
 """A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""
-OFF_AXIS = math.cos(math.radians(80.0))
+OFF_AXIS = elementary.cos(math.radians(80.0))
 """Least cosine of the angle to the optical axis at which a depth tells a range."""
 
 
@@ -147,7 +148,7 @@ def _of_alphas(
     Their errors of v, ω and γ have the variances α₁v² + α₂ω², α₃v² + α₄ω², α₅v² + α₆ω² and are held
     for one interval T (eq. 2-4): times T² on the way and the turns. As a density that is T·t.
     """
-    v2, w2 = (distance / duration_s) ** 2, (turn / duration_s) ** 2
+    v2, w2 = elementary.squared(distance / duration_s), elementary.squared(turn / duration_s)
     spread = interval_s * duration_s
     a1, a2, a3, a4, a5, a6 = alphas
     return (
@@ -193,9 +194,10 @@ def arc(
         cosine = 0.5 - square / 24.0
         cubic = turn * (1.0 / 6.0 - square / 120.0)
     else:
-        sine = math.sin(turn) / turn
-        cosine = 2.0 * (math.sin(0.5 * turn) / turn) ** 2
-        cubic = (turn - math.sin(turn)) / (turn * turn)
+        s = elementary.sin(turn)
+        sine = s / turn
+        cosine = 2.0 * (elementary.sin(0.5 * turn) / turn) ** 2
+        cubic = (turn - s) / (turn * turn)
     ax, ay = sine, -turn * cosine
     bx, by = distance * cubic, distance * cosine
     covariance = np.empty((3, 3))
@@ -222,6 +224,7 @@ def turn_then_drive(
     lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
     """The noises (a, b) reach the end's tangent space by J = [[1, 0], [0, d], [0, 1]]."""
+    s, c = elementary.sin_and_cos(turn)
     covariance = np.zeros((3, 3))
     covariance[0, 0] = forward_var
     covariance[0, 1] = covariance[1, 0] = both * distance
@@ -230,10 +233,7 @@ def turn_then_drive(
     covariance[1, 2] = turn_var * distance
     covariance[2, 1] = turn_var * distance
     covariance[2, 2] = turn_var + final
-    return (
-        np.array([distance * math.cos(turn), distance * math.sin(turn), wrapped(turn)]),
-        covariance,
-    )
+    return np.array([distance * c, distance * s, wrapped(turn)]), covariance
 
 
 @compiled
@@ -244,41 +244,45 @@ def predicted(pose: Pose, landmark: Point) -> tuple[float, float]:
     """
     dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
     distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
-    return distance, wrapped(math.atan2(dy, dx) - pose[2])
+    return distance, wrapped(elementary.atan2(dy, dx) - pose[2])
 
 
 @compiled
 def pose_jacobian(distance: float, bearing: float) -> Float[np.ndarray, "2 3"]:
     """∂z/∂xi of h(pose ∘ Exp(xi), landmark) at xi = 0, from the predicted (range, bearing)."""
-    c, s = math.cos(bearing), math.sin(bearing)
+    s, c = elementary.sin_and_cos(bearing)
     return np.array([[-c, -s, 0.0], [s / distance, -c / distance, -1.0]])
 
 
 @compiled
 def landmark_jacobian(distance: float, direction: float) -> Float[np.ndarray, "2 2"]:
     """∂z/∂landmark, from the predicted range and the direction = theta + bearing in the map."""
-    c, s = math.cos(direction), math.sin(direction)
+    s, c = elementary.sin_and_cos(direction)
     return np.array([[c, s], [-s / distance, c / distance]])
 
 
 @compiled
 def located(pose: Pose, distance: float, bearing: float) -> Point:
     """The inverse model: the point at (range, bearing) from pose, in the pose's map frame."""
-    direction = pose[2] + bearing
-    return np.array(
-        [pose[0] + distance * math.cos(direction), pose[1] + distance * math.sin(direction)]
-    )
+    s, c = elementary.sin_and_cos(pose[2] + bearing)
+    return np.array([pose[0] + distance * c, pose[1] + distance * s])
 
 
 def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
     """(σ_range² [m²], σ_bearing² [rad²]) at a predicted range: σ_r² = range_sigma² + (per_m r)²."""
     slope = sensor.range_sigma_per_m * predicted_range
-    return sensor.range_sigma**2 + slope * slope, sensor.bearing_sigma**2
+    return elementary.squared(sensor.range_sigma) + slope * slope, elementary.squared(
+        sensor.bearing_sigma
+    )
 
 
 def variances(sensor: Sensor) -> tuple[float, float, float]:
     """(σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]): what kernels take as a sensor."""
-    return sensor.range_sigma**2, sensor.range_sigma_per_m**2, sensor.bearing_sigma**2
+    return (
+        elementary.squared(sensor.range_sigma),
+        elementary.squared(sensor.range_sigma_per_m),
+        elementary.squared(sensor.bearing_sigma),
+    )
 
 
 def corrected(
@@ -297,7 +301,7 @@ def corrected(
     turns = np.floor((np.pi - turned) / (2.0 * np.pi))
     distances = (ranges - sensor.range_offset) / sensor.range_scale
     if sensor.range_is_depth:
-        cosine = np.cos(bearings - sensor.optical_axis)
+        cosine = elementwise.cos(bearings - sensor.optical_axis)
         distances = np.where(cosine > OFF_AXIS, distances / np.maximum(cosine, OFF_AXIS), np.nan)
     return distances, turned + 2.0 * np.pi * turns
 

@@ -7,11 +7,10 @@ particle: with S the sensor's pose since the window's start, the base's is m ∘
 p that is seen from the sensor's start is m p from the base's.
 """
 
-import math
-
 import numpy as np
 from jaxtyping import Float
 
+from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import PoseGaussian
 from team.estimation.geometry import Pose, adjoint, compose, inverse
 from team.estimation.models import Increment
@@ -21,7 +20,7 @@ def of_sensor(step: Increment, mount: Pose) -> Increment:
     """The sensor's motion as the base moves: T Exp(ξ) m = m (m⁻¹ T m) Exp(Ad(m⁻¹) ξ)."""
     away = inverse(mount)
     Ad = adjoint(away)
-    C = Ad @ step.covariance @ Ad.T
+    C = dense.product(dense.product(Ad, step.covariance), Ad.T)
     return Increment(compose(compose(away, step.mean), mount), 0.5 * (C + C.T))
 
 
@@ -35,13 +34,13 @@ def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:
     end = compose(pose.mean, step)
     dx, dy = end[:2] - pose.mean[:2]
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    return PoseGaussian(end, F @ pose.covariance @ F.T)
+    return PoseGaussian(end, dense.product(dense.product(F, pose.covariance), F.T))
 
 
 def base_poses(poses: Float[np.ndarray, "*n 3"], mount: Pose) -> Float[np.ndarray, "*n 3"]:
     """Of each sensor's pose S the base's, m ∘ S ∘ m⁻¹."""
     away = inverse(mount)
-    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    s, c = elementwise.sin_and_cos(poses[..., 2])
     x = poses[..., 0] + c * away[0] - s * away[1]
     y = poses[..., 1] + s * away[0] + c * away[1]
     found: Float[np.ndarray, "*n 3"] = np.stack([*_turned(x, y, mount), poses[..., 2]], axis=-1)
@@ -62,7 +61,7 @@ def base_covariances(
     covariances: Float[np.ndarray, "*n 3"], mount: Pose
 ) -> Float[np.ndarray, "*n 3"]:
     """(xx, xy, yy) of points of the sensor's start, along the axes of the base's."""
-    c, s = math.cos(mount[2]), math.sin(mount[2])
+    s, c = elementary.sin_and_cos(mount[2])
     xx, xy, yy = np.moveaxis(covariances, -1, 0)
     return np.stack(
         [
@@ -79,7 +78,7 @@ def base_shifts(
 ) -> Float[np.ndarray, "*b n 3"]:
     """The shifts (dx, dy, dθ) of the base's poses that follow from those of the sensor's poses."""
     away = inverse(mount)
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    s, c = elementwise.sin_and_cos(poses[:, 2])
     x = shifts[..., 0] - (s * away[0] + c * away[1]) * shifts[..., 2]
     y = shifts[..., 1] + (c * away[0] - s * away[1]) * shifts[..., 2]
     return np.stack([*_turned(x, y, mount), shifts[..., 2]], axis=-1)
@@ -88,5 +87,5 @@ def base_shifts(
 def _turned(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], mount: Pose
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    c, s = math.cos(mount[2]), math.sin(mount[2])
+    s, c = elementary.sin_and_cos(mount[2])
     return c * x - s * y, s * x + c * y

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import MotionModel
+from team.estimation import dense, elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Pose, adjoint, exponential, logarithm
 from team.estimation.models import Increment, increment_of, motion_variances
@@ -59,7 +60,7 @@ class OdometryInterval(NamedTuple):
         """
         if self.moved is None:
             return self.forward
-        return math.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
+        return elementary.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
 
     def forward_column(self, motion: MotionModel, duration_ns: int) -> Float[np.ndarray, "3"]:
         """`forward_column` of a part of the interval."""
@@ -70,7 +71,7 @@ class OdometryInterval(NamedTuple):
             return column
         share = duration_ns / self.duration_ns
         x, y, turn = share * calibrated(motion, self.moved.twist, self.duration_ns * 1e-9)
-        c, s = math.cos(0.5 * turn), math.sin(0.5 * turn)
+        s, c = elementary.sin_and_cos(0.5 * turn)
         column[0], column[1] = c * x + s * y, c * y - s * x
         return column
 
@@ -97,7 +98,7 @@ def forward_column(
         return column
     limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
     turn = min(max(motion.yaw_scale * yaw_rate, -limit), limit) * duration_s
-    column[0], column[1] = way * math.cos(0.5 * turn), -way * math.sin(0.5 * turn)
+    column[0], column[1] = way * elementary.cos(0.5 * turn), -way * elementary.sin(0.5 * turn)
     return column
 
 
@@ -110,7 +111,7 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
     """
     if motion.kind != "ackermann" or motion.wheel_base is None:
         return math.nan, math.nan
-    slope = math.tan(steering + motion.steering_offset)
+    slope = elementary.tan(steering + motion.steering_offset)
     share = 1.0 - slope * motion.wheel_offset / motion.wheel_base
     if not share > 0.0:
         return math.nan, math.nan
@@ -131,7 +132,7 @@ def calibrated(motion: MotionModel, twist: Pose, duration_s: float) -> Pose:
     limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
     turn = motion.yaw_scale * float(twist[2])
     turn = min(max(turn, -limit * duration_s), limit * duration_s)
-    way = math.hypot(twist[0], twist[1])
+    way = elementary.hypot(twist[0], twist[1])
     scale = motion.slow_scale if way < motion.slow_below * duration_s else motion.forward_scale
     effective = max(scale * way - motion.turn_drag * abs(turn), 0.0)
     share = effective / way if way > 0.0 else 0.0
@@ -152,11 +153,15 @@ def part_of(
     twist = calibrated(motion, whole.twist, duration_s)
     xi = share * twist
     if whole.covariance is None:
-        way = math.copysign(math.hypot(xi[0], xi[1]), xi[0])
+        way = math.copysign(elementary.hypot(xi[0], xi[1]), xi[0])
         noises = motion_variances(motion, share * duration_s, way, float(xi[2]))
         return Increment(exponential(xi), _spread(xi, way, noises))
     Ad = adjoint(exponential(rest * twist))
-    C = motion.covariance_factor * share * (Ad @ whole.covariance @ Ad.T)
+    C = (
+        motion.covariance_factor
+        * share
+        * (dense.product(dense.product(Ad, whole.covariance), Ad.T))
+    )
     return Increment(exponential(xi), 0.5 * (C + C.T))
 
 
@@ -178,9 +183,10 @@ def _spread(
         cosine = 0.5 - square / 24.0
         cubic = turn * (1.0 / 6.0 - square / 120.0)
     else:
-        sine = math.sin(turn) / turn
-        cosine = 2.0 * (math.sin(0.5 * turn) / turn) ** 2
-        cubic = (turn - math.sin(turn)) / (turn * turn)
+        s = elementary.sin(turn)
+        sine = s / turn
+        cosine = 2.0 * (elementary.sin(0.5 * turn) / turn) ** 2
+        cubic = (turn - s) / (turn * turn)
     ux, uy = (x / way, y / way) if way != 0.0 else (1.0, 0.0)
     ax, ay = sine * ux + turn * cosine * uy, -turn * cosine * ux + sine * uy
     bx, by = x * cubic - y * cosine, x * cosine + y * cubic

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import Bounds
+from team.estimation import dense, elementary
 from team.estimation.contribution import InitialPoseFactor
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.submap import LocalMap
@@ -98,10 +99,10 @@ def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | Non
         if worst:
             return f"a sigma of {worst[0]:.3g} {unit}, not from {least:g} to {most:g} {unit}"
     try:
-        factor = np.linalg.cholesky(covariance / sigmas / sigmas[:, None])
+        factor = dense.cholesky(covariance / sigmas / sigmas[:, None])
     except np.linalg.LinAlgError:
         return "a covariance that is not positive definite"
-    left = float(np.min(np.diag(factor), initial=1.0)) ** 2
+    left = elementary.squared(float(np.min(np.diag(factor), initial=1.0)))
     if left < bounds.independent:
         return (
             f"a number of which the others leave a share of {left:.1g} of its variance, "

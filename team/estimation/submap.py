@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.config import UNNAMED, Bias
+from team.estimation import elementwise
 
 NO_NODES = np.empty(0, np.int64)
 NO_COLUMNS = np.empty((0, 0))
@@ -118,7 +119,7 @@ class LocalMap:
         """Distances between landmarks without names that one keyframe saw [m]; ∞ between others."""
         x, y = self.landmarks[self.ids >= UNNAMED].T
         masks = self.unnamed.seen.astype(np.float32)
-        away = np.hypot(x[:, None] - x, y[:, None] - y)
+        away = elementwise.hypot(x[:, None] - x, y[:, None] - y)
         away[masks @ masks.T == 0.0] = np.inf
         np.fill_diagonal(away, np.inf)
         return np.asarray(away)

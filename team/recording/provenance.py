@@ -7,7 +7,7 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from platform import platform, python_version
+from platform import libc_ver, machine, platform, python_version
 
 import numpy as np
 
@@ -23,6 +23,7 @@ def provenance() -> dict[str, str]:
         **versions,
         "version.python": python_version(),
         "platform": platform(),
+        "arithmetic": arithmetic(),
         "blas": _blas(),
         "cpu.name": cpu_name,
         "cpu.features": cpu_features,
@@ -38,6 +39,13 @@ def kernel_fingerprint() -> str:
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def arithmetic() -> str:
+    """What the bits depend on beside the program and its libraries: the same on every processor of
+    an architecture. The C library's logarithm is in the tails of NumPy's normal numbers.
+    """
+    return " ".join((machine(), *libc_ver())).strip()
 
 
 def git_commit() -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import RobotConfig
-from team.estimation import geometry
+from team.estimation import elementwise, geometry
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.fastslam import Particles
@@ -56,7 +56,7 @@ def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
     """Thin out the particles evenly; origin: the pose of their frame in the own map's frame."""
     every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
     logs = particles.log_weights[::every]
-    weights = np.exp(logs - logs.max())
+    weights = elementwise.exp(logs - logs.max())
     poses = [geometry.compose(origin, pose) for pose in particles.poses[::every]]
     return Cloud(np.array(poses), weights / weights.sum())
 

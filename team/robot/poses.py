@@ -1,5 +1,7 @@
 """Publishes a robot's running poses: by its own measurements, and given the team's map."""
 
+import math
+
 import numpy as np
 
 from team import translate
@@ -84,5 +86,5 @@ class RunningPoses:
         except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out
-        self.sigma_m = max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0) ** 0.5
+        self.sigma_m = math.sqrt(max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0))
         return [*out, writer.pose(ch.TEAM_POSE, stamp_ns, sequence, prior.digest, posed)]

@@ -29,10 +29,11 @@ from team.wire import messages as m
 from team.wire.codec import encoded
 
 PLATFORM = (
-    "kernels", "cpu.name", "cpu.features", "blas",
+    "kernels", "arithmetic",
     "version.numpy", "version.scipy", "version.numba", "version.llvmlite",
 )  # fmt: skip
-"""The metadata that have to be equal for equal bits."""
+"""The metadata that have to be equal for equal bits; the processor's features are not among them:
+docs/decisions/0106."""
 MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (
     ch.SUBMAP, ch.ASSOCIATION, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE,

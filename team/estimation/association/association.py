@@ -4,12 +4,14 @@ The association uses no map and no other window, so that submaps stay independen
 association, which all its particles share.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import AssociationSettings
+from team.estimation import dense, elementary, elementwise
 from team.estimation.association.certainty import certainties
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import (
@@ -122,11 +124,13 @@ def _again(
         for row in np.nonzero(found == NOBODY)[0]:
             end = 3 * k + 2 * len(known)
             new = slice(end, end + 2)
-            G = turn @ np.array([[1.0, 0.0, -at[row, 1]], [0.0, 1.0, at[row, 0]]])
-            P[new, :end] = G @ P[pose, :end]
+            G = dense.product(turn, np.array([[1.0, 0.0, -at[row, 1]], [0.0, 1.0, at[row, 0]]]))
+            P[new, :end] = dense.product(G, P[pose, :end])
             P[:end, new] = P[new, :end].T
-            P[new, new] = G @ P[pose, pose] @ G.T + turn @ R[row] @ turn.T
-            points[len(known)] = now.poses[i, :2] + turn @ at[row]
+            P[new, new] = dense.product(dense.product(G, P[pose, pose]), G.T) + dense.product(
+                dense.product(turn, R[row]), turn.T
+            )
+            points[len(known)] = now.poses[i, :2] + dense.product(turn, at[row])
             found[row] = len(known)
             known.append(named[row])
         landmark_of[of_scan] = found
@@ -146,7 +150,13 @@ def _merged(
     together = (seen.astype(np.int64) @ seen.T.astype(np.int64)) > 0
     P = now.covariance[first:, first:].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
     own = P[np.arange(count), np.arange(count)]
-    S = own[:, None] + own[None] - P - P.transpose(0, 1, 3, 2) + settings.slack_m**2 * np.eye(2)
+    S = (
+        own[:, None]
+        + own[None]
+        - P
+        - P.transpose(0, 1, 3, 2)
+        + elementary.squared(settings.slack_m) * np.eye(2)
+    )
     apart = now.landmarks[:, None] - now.landmarks[None]
     squared, _ = squared_distances(apart, S)
     unnamed = names == NOBODY
@@ -205,16 +215,18 @@ def _missed_too_often(
     first = np.unique(scan_of, return_index=True)[1]
     if not len(first):
         return clutter
-    bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
-    farthest = np.maximum.reduceat(np.hypot(scans.points[:, 0], scans.points[:, 1]), first)
+    bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
+    farthest = np.maximum.reduceat(elementwise.hypot(scans.points[:, 0], scans.points[:, 1]), first)
     least, most = np.minimum.reduceat(bearings, first), np.maximum.reduceat(bearings, first)
     poses = now.poses[scan_of[first]]
     for landmark in np.nonzero(~confirmed)[0]:
         members = np.nonzero(landmark_of == landmark)[0]
         places = seen_from(poses, np.broadcast_to(now.landmarks[landmark], (len(poses), 2)))
-        bearing = np.arctan2(places[:, 1], places[:, 0])
+        bearing = elementwise.atan2(places[:, 1], places[:, 0])
         inside = (least <= bearing) & (bearing <= most)
-        looks = np.count_nonzero(inside & (np.hypot(places[:, 0], places[:, 1]) <= farthest))
+        looks = np.count_nonzero(
+            inside & (elementwise.hypot(places[:, 0], places[:, 1]) <= farthest)
+        )
         clutter[members] = _rare(len(members), max(int(looks), len(members)), settings)
     return clutter
 
@@ -222,7 +234,7 @@ def _missed_too_often(
 def _rare(seen: int, looks: int, settings: AssociationSettings) -> bool:
     """Whether P(at most `seen` of `looks` detections) < 0.05 with the detection probability."""
     p = settings.detection_probability
-    term, total = (1.0 - p) ** looks, 0.0
+    term, total = math.prod([1.0 - p] * looks), 0.0
     for c in range(seen + 1):
         total += term
         term *= (looks - c) / (c + 1.0) * p / (1.0 - p)

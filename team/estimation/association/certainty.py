@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.special import ndtr
 
 from team.config import AssociationSettings
+from team.estimation import elementary, elementwise
 from team.estimation.association.matching import squared_distances
 from team.estimation.association.scans import NOBODY, Scans
 from team.estimation.association.smoothing import Smoothed, predicted_by
@@ -52,16 +52,16 @@ class FieldOfView:
         self, seen: Float[np.ndarray, "L 2"], spread: Float[np.ndarray, "L 2 2"]
     ) -> Float[np.ndarray, " L"]:
         """Probability that each place, given in the sensor's frame, is in view."""
-        ranges = np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-6)
-        bearings = np.arctan2(seen[:, 1], seen[:, 0])
+        ranges = np.maximum(elementwise.hypot(seen[:, 0], seen[:, 1]), 1e-6)
+        bearings = elementwise.atan2(seen[:, 1], seen[:, 0])
         along = seen / ranges[:, None]
         across = np.column_stack((-along[:, 1], along[:, 0]))
         far = np.sqrt(np.maximum(np.einsum("li,lij,lj->l", along, spread, along), 1e-12))
         wide = np.sqrt(np.maximum(np.einsum("li,lij,lj->l", across, spread, across), 1e-12))
-        inside = ndtr((self.farthest - ranges) / far)
+        inside = elementwise.normal_below((self.farthest - ranges) / far)
         if self.most - self.least < 1.5 * np.pi:
-            inside *= ndtr((self.most - bearings) * ranges / wide)
-            inside *= ndtr((bearings - self.least) * ranges / wide)
+            inside *= elementwise.normal_below((self.most - bearings) * ranges / wide)
+            inside *= elementwise.normal_below((bearings - self.least) * ranges / wide)
         return np.asarray(np.maximum(inside, LEAST))
 
 
@@ -69,13 +69,13 @@ def view_of(scans: Scans) -> FieldOfView:
     """The sector that the window's detections fill, without the widening by their noise, and the
     density of detections in it.
     """
-    ranges = np.hypot(scans.points[:, 0], scans.points[:, 1])
-    bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
+    ranges = elementwise.hypot(scans.points[:, 0], scans.points[:, 1])
+    bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
     along = scans.points / np.maximum(ranges, 1e-6)[:, None]
     noise = np.sqrt(np.einsum("ni,nij,nj->n", along, scans.covariances, along))
     farthest = max(float((ranges - 2.0 * noise).max()), FARTHER * float(np.median(ranges)))
     least, most = float(bearings.min()) - WIDER, float(bearings.max()) + WIDER
-    area = max(0.5 * min(most - least, 2.0 * np.pi) * farthest**2, 1e-9)
+    area = max(0.5 * min(most - least, 2.0 * np.pi) * elementary.squared(farthest), 1e-9)
     looks = len(np.unique(scans.keyframes))
     return FieldOfView(len(ranges) / (looks * area), area, looks, farthest, least, most)
 
@@ -103,10 +103,10 @@ def certainties(
         S = spread[None] + R[:, None]
         squared, logs = squared_distances(scans.points[of_scan][:, None] - seen[None], S)
         detected = settings.detection_probability * view.holds(seen, spread + R.mean(axis=0))
-        volume = np.pi * settings.gate * np.exp(0.5 * logs)
-        other = out - view.density * np.expm1(-view.density * volume)
+        volume = np.pi * settings.gate * elementwise.exp(0.5 * logs)
+        other = out - view.density * elementwise.expm1(-view.density * volume)
         with np.errstate(under="ignore"):
-            likely = np.exp(-0.5 * np.minimum(squared, 1e3) - 0.5 * logs) / (2.0 * np.pi)
+            likely = elementwise.exp(-0.5 * np.minimum(squared, 1e3) - 0.5 * logs) / (2.0 * np.pi)
             weights = detected / (1.0 - detected) * likely / other
         chosen = landmark_of[of_scan]
         found[of_scan] = marginals(weights)[np.arange(len(chosen)), chosen]

@@ -5,6 +5,7 @@ once.
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import elementwise
 from team.estimation.association.scans import NOBODY
 
 
@@ -16,7 +17,7 @@ def squared_distances(
     x, y = differences[..., 0], differences[..., 1]
     determinant = np.maximum(a * c - b * b, 1e-300)
     squared = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
-    return squared, np.log(determinant)
+    return squared, elementwise.log(determinant)
 
 
 def best_pairs_first(

@@ -1,10 +1,11 @@
 """A window's detections as arrays, and geometry on many poses and points at once."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
+
+from team.estimation import dense, elementary, elementwise
 
 NOBODY = -1
 """Stands for no identity and for no landmark."""
@@ -44,21 +45,23 @@ def points_of(
     """Convert ranges and bearings with covariances (rr, rb, bb) to points with theirs, to first
     order.
     """
-    c, s = np.cos(bearings), np.sin(bearings)
+    s, c = elementwise.sin_and_cos(bearings)
     J = np.stack((np.stack((c, -ranges * s), -1), np.stack((s, ranges * c), -1)), -2)
     R = variances[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    return np.column_stack((ranges * c, ranges * s)), J @ R @ J.transpose(0, 2, 1)
+    return np.column_stack((ranges * c, ranges * s)), dense.product(
+        dense.product(J, R), J.transpose(0, 2, 1)
+    )
 
 
 def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
     """The rotation matrix of an angle."""
-    c, s = math.cos(angle), math.sin(angle)
+    s, c = elementary.sin_and_cos(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
     """The rotation matrix of each angle."""
-    c, s = np.cos(angles), np.sin(angles)
+    s, c = elementwise.sin_and_cos(angles)
     return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
 
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.linalg import cho_factor, cho_solve
 
+from team.estimation import dense
 from team.estimation.association.scans import (
     NOBODY,
     Scans,
@@ -60,13 +60,15 @@ def seen_with(
     from `first` on.
     """
     turn = rotation(pose[2])
-    seen = (landmarks - pose[:2]) @ turn
+    seen = dense.product(landmarks - pose[:2], turn)
     Hp = pose_jacobians(seen)
     rows = slice(first, first + 2 * count)
     own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
     cross = P[at, rows].reshape(3, count, 2).transpose(1, 0, 2)
-    mixed = Hp @ cross @ turn
-    spread = Hp @ P[at, at] @ Hp.transpose(0, 2, 1) + turn.T @ own @ turn
+    mixed = dense.product(dense.product(Hp, cross), turn)
+    spread = dense.product(dense.product(Hp, P[at, at]), Hp.transpose(0, 2, 1)) + dense.product(
+        dense.product(turn.T, own), turn
+    )
     spread += mixed + mixed.transpose(0, 2, 1)
     return seen, spread
 
@@ -84,8 +86,8 @@ def smoothed(
     """
     used = np.nonzero(landmark_of != NOBODY)[0]
     seen_by, seen = scans.keyframes[used], landmark_of[used]
-    weights = np.linalg.inv(scans.covariances[used])
-    motion_weights = np.linalg.inv(scans.motion_covariances + JITTER)
+    weights = dense.inverse(scans.covariances[used])
+    motion_weights = dense.inverse(scans.motion_covariances + JITTER)
     k, size = len(poses), 3 * len(poses) + 2 * len(landmarks)
     of_pose = 3 * seen_by[:, None] + np.arange(3)
     of_landmark = 3 * k + 2 * seen[:, None] + np.arange(2)
@@ -96,20 +98,19 @@ def smoothed(
         error = scans.points[used] - predicted
         turned = rotations(poses[seen_by, 2]).transpose(0, 2, 1)
         J = np.concatenate((pose_jacobians(predicted), turned), axis=2)
-        JW = J.transpose(0, 2, 1) @ weights
-        np.add.at(information, (columns[:, :, None], columns[:, None, :]), JW @ J)
+        JW = dense.product(J.transpose(0, 2, 1), weights)
+        np.add.at(information, (columns[:, :, None], columns[:, None, :]), dense.product(JW, J))
         np.add.at(gradient, columns, np.einsum("nij,nj->ni", JW, error))
         squared += float(np.einsum("ni,nij,nj->", error, weights, error))
-        factor = cho_factor(information, lower=True, check_finite=False)
-        step = cho_solve(factor, gradient, check_finite=False)
+        factor = dense.cholesky(information)
+        step = dense.solve_factored(factor, gradient)
         if not np.isfinite(step).all():
             raise np.linalg.LinAlgError("the window has no solution")
         if iteration == ITERATIONS or np.abs(step).max(initial=0.0) < SETTLED:
             break
         poses, landmarks = _moved(poses, step[: 3 * k]), landmarks + step[3 * k :].reshape(-1, 2)
-    covariance = cho_solve(factor, np.eye(size), check_finite=False)
     dof = 2 * len(used) - 2 * len(landmarks)
-    return Smoothed(poses, landmarks, 0.5 * (covariance + covariance.T), squared, dof)
+    return Smoothed(poses, landmarks, dense.inverse_of_factored(factor), squared, dof)
 
 
 def _of_motion(
@@ -130,8 +131,8 @@ def _of_motion(
     back[:, :2, :2] = -turned
     back[:, 0, 2], back[:, 1, 2], back[:, 2, 2] = -shift[:, 1], shift[:, 0], -1.0
     information, gradient = np.zeros((size, size)), np.zeros(size)
-    BW = back.transpose(0, 2, 1) @ weights
-    BWB = BW @ back
+    BW = dense.product(back.transpose(0, 2, 1), weights)
+    BWB = dense.product(BW, back)
     W_error, BW_error = np.einsum("kij,kj->ki", weights, error), np.einsum("kij,kj->ki", BW, error)
     for i in range(k):
         a, b = slice(3 * i - 3, 3 * i), slice(3 * i, 3 * i + 3)

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.special import chdtri
 
 from team.config import AssociationSettings
+from team.estimation import dense, elementary, elementwise
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import NOBODY, Scans, pose_jacobians, rotation
+from team.estimation.consistency import chi2_limit
 from team.estimation.geometry import adjoint, compose, inverse
 
 FEW = 0.5
@@ -72,22 +73,24 @@ class Tracker:
         n = self._size
         Ad = adjoint(inverse(motion))
         self.pose = compose(self.pose, motion)
-        self._P[:3, :n] = Ad @ self._P[:3, :n]
-        self._P[:n, :3] = self._P[:n, :3] @ Ad.T
+        self._P[:3, :n] = dense.product(Ad, self._P[:3, :n])
+        self._P[:n, :3] = dense.product(self._P[:n, :3], Ad.T)
         self._P[:3, :3] += covariance
 
     def predicted(self) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
         """Each landmark's position relative to the robot, and its covariance."""
         count = len(self.names)
         turn = rotation(self.pose[2])
-        seen = (self.landmarks - self.pose[:2]) @ turn
+        seen = dense.product(self.landmarks - self.pose[:2], turn)
         Hp = pose_jacobians(seen)
         n = self._size
         own = self._P[3:n, 3:n].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
         cross = self._P[:3, 3:n].reshape(3, count, 2).transpose(1, 0, 2)
-        mixed = Hp @ cross @ turn
-        S = Hp @ self._P[:3, :3] @ Hp.transpose(0, 2, 1)
-        return seen, S + turn.T @ own @ turn + mixed + mixed.transpose(0, 2, 1)
+        mixed = dense.product(dense.product(Hp, cross), turn)
+        S = dense.product(dense.product(Hp, self._P[:3, :3]), Hp.transpose(0, 2, 1))
+        return seen, S + dense.product(dense.product(turn.T, own), turn) + mixed + mixed.transpose(
+            0, 2, 1
+        )
 
     def shift(self, by: Float[np.ndarray, "3"]) -> None:
         """Apply a slip of about this (forward, left, turn) to the pose, with its uncertainty."""
@@ -106,12 +109,12 @@ class Tracker:
             return
         H, seen = self._jacobian(landmarks)
         P = self._P[:n, :n]
-        HP = H @ P
-        S = HP @ H.T
+        HP = dense.product(H, P)
+        S = dense.product(HP, H.T)
         S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
-        gain = np.linalg.solve(S, HP).T
-        step = gain @ (points - seen).ravel()
-        P -= gain @ HP
+        gain = dense.solve(S, HP).T
+        step = dense.product(gain, (points - seen).ravel())
+        P -= dense.product(gain, HP)
         self._P[:n, :n] = 0.5 * (P + P.T)
         self.pose = compose(self.pose, step[:3])
         self._points[: len(self.names)] += step[3:].reshape(-1, 2)
@@ -122,7 +125,7 @@ class Tracker:
         """∂h/∂state for these landmarks, and h."""
         m = len(landmarks)
         turn = rotation(self.pose[2])
-        seen = (self.landmarks[landmarks] - self.pose[:2]) @ turn
+        seen = dense.product(self.landmarks[landmarks] - self.pose[:2], turn)
         H = np.zeros((m, 2, self._size))
         H[:, :, :3] = pose_jacobians(seen)
         columns = 3 + 2 * landmarks[:, None] + np.arange(2)
@@ -135,12 +138,14 @@ class Tracker:
         """Add a new landmark; returns its index."""
         index, n = len(self.names), self._size
         turn = rotation(self.pose[2])
-        G = turn @ np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
+        G = dense.product(turn, np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]]))
         new = slice(n, n + 2)
-        self._P[new, :n] = G @ self._P[:3, :n]
+        self._P[new, :n] = dense.product(G, self._P[:3, :n])
         self._P[:n, new] = self._P[new, :n].T
-        self._P[new, new] = G @ self._P[:3, :3] @ G.T + turn @ covariance @ turn.T
-        self._points[index] = self.pose[:2] + turn @ point
+        self._P[new, new] = dense.product(dense.product(G, self._P[:3, :3]), G.T) + dense.product(
+            dense.product(turn, covariance), turn.T
+        )
+        self._points[index] = self.pose[:2] + dense.product(turn, point)
         self.names.append(name)
         return index
 
@@ -177,10 +182,10 @@ class Tracker:
         if not m:
             return 0.0
         H, seen = self._jacobian(landmarks)
-        S = H @ self._P[:n, :n] @ H.T
+        S = dense.product(dense.product(H, self._P[:n, :n]), H.T)
         S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
         error = (points - seen).ravel()
-        return float(error @ np.linalg.solve(S, error) / chdtri(2 * m, RARE))
+        return float(dense.product(error, dense.solve(S, error)) / chi2_limit(2 * m, RARE))
 
     def jump(
         self,
@@ -198,13 +203,21 @@ class Tracker:
         gate, reach = self._settings.gate, self._settings.slip_m
         seen, spread = self.predicted()
         Hp = pose_jacobians(seen)
-        loose = np.diag([(0.5 * reach) ** 2, (0.5 * reach) ** 2, SLIP_TURN**2])
+        loose = np.diag(
+            [
+                elementary.squared(0.5 * reach),
+                elementary.squared(0.5 * reach),
+                elementary.squared(SLIP_TURN),
+            ]
+        )
         tight = self._P[:3, :3]
-        own = spread - Hp @ tight @ Hp.transpose(0, 2, 1)
-        own += 1e-6 * np.eye(2) + np.maximum(-np.linalg.eigvalsh(own)[:, :1, None], 0.0) * np.eye(2)
-        HpD = Hp @ (loose + tight)
+        own = spread - dense.product(dense.product(Hp, tight), Hp.transpose(0, 2, 1))
+        own += 1e-6 * np.eye(2) + np.maximum(
+            -_smaller_eigenvalue(own)[:, None, None], 0.0
+        ) * np.eye(2)
+        HpD = dense.product(Hp, loose + tight)
         offsets = points[:, None] - seen[None]
-        near = np.hypot(offsets[..., 0], offsets[..., 1]) < reach
+        near = elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach
         least = MOST * max(int(near.any(axis=1).sum()), SLIP_DETECTIONS)
         known = np.nonzero(found != NOBODY)[0]
         before, _ = squared_distances(
@@ -214,9 +227,11 @@ class Tracker:
         best = (max(least, len(known) + 1) - 1e-9, 0.0)
         slip = None
         for row, column in np.argwhere(near):
-            C = HpD[column] @ Hp.transpose(0, 2, 1)  # of the proposing one with each
-            gain = C.transpose(0, 2, 1) @ np.linalg.inv(C[column] + own[column] + covariances[row])
-            S = HpD @ Hp.transpose(0, 2, 1) - gain @ C + own
+            C = dense.product(HpD[column], Hp.transpose(0, 2, 1))  # of the proposing one with each
+            gain = dense.product(
+                C.transpose(0, 2, 1), dense.inverse(C[column] + own[column] + covariances[row])
+            )
+            S = dense.product(HpD, Hp.transpose(0, 2, 1)) - dense.product(gain, C) + own
             moved = offsets - np.einsum("lij,j->li", gain, offsets[row, column])
             squared, logs = squared_distances(moved, S[None] + covariances[:, None])
             pairs = best_pairs_first(squared, squared + logs, gate)
@@ -228,19 +243,21 @@ class Tracker:
             return None
         rows, columns = slip
         H = Hp[columns].reshape(-1, 3)
-        S = H @ (loose + tight) @ H.T
+        S = dense.product(dense.product(H, loose + tight), H.T)
         m = len(rows)
         S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances[rows] + own[columns]
         error = offsets[rows, columns].ravel()
-        return np.asarray((loose + tight) @ H.T @ np.linalg.solve(S, error))
+        return np.asarray(dense.product(dense.product(loose + tight, H.T), dense.solve(S, error)))
 
 
 def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The covariance of a motion with a slip of about this (forward, left, turn): the slip is
     its standard deviation.
     """
-    metres, turn = max(float(np.hypot(*slip[:2])), 0.02), max(abs(float(slip[2])), 0.02)
-    return np.diag([metres**2, metres**2, turn**2])
+    metres, turn = max(float(elementwise.hypot(*slip[:2])), 0.02), max(abs(float(slip[2])), 0.02)
+    return np.diag(
+        [elementary.squared(metres), elementary.squared(metres), elementary.squared(turn)]
+    )
 
 
 def tracked(scans: Scans, settings: AssociationSettings) -> Tracked:
@@ -300,4 +317,12 @@ def _missed_nearby(
     free = np.ones(len(seen), np.bool_)
     free[found[found != NOBODY]] = False
     offsets = points[found == NOBODY][:, None] - seen[free][None]
-    return bool((np.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())
+    return bool((elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())
+
+
+def _smaller_eigenvalue(S: Float[np.ndarray, "l 2 2"]) -> Float[np.ndarray, " l"]:
+    """The smaller eigenvalue of each symmetric matrix."""
+    half = 0.5 * (S[:, 0, 0] - S[:, 1, 1])
+    return np.asarray(
+        0.5 * (S[:, 0, 0] + S[:, 1, 1]) - np.sqrt(half * half + S[:, 1, 0] * S[:, 1, 0])
+    )

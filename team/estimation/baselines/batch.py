@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team.estimation import dense, elementary
 from team.estimation.baselines import batch_factors as factors_of
 from team.estimation.baselines.batch_factors import Factors, Linear, Measurements, Motions, Starts
 from team.estimation.baselines.robot_step import RobotStep
@@ -76,7 +77,7 @@ class Batch(Iterate):
         measurements = self.factors.measurements
         distance = self.seen.residual[:, 0] + measurements.ranges
         at_zero, per_m, bearing = measurements.variances.T
-        return 1.0 / np.column_stack([at_zero + per_m * distance**2, bearing])
+        return 1.0 / np.column_stack([at_zero + per_m * elementary.squared(distance), bearing])
 
     @property
     def narrow(self) -> bool:
@@ -92,15 +93,15 @@ class Batch(Iterate):
         """Robust weight of each measurement, 1/(1 + χ²/c²); 1 without a robust loss."""
         if self.robust_c is None:
             return np.ones(len(self.age))
-        chi2 = np.sum(self.seen.residual**2 * self._precision, axis=1)
-        weight: Values = 1.0 / (1.0 + chi2 / self._scale**2)
+        chi2 = np.sum(elementary.squared(self.seen.residual) * self._precision, axis=1)
+        weight: Values = 1.0 / (1.0 + chi2 / elementary.squared(self._scale))
         return weight
 
     def cost_of(self, other: "Batch") -> float:
         """Σ w χ² of another estimate with this one's noise and weights: what a step lowers."""
         start_residual, _ = factors_of.start_residuals(self.factors.starts, other.poses)
         moved = factors_of.motion_residuals(self.factors.motions, other.poses).residual
-        chi2 = np.sum(other.seen.residual**2 * self._precision, axis=1)
+        chi2 = np.sum(elementary.squared(other.seen.residual) * self._precision, axis=1)
         return (
             float(
                 np.einsum(
@@ -108,7 +109,7 @@ class Batch(Iterate):
                 )
             )
             + float(np.einsum("ni,nij,nj->", moved, self.factors.motions.information, moved))
-            + float(self._weight @ chi2)
+            + float(dense.product(self._weight, chi2))
         )
 
     @property
@@ -133,29 +134,31 @@ class Batch(Iterate):
         start_residual, of_start = factors_of.start_residuals(starts, self.poses)
         moved, before, after = factors_of.motion_residuals(motions, self.poses)
         seen, of_pose, of_landmark = self.seen
-        start = of_start.transpose(0, 2, 1) @ starts.information
-        before_, after_ = (J.transpose(0, 2, 1) @ motions.information for J in (before, after))
+        start = dense.product(of_start.transpose(0, 2, 1), starts.information)
+        before_, after_ = (
+            dense.product(J.transpose(0, 2, 1), motions.information) for J in (before, after)
+        )
         precision = self._weight[:, None, None] * self._precision[:, None, :]
         pose_ = of_pose.transpose(0, 2, 1) * precision
         landmark_ = of_landmark.transpose(0, 2, 1) * precision
         values = self.factors.assembled(
             (
-                start @ of_start,
-                before_ @ before,
-                after_ @ before,
-                after_ @ after,
-                pose_ @ of_pose,
-                landmark_ @ of_pose,
-                landmark_ @ of_landmark,
+                dense.product(start, of_start),
+                dense.product(before_, before),
+                dense.product(after_, before),
+                dense.product(after_, after),
+                dense.product(pose_, of_pose),
+                dense.product(landmark_, of_pose),
+                dense.product(landmark_, of_landmark),
             )
         )
         gradient = self.factors.gathered(
             (
-                start @ start_residual[:, :, None],
-                before_ @ moved[:, :, None],
-                after_ @ moved[:, :, None],
-                pose_ @ seen[:, :, None],
-                landmark_ @ seen[:, :, None],
+                dense.product(start, start_residual[:, :, None]),
+                dense.product(before_, moved[:, :, None]),
+                dense.product(after_, moved[:, :, None]),
+                dense.product(pose_, seen[:, :, None]),
+                dense.product(landmark_, seen[:, :, None]),
             )
         )
         return values, gradient
@@ -194,7 +197,9 @@ class Batch(Iterate):
     @property
     def newton_decrement(self) -> float:
         """√(gᵀA⁻¹g): how far the next Newton step goes, in standard deviations."""
-        return math.sqrt(max(-float(self.normal_equations[1] @ self.newton_step), 0.0))
+        return math.sqrt(
+            max(-float(dense.product(self.normal_equations[1], self.newton_step)), 0.0)
+        )
 
     def converged(self, least_decrement: float) -> bool:
         """Whether every robust scale is at its end and the next step goes no farther than that."""
@@ -243,9 +248,9 @@ def initial_state(
 
 def _start_information(pose: Pose, covariance: Matrix | None) -> Matrix:
     if covariance is None:
-        return np.eye(3) / EXACT_SIGMA**2
+        return np.eye(3) / elementary.squared(EXACT_SIGMA)
     G = tangent(pose[2])
-    own = G.T @ covariance @ G
+    own = dense.product(dense.product(G.T, covariance), G)
     return information(0.5 * (own + own.T), "a start pose")
 
 
@@ -279,7 +284,7 @@ def extended(batch: Batch, turns: Sequence[RobotStep]) -> Batch:
     after = np.arange(len(batch.poses), len(poses))
     motions, measurements = factors.motions, factors.measurements
     counts = [len(turn.ids) for turn in turns]
-    floor = np.diag(FLOOR_SIGMAS) ** 2
+    floor = elementary.squared(np.diag(FLOOR_SIGMAS))
     added = Motions(
         np.array(before, np.int64),
         after,
@@ -360,7 +365,7 @@ def pose_gaussian(batch: Batch, robot: str) -> PoseGaussian:
     unknowns = 3 * int(newest[0]) + np.arange(3)
     own = sparse.inverse_columns(batch.posterior, unknowns)[unknowns]
     G = tangent(batch.poses[newest[0], 2])
-    covariance = G @ own @ G.T
+    covariance = dense.product(dense.product(G, own), G.T)
     return PoseGaussian(batch.poses[newest[0]], 0.5 * (covariance + covariance.T))
 
 
@@ -372,4 +377,4 @@ def trajectory(
     pattern, entries = batch.factors.pattern, batch.selected_covariance
     blocks = np.array([pattern.diagonal_block(entries, int(k)) for k in own])
     G = np.array([tangent(heading) for heading in batch.poses[own, 2]])
-    return batch.poses[own], G @ blocks @ G.transpose(0, 2, 1)
+    return batch.poses[own], dense.product(dense.product(G, blocks), G.transpose(0, 2, 1))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import dense, elementary, elementwise
 from team.estimation.compiled import compiled
 from team.estimation.geometry import (
     adjoint,
@@ -129,7 +130,7 @@ def _half_turn(turn: Values) -> tuple[Values, Values]:
     half = 0.5 * turn
     small = np.abs(turn) < SMALL_TURN
     safe = np.where(small, 1.0, half)
-    return np.where(small, 1.0 - half**2 / 3.0, safe / np.tan(safe)), half
+    return np.where(small, 1.0 - elementary.squared(half) / 3.0, safe / np.tan(safe)), half
 
 
 def inverse_right_jacobians(xi: Rows) -> Blocks:
@@ -142,8 +143,12 @@ def inverse_right_jacobians(xi: Rows) -> Blocks:
     forward, left, turn = xi.T
     small = np.abs(turn) < SMALL_TURN
     safe = np.where(small, 1.0, turn)
-    p = np.where(small, turn / 6.0, (safe - np.sin(safe)) / safe**2)
-    q = np.where(small, 0.5 - turn**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    p = np.where(small, turn / 6.0, (safe - elementwise.sin(safe)) / elementary.squared(safe))
+    q = np.where(
+        small,
+        0.5 - elementary.squared(turn) / 24.0,
+        (1.0 - elementwise.cos(safe)) / elementary.squared(safe),
+    )
     t = np.stack([p * forward - q * left, p * left + q * forward], axis=1)
     a, half = _half_turn(turn)
     J = np.zeros((len(xi), 3, 3))
@@ -175,7 +180,7 @@ def motion_residuals(motions: Motions, poses: Poses) -> Linear:
     moved = relative_poses(poses[motions.before], poses[motions.after])
     residual = logarithms(relative_poses(motions.mean, moved))
     after = inverse_right_jacobians(residual)
-    return Linear(residual, -after @ _adjoints_of_inverse(moved), after)
+    return Linear(residual, dense.product(-after, _adjoints_of_inverse(moved)), after)
 
 
 def measurement_residuals(measurements: Measurements, poses: Poses, landmarks: Points) -> Linear:

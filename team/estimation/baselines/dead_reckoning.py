@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import Sensor
+from team.estimation import dense
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose, tangent
 from team.estimation.models import Increment
@@ -45,7 +46,7 @@ def filter_step(
 def pose_gaussian(state: DeadReckoning) -> PoseGaussian:
     """In the coordinates (x, y, theta), to first order: P = G C Gᵀ with G = blkdiag(R(θ), 1)."""
     G = tangent(state.pose.mean[2])
-    P = G @ state.pose.covariance @ G.T
+    P = dense.product(dense.product(G, state.pose.covariance), G.T)
     return PoseGaussian(state.pose.mean, 0.5 * (P + P.T))
 
 

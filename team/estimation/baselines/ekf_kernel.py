@@ -10,6 +10,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam.landmark_kernel import Triple, place, seen
@@ -60,7 +61,7 @@ def _move(
 
     F = ∂(pose ∘ motion)/∂pose = [[I, ∂R/∂θ t], [0, 1]], G = blkdiag(R(θ'), 1).
     """
-    c, s = math.cos(mean[2]), math.sin(mean[2])
+    s, c = elementary.sin_and_cos(mean[2])
     of_x, of_y = -s * motion[0] - c * motion[1], c * motion[0] - s * motion[1]
     mean[0] += of_y
     mean[1] -= of_x
@@ -69,7 +70,7 @@ def _move(
     P[1] += of_y * P[2]
     P[:, 0] += of_x * P[:, 2]
     P[:, 1] += of_y * P[:, 2]
-    c, s = math.cos(mean[2]), math.sin(mean[2])
+    s, c = elementary.sin_and_cos(mean[2])
     across_x, across_y = c * Q[0, 2] - s * Q[1, 2], s * Q[0, 2] + c * Q[1, 2]
     P[0, 0] += c * c * Q[0, 0] - 2.0 * c * s * Q[0, 1] + s * s * Q[1, 1]
     P[1, 1] += s * s * Q[0, 0] + 2.0 * c * s * Q[0, 1] + c * c * Q[1, 1]
@@ -154,7 +155,7 @@ def _condition(
         distance, ex, ey = seen(pose, mean[places[i] : places[i] + 2])
         sights[i, 0], sights[i, 1], sights[i, 2] = distance, ex, ey
         innovation[2 * i] = measurements[i, 0] - distance
-        innovation[2 * i + 1] = wrapped(measurements[i, 1] + pose[2] - math.atan2(ey, ex))
+        innovation[2 * i + 1] = wrapped(measurements[i, 1] + pose[2] - elementary.atan2(ey, ex))
         R[2 * i], R[2 * i + 1] = sensor[0] + sensor[1] * distance * distance, sensor[2]
     HP, S, column = np.empty((m, n)), np.empty((m, m)), np.empty(m)
     for j in range(n):

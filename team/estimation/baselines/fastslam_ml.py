@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.config import UNNAMED, Sensor
+from team.estimation import dense, elementary, elementwise
 from team.estimation.baselines.nearest_neighbour import GATE
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from team.estimation.hybrid_slam.moments import mean_direction
@@ -63,8 +64,8 @@ def filter_step(
     """
     values, vectors = np.linalg.eigh(increment.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    drawn = increment.mean + generator.standard_normal((len(state.poses), 3)) @ root.T
-    c, s = np.cos(state.poses[:, 2]), np.sin(state.poses[:, 2])
+    drawn = increment.mean + dense.product(generator.standard_normal((len(state.poses), 3)), root.T)
+    s, c = elementwise.sin_and_cos(state.poses[:, 2])
     moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
     poses = state.poses + np.column_stack((moved, drawn[:, 2]))
     state = _with_room(replace(state, poses=poses), len(ranges))
@@ -96,22 +97,30 @@ class _Scan:
             (np.stack((dx / range_, dy / range_), -1), np.stack((-dy / q, dx / q), -1)), -2
         )
         R = np.diag(
-            [sensor.range_sigma**2 + (sensor.range_sigma_per_m * r) ** 2, sensor.bearing_sigma**2]
+            [
+                elementary.squared(sensor.range_sigma)
+                + elementary.squared(sensor.range_sigma_per_m * r),
+                elementary.squared(sensor.bearing_sigma),
+            ]
         )
-        S = H @ self._covariances @ H.transpose(0, 1, 3, 2) + R
-        turned = b - np.arctan2(dy, dx) + heading[:, None]
+        S = dense.product(dense.product(H, self._covariances), H.transpose(0, 1, 3, 2)) + R
+        turned = b - elementwise.atan2(dy, dx) + heading[:, None]
         off = np.stack((r - range_, np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi), -1)
         determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
         squared = (
-            S[..., 1, 1] * off[..., 0] ** 2
+            S[..., 1, 1] * elementary.squared(off[..., 0])
             - 2.0 * S[..., 0, 1] * off[..., 0] * off[..., 1]
-            + S[..., 0, 0] * off[..., 1] ** 2
+            + S[..., 0, 0] * elementary.squared(off[..., 1])
         ) / determinant
-        likely = -0.5 * squared - 0.5 * np.log(determinant) - np.log(2.0 * np.pi)
+        likely = -0.5 * squared - 0.5 * elementwise.log(determinant) - elementary.log(2.0 * np.pi)
         used = np.arange(self._means.shape[1]) < self._counts[:, None]
         likely = np.where(used & self._free & (squared < gate), likely, -np.inf)
         best = likely.argmax(axis=1)
-        edge = -0.5 * gate - 0.5 * float(np.log(np.linalg.det(R))) - np.log(2.0 * np.pi)
+        edge = (
+            -0.5 * gate
+            - 0.5 * float(elementwise.log(np.linalg.det(R)))
+            - elementary.log(2.0 * np.pi)
+        )
         old = likely[particles, best] > edge
         self._logs += np.where(old, likely[particles, best], edge)
         place = np.where(old, best, self._counts)
@@ -130,9 +139,9 @@ class _Scan:
         off: Float[np.ndarray, "M C 2"],
     ) -> None:
         P, J = self._covariances[at, place], H[at, place]
-        gain = np.linalg.solve(S[at, place], J @ P).transpose(0, 2, 1)
+        gain = dense.solve(S[at, place], dense.product(J, P)).transpose(0, 2, 1)
         self._means[at, place] += np.einsum("kij,kj->ki", gain, off[at, place])
-        after = P - gain @ J @ P
+        after = P - dense.product(dense.product(gain, J), P)
         self._covariances[at, place] = 0.5 * (after + after.transpose(0, 2, 1))
 
     def _found(
@@ -144,10 +153,10 @@ class _Scan:
     ) -> None:
         r, b = measured
         x, y, heading = self._state.poses[at].T
-        c, s = np.cos(heading + b), np.sin(heading + b)
+        s, c = elementwise.sin_and_cos(heading + b)
         G = np.stack((np.stack((c, -r * s), -1), np.stack((s, r * c), -1)), -2)
         self._means[at, place] = np.column_stack((x + r * c, y + r * s))
-        self._covariances[at, place] = G @ R @ G.transpose(0, 2, 1)
+        self._covariances[at, place] = dense.product(dense.product(G, R), G.transpose(0, 2, 1))
         self._counts[at] += 1
 
     def state(self) -> FastSlamMl:
@@ -181,14 +190,14 @@ def _with_room(state: FastSlamMl, more: int) -> FastSlamMl:
 
 
 def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
-    weights = np.exp(state.logs - state.logs.max())
+    weights = elementwise.exp(state.logs - state.logs.max())
     return np.asarray(weights / weights.sum())
 
 
 def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
     """Systematic resampling where the effective number is below this share."""
     weights, m = _weights(state), len(state.poses)
-    if 1.0 / float(weights @ weights) >= below * m:
+    if 1.0 / float(dense.product(weights, weights)) >= below * m:
         return state
     at = (np.arange(m) + generator.random()) / m
     chosen = np.minimum(np.searchsorted(np.cumsum(weights), at), m - 1)
@@ -214,10 +223,10 @@ def pose_gaussian(state: FastSlamMl) -> PoseGaussian:
     """The moments of all particles."""
     weights = _weights(state)
     heading = float(mean_direction(state.poses[:, 2], weights))
-    mean = np.append(weights @ state.poses[:, :2], heading)
+    mean = np.append(dense.product(weights, state.poses[:, :2]), heading)
     off = state.poses - mean
     off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    return PoseGaussian(mean, (off * weights[:, None]).T @ off)
+    return PoseGaussian(mean, dense.product((off * weights[:, None]).T, off))
 
 
 def landmark_gaussian(state: FastSlamMl) -> LandmarkGaussian:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import Sensor
+from team.estimation import elementary, elementwise
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
@@ -69,7 +70,9 @@ def filter_step(
         proposal="fastslam1",
         generator=generator,
     )
-    mean, P = moments(after.poses, np.exp(after.log_weights), after.means, after.covariances)
+    mean, P = moments(
+        after.poses, elementwise.exp(after.log_weights), after.means, after.covariances
+    )
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
     return absorbed(
         ThesisState(mean[:3], P[:3, :3], state.ids, state.landmarks, state.covariances),
@@ -89,7 +92,7 @@ def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> 
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
     return Particles(
         poses=np.tile(state.pose, (particles, 1)),
-        log_weights=np.full(particles, -np.log(particles)),
+        log_weights=np.full(particles, -elementary.log(particles)),
         ids=state.ids[observed],
         means=np.tile(state.landmarks[observed], (particles, 1, 1)),
         covariances=np.tile(triangles, (particles, 1, 1)),

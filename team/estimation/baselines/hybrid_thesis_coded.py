@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import Sensor
+from team.estimation import elementary, elementwise
 from team.estimation.baselines.plain_fastslam import landmark_moments, pose_moments
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
@@ -88,8 +89,8 @@ def _at_first(
     poses: Float[np.ndarray, "M 3"], range_m: float, bearing: float
 ) -> Float[np.ndarray, "M 3"]:
     """Gz r Gzᵀ of each particle as (xx, xy, yy), with Gz as it is printed."""
-    s, c = np.sin(poses[:, 2] + bearing), np.cos(poses[:, 2] + bearing)
-    along, across = FIRST_RANGE_VAR, range_m**2 * FIRST_BEARING_VAR
+    s, c = elementwise.sin_and_cos(poses[:, 2] + bearing)
+    along, across = FIRST_RANGE_VAR, elementary.squared(range_m) * FIRST_BEARING_VAR
     return np.column_stack(
         (c * c * along + s * s * across, c * s * (along + across), s * s * along + c * c * across)
     )

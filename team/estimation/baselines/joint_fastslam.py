@@ -5,13 +5,13 @@ number of robots at known start poses. The particles have to cover the product o
 paths, so over-confidence comes sooner than with one robot's (`plain_fastslam`).
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team.estimation import elementary
 from team.estimation.baselines.plain_fastslam import landmark_moments, pose_moments
 from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
@@ -73,7 +73,7 @@ def filter_step(
         state = replace(
             state,
             poses=state.poses[:, parents],
-            log_weights=np.full(len(parents), -math.log(len(parents))),
+            log_weights=np.full(len(parents), -elementary.log(len(parents))),
             means=state.means[parents],
             covariances=state.covariances[parents],
         )

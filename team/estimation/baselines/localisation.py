@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.config import Sensor
+from team.estimation import elementary
 from team.estimation.baselines.plain_fastslam import pose_moments
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
@@ -155,8 +156,8 @@ def _weighed(
             distance, ex, ey = seen(pose, landmarks[slots[k]])
             range_sigma = math.sqrt(sensor[0] + sensor[1] * distance * distance)
             of_range = (measurements[k, 0] - distance) / range_sigma
-            turn = wrapped(measurements[k, 1] + pose[2] - math.atan2(ey, ex))
+            turn = wrapped(measurements[k, 1] + pose[2] - elementary.atan2(ey, ex))
             of_bearing = turn / bearing_sigma
             weighed[i] -= 0.5 * (of_range * of_range + of_bearing * of_bearing)
-            weighed[i] -= math.log(2.0 * math.pi * range_sigma * bearing_sigma)
+            weighed[i] -= elementary.log(2.0 * math.pi * range_sigma * bearing_sigma)
     return weighed

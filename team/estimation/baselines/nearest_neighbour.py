@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.config import UNNAMED, Sensor
+from team.estimation import dense, elementary, elementwise
 from team.estimation.association.matching import best_pairs_first, squared_distances
 from team.estimation.association.scans import NOBODY
 from team.estimation.baselines import ekf_slam
@@ -67,8 +68,10 @@ def _associated(
     known = np.flatnonzero(slam.ids >= UNNAMED)
     predicted, spread = predictions(slam, known)
     R = np.zeros((len(ranges), 2, 2))
-    R[:, 0, 0] = sensor.range_sigma**2 + (sensor.range_sigma_per_m * ranges) ** 2
-    R[:, 1, 1] = sensor.bearing_sigma**2
+    R[:, 0, 0] = elementary.squared(sensor.range_sigma) + elementary.squared(
+        sensor.range_sigma_per_m * ranges
+    )
+    R[:, 1, 1] = elementary.squared(sensor.bearing_sigma)
     off = np.column_stack((ranges, bearings))[:, None] - predicted[None]
     off[..., 1] = np.remainder(off[..., 1] + np.pi, 2.0 * np.pi) - np.pi
     squared, logs = squared_distances(off, spread[None] + R[:, None])
@@ -86,12 +89,16 @@ def predictions(
     """(range, bearing) of these landmarks and H P Hᵀ, without the sensor's noise."""
     at = 3 + 2 * which[:, None] + np.arange(2)
     dx, dy = (slam.mean[at] - slam.mean[:2]).T
-    r = np.maximum(np.hypot(dx, dy), 1e-6)
+    r = np.maximum(elementwise.hypot(dx, dy), 1e-6)
     H = np.zeros((len(which), 2, 5))
     H[:, 0, 0], H[:, 0, 1] = -dx / r, -dy / r
-    H[:, 1, 0], H[:, 1, 1], H[:, 1, 2] = dy / r**2, -dx / r**2, -1.0
+    H[:, 1, 0], H[:, 1, 1], H[:, 1, 2] = (
+        dy / elementary.squared(r),
+        -dx / elementary.squared(r),
+        -1.0,
+    )
     H[:, :, 3:] = -H[:, :, :2]
     columns = np.concatenate((np.tile(np.arange(3), (len(which), 1)), at), axis=1)
     P = slam.covariance[columns[:, :, None], columns[:, None, :]]
-    bearing = np.arctan2(dy, dx) - slam.mean[2]
-    return np.column_stack((r, bearing)), H @ P @ H.transpose(0, 2, 1)
+    bearing = elementwise.atan2(dy, dx) - slam.mean[2]
+    return np.column_stack((r, bearing)), dense.product(dense.product(H, P), H.transpose(0, 2, 1))

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import Sensor
+from team.estimation import elementwise
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
@@ -83,7 +84,7 @@ def landmark_gaussian(state: PlainFastSlam) -> LandmarkGaussian:
 def pose_moments(particles: Particles) -> PoseGaussian:
     """Moments of the weighted poses; singular where fewer than four of them differ."""
     none = particles.means[:, :0], particles.covariances[:, :0]
-    return PoseGaussian(*moments(particles.poses, np.exp(particles.log_weights), *none))
+    return PoseGaussian(*moments(particles.poses, elementwise.exp(particles.log_weights), *none))
 
 
 def landmark_moments(particles: Particles) -> LandmarkGaussian:
@@ -91,7 +92,7 @@ def landmark_moments(particles: Particles) -> LandmarkGaussian:
     order = np.argsort(particles.ids)
     mean, P = moments(
         particles.poses,
-        np.exp(particles.log_weights),
+        elementwise.exp(particles.log_weights),
         particles.means[:, order],
         particles.covariances[:, order],
     )

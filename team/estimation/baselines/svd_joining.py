@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import dense, elementary, elementwise
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
 from team.estimation.geometry import Pose, wrapped
@@ -178,8 +179,8 @@ def exchanged(
         raise TooFewPointsError(n)
     a_from_b = procrustes(tie_a, tie_b, np.ones(n))
     moved, G = _moved(a_from_b, tie_b)
-    variance = 0.5 * float(((tie_a - moved) ** 2).sum()) / (2 * n - 3)
-    of_motion = 2.0 * variance * information(G.T @ G, "two maps' points")
+    variance = 0.5 * float((elementary.squared(tie_a - moved)).sum()) / (2 * n - 3)
+    of_motion = 2.0 * variance * information(dense.product(G.T, G), "two maps' points")
     common = np.isin(ids, a.ids) & np.isin(ids, b.ids)
     from_b = np.where(common, 0.5, np.isin(ids, b.ids))
     in_frame_a, slopes = np.zeros((len(ids), 2)), np.zeros((2 * len(ids), 3))
@@ -189,7 +190,7 @@ def exchanged(
     means[of_a] += (1.0 - from_b[of_a])[:, None] * a.means
     E = np.repeat(from_b, 2)[:, None] * slopes
     own = variance * np.where(common, 0.5, 1.0)
-    covariance = np.diag(np.repeat(own, 2)) + E @ of_motion @ E.T
+    covariance = np.diag(np.repeat(own, 2)) + dense.product(dense.product(E, of_motion), E.T)
     return ExchangedMap(
         LandmarkGaussian(ids, means, 0.5 * (covariance + covariance.T)),
         PoseGaussian(a_from_b, of_motion),
@@ -200,8 +201,8 @@ def _moved(
     a_from_b: Pose, points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 3"]]:
     """R b + t and its derivative by (t, θ): [I, R b turned by 90°]."""
-    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
-    turned = points @ np.array([[c, s], [-s, c]])
+    s, c = elementwise.sin_and_cos(a_from_b[2])
+    turned = dense.product(points, np.array([[c, s], [-s, c]]))
     G = np.zeros((2 * len(points), 3))
     G[0::2, 0] = G[1::2, 1] = 1.0
     G[0::2, 2], G[1::2, 2] = -turned[:, 1], turned[:, 0]
@@ -238,12 +239,12 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     for _ in range(ITERATIONS):
         residual, J = _seen_from(state, columns_b)
         residual -= b.means.ravel()
-        hessian = J.T @ of_b @ J
+        hessian = dense.product(dense.product(J.T, of_b), J)
         hessian[np.ix_(columns_a, columns_a)] += of_a
-        gradient = J.T @ (of_b @ residual)
-        gradient[columns_a] += of_a @ (state[columns_a] - a.means.ravel())
+        gradient = dense.product(J.T, dense.product(of_b, residual))
+        gradient[columns_a] += dense.product(of_a, state[columns_a] - a.means.ravel())
         covariance = information(hessian, "two maps' joint solution")
-        step = covariance @ gradient
+        step = dense.product(covariance, gradient)
         state -= step
         state[2] = wrapped(state[2])
         if np.abs(step).max() < STANDS_STILL:
@@ -263,10 +264,10 @@ def _seen_from(
     state: Float[np.ndarray, " n"], columns: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Rᵀ(x − t) of the points in these columns, and its derivative by the whole (t, θ, x)."""
-    c, s = np.cos(state[2]), np.sin(state[2])
+    s, c = elementwise.sin_and_cos(state[2])
     back = np.array([[c, s], [-s, c]])
     offsets = state[columns].reshape(-1, 2) - state[:2]
-    seen = offsets @ back.T
+    seen = dense.product(offsets, back.T)
     J = np.zeros((len(columns), len(state)))
     J[0::2, :2], J[1::2, :2] = -back[0], -back[1]
     J[0::2, 2], J[1::2, 2] = seen[:, 1], -seen[:, 0]

@@ -9,20 +9,19 @@ window would keep rejecting correct measurements once that map is wrong, and wou
 twice.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
-from scipy.linalg.lapack import dpotrf, dpotri
 
 from team.config import Sensor
+from team.estimation import dense, elementary
 from team.estimation.geometry import compose
 from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.models import Increment, located, variances
 from team.estimation.scans import Own
 
-EVIDENCE = math.log(100.0)
+EVIDENCE = elementary.log(100.0)
 """Log odds that a landmark's accepted measurements must reach; by chance they do so in one case
 of a hundred."""
 MOTION_JITTER = (1e-6, 1e-6, 1e-8)
@@ -56,8 +55,8 @@ class _Measurements:
         self.means, self.covariances = _between(motions, seen.tolist())
         reach = min(sensor.max_range, float(measurements[:, 0].max()))
         uniform = 1.0 / (reach * sensor.field_of_view)
-        self.prior = math.log((1.0 - outlier_share) / outlier_share)
-        self.odds = self.prior - math.log(uniform)
+        self.prior = elementary.log((1.0 - outlier_share) / outlier_share)
+        self.odds = self.prior - elementary.log(uniform)
         """Added to log p(z): gives the log odds that the measurement is good."""
 
 
@@ -108,7 +107,7 @@ def confirmed(
     landmarks = np.array(
         [located(path[window.keyframes[i]], *measurements[i].tolist()) for i in placed_by]
     ).reshape(-1, 2)
-    metrics = np.linalg.inv(window.covariances + np.diag(MOTION_JITTER))
+    metrics = dense.inverse(window.covariances + np.diag(MOTION_JITTER))
     for _ in range(ROUNDS):
         smoothed = _smoothed(window, path, landmarks, metrics, taken)
         if smoothed is None:
@@ -174,21 +173,20 @@ def _smoothed(
     """
     unknown = np.bincount(window.slots[taken], minlength=window.landmarks) == 0
     free = 3 * (len(path) - 1) + np.flatnonzero(np.repeat(unknown, 2))
-    far = float(window.measurements[:, 0].max()) ** 2
+    far = elementary.squared(float(window.measurements[:, 0].max()))
     for _ in range(2):
         H, g = kernel.normal_equations(
             path, landmarks, window.means, metrics, window.keyframes, window.slots,
             window.measurements, window.own, taken, window.sensor,
         )  # fmt: skip
         H[free, free] = 1.0 / far
-        factor, indefinite = dpotrf(H, lower=1)
-        if indefinite:
+        try:
+            covariance = dense.inverse_of_factored(dense.cholesky(H))
+        except np.linalg.LinAlgError:
             return None
-        inverse, singular = dpotri(factor, lower=1)
-        if singular or not np.isfinite(inverse).all():
+        if not np.isfinite(covariance).all():
             return None
-        covariance = np.tril(inverse) + np.tril(inverse, -1).T
-        path, landmarks = kernel.filter_step(path, landmarks, covariance @ g)
+        path, landmarks = kernel.filter_step(path, landmarks, dense.product(covariance, g))
     return path, landmarks, covariance
 
 
@@ -224,7 +222,7 @@ def _misread(
     total = np.bincount(window.slots[taken], logs[taken], minlength=window.landmarks)
     names = np.arange(window.landmarks)
     doubtful = np.zeros(window.landmarks, dtype=np.bool_)
-    own_name = window.prior + math.log(max(window.landmarks - 1, 1))
+    own_name = window.prior + elementary.log(max(window.landmarks - 1, 1))
     for other in np.flatnonzero(count >= 2):
         as_other = kernel.left_out(
             path, landmarks, covariance, window.keyframes, np.full_like(window.slots, other),

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import (
     adjoint,
@@ -70,7 +71,7 @@ def _log_density(e0: float, e1: float, s00: float, s01: float, s11: float) -> fl
     """Log N(e; 0, S) of two numbers."""
     determinant = s00 * s11 - s01 * s01
     squared = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
-    return -0.5 * (squared + math.log(determinant)) - math.log(2.0 * math.pi)
+    return -0.5 * (squared + elementary.log(determinant)) - elementary.log(2.0 * math.pi)
 
 
 @compiled
@@ -90,7 +91,7 @@ def _prediction(
     with its noise and the measurement's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ.
     """
     distance, bearing = max(seen[0], NEAREST_M), seen[1]
-    c, s = math.cos(bearing), math.sin(bearing)
+    s, c = elementary.sin_and_cos(bearing)
     along = sensor[0] + sensor[1] * distance * distance
     across = sensor[2] * distance * distance
     both = 0.0
@@ -290,7 +291,7 @@ def left_out(
         if not (d00 > 1e-9 * r0 and d11 > 1e-9 * r1 and determinant > 1e-12 * of_noise):
             logs[n] = -np.inf  # nothing else says where the landmark is
             continue
-        logs[n] = _log_density(e[0], e[1], d00, d01, d11) + math.log(determinant / of_noise)
+        logs[n] = _log_density(e[0], e[1], d00, d01, d11) + elementary.log(determinant / of_noise)
     return logs
 
 

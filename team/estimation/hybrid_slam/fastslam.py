@@ -4,7 +4,6 @@ p(path, landmarks | z) = p(path | z) Π p(landmark | path, z): the first factor 
 particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
 """
 
-import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.config import Sensor
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import fastslam_kernel
@@ -58,7 +58,7 @@ def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
     count = len(poses)
     return Particles(
         poses=poses,
-        log_weights=np.full(count, -math.log(count)),
+        log_weights=np.full(count, -elementary.log(count)),
         ids=np.empty(0, np.uint32),
         means=np.empty((count, 0, 2)),
         covariances=np.empty((count, 0, 3)),
@@ -70,7 +70,7 @@ def effective_sample_size(log_weights: Float[np.ndarray, " M"]) -> float:
     """1/Σ w² of normalised log weights."""
     total = 0.0
     for log_weight in log_weights:
-        total += math.exp(2.0 * log_weight)
+        total += elementary.exp(2.0 * log_weight)
     return 1.0 / total
 
 
@@ -80,8 +80,8 @@ def normalised(log_weights: Float[np.ndarray, " M"]) -> tuple[Float[np.ndarray, 
     largest = log_weights.max()
     total = 0.0
     for log_weight in log_weights:
-        total += math.exp(log_weight - largest)
-    log_sum = largest + math.log(total)
+        total += elementary.exp(log_weight - largest)
+    log_sum = largest + elementary.log(total)
     return log_weights - log_sum, log_sum
 
 
@@ -97,11 +97,11 @@ def systematic_parents(
     count = len(log_weights)
     parents = np.empty(count, np.int64)
     parent = 0
-    cumulated = math.exp(log_weights[0])
+    cumulated = elementary.exp(log_weights[0])
     for k in range(count):
         while (k + uniform) / count >= cumulated and parent < count - 1:
             parent += 1
-            cumulated += math.exp(log_weights[parent])
+            cumulated += elementary.exp(log_weights[parent])
         parents[k] = parent
     return parents
 
@@ -115,7 +115,7 @@ def resampled(
     return (
         Particles(
             particles.poses[parents],
-            np.full(count, -math.log(count)),
+            np.full(count, -elementary.log(count)),
             particles.ids,
             particles.means[parents],
             particles.covariances[parents],

@@ -9,7 +9,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from team.estimation.compiled import compiled
+from team.estimation import elementary
+from team.estimation.compiled import compiled, inlined
 from team.estimation.geometry import swept, wrapped
 from team.estimation.hybrid_slam.landmark_kernel import (
     Triple,
@@ -46,6 +47,10 @@ def slots_of(
     return ids[:count].copy(), slots, first
 
 
+WEAKEST = 1e-150
+"""The logarithm of a product of densities is taken when the product is below this, or above its
+inverse.
+"""
 SMALLEST_VARIANCE = 1e-200
 """A variance of motion below this is taken as zero [m², rad²]."""
 
@@ -76,10 +81,9 @@ def semidefinite_factor(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarra
     return L
 
 
-@compiled
-def _moved(pose: Triple, forward: float, left: float, turn: float) -> Triple:
-    """The pose after (forward, left, turn), given in it."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+@inlined
+def _moved(pose: Triple, s: float, c: float, forward: float, left: float, turn: float) -> Triple:
+    """The pose after (forward, left, turn), given in it; s, c are of its heading."""
     return (
         pose[0] + c * forward - s * left,
         pose[1] + s * forward + c * left,
@@ -87,15 +91,17 @@ def _moved(pose: Triple, forward: float, left: float, turn: float) -> Triple:
     )
 
 
-@compiled
-def _moved_by_noise(pose: Triple, L: Float[np.ndarray, "3 3"], noise: Triple) -> Triple:
-    """The pose after Exp(L ε), for a lower triangular L."""
+@inlined
+def _moved_by_noise(
+    pose: Triple, s: float, c: float, L: Float[np.ndarray, "3 3"], noise: Triple
+) -> Triple:
+    """The pose after Exp(L ε), for a lower triangular L; s, c are of its heading."""
     turn = L[2, 0] * noise[0] + L[2, 1] * noise[1] + L[2, 2] * noise[2]
     x, y = swept(L[0, 0] * noise[0], L[1, 0] * noise[0] + L[1, 1] * noise[1], turn)
-    return _moved(pose, x, y, turn)
+    return _moved(pose, s, c, x, y, turn)
 
 
-@compiled
+@inlined
 def _condition_noise(
     noise_mean: Float[np.ndarray, "3"],
     root: Float[np.ndarray, "3 3"],
@@ -105,13 +111,13 @@ def _condition_noise(
 ) -> float:
     """N(m, A Aᵀ) given row·ε + v = row·m + innovation, v ~ N(0, variance); in place.
 
-    Potter's square-root update: the covariance can not lose its sign. Returns the change of
-    log|det A|. Maybeck 1979, section 7.3.
+    Potter's square-root update: the covariance can not lose its sign. Returns by what |det A|² is
+    multiplied. Maybeck 1979, section 7.3.
     """
     phi0 = root[0, 0] * row[0] + root[1, 0] * row[1] + root[2, 0] * row[2]
     phi1 = root[0, 1] * row[0] + root[1, 1] * row[1] + root[2, 1] * row[2]
     phi2 = root[0, 2] * row[0] + root[1, 2] * row[1] + root[2, 2] * row[2]
-    total = phi0 * phi0 + phi1 * phi1 + phi2 * phi2 + variance
+    total: float = phi0 * phi0 + phi1 * phi1 + phi2 * phi2 + variance
     share = 1.0 / (1.0 + math.sqrt(variance / total))
     for i in range(3):
         gain = (root[i, 0] * phi0 + root[i, 1] * phi1 + root[i, 2] * phi2) / total
@@ -119,10 +125,10 @@ def _condition_noise(
         root[i, 0] -= share * gain * phi0
         root[i, 1] -= share * gain * phi1
         root[i, 2] -= share * gain * phi2
-    return 0.5 * math.log(variance / total)
+    return variance / total
 
 
-@compiled
+@inlined
 def _condition_noise_on_measurement(
     noise_mean: Float[np.ndarray, "3"],
     root: Float[np.ndarray, "3 3"],
@@ -138,14 +144,14 @@ def _condition_noise_on_measurement(
 
     `pose` is the particle's pose at ε = m; there z = h + H L (ε − m) + v with the joint covariance
     S = Hₗ Σ Hₗᵀ + R of v. The range is taken first, then the bearing less its regression on the
-    range, so each is scalar. Returns the change of log|det A|.
+    range, so each is scalar. Returns by what |det A|² is multiplied.
     """
     distance, ex, ey = seen(pose, mean)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    s, c = elementary.sin_and_cos(pose[2])
     u, v = c * ex + s * ey, c * ey - s * ex
     xx, xy, yy = covariance[0], covariance[1], covariance[2]
     of_range, of_bearing, rr, rb, bb = innovation_of(
-        measurement, own, sensor, distance, wrapped(measurement[1] - math.atan2(v, u))
+        measurement, own, sensor, distance, wrapped(measurement[1] - elementary.atan2(v, u))
     )
     S_rr = xx * ex * ex + 2.0 * xy * ex * ey + yy * ey * ey
     S_rr += rr
@@ -158,11 +164,10 @@ def _condition_noise_on_measurement(
     b2 = -L[2, 2]
     m0, m1, m2 = noise_mean[0], noise_mean[1], noise_mean[2]
     of_bearing -= slope * of_range
-    change = _condition_noise(noise_mean, root, (r0, r1, 0.0), of_range, S_rr)
+    by_range = _condition_noise(noise_mean, root, (r0, r1, 0.0), of_range, S_rr)
     of_bearing -= b0 * (noise_mean[0] - m0) + b1 * (noise_mean[1] - m1) + b2 * (noise_mean[2] - m2)
-    return change + _condition_noise(
-        noise_mean, root, (b0, b1, b2), of_bearing, S_bb - slope * S_rb
-    )
+    by_bearing = _condition_noise(noise_mean, root, (b0, b1, b2), of_bearing, S_bb - slope * S_rb)
+    return by_range * by_bearing
 
 
 @compiled
@@ -199,15 +204,19 @@ def step(
     """
     noise_mean, root = np.empty(3), np.empty((3, 3))
     for i in range(len(start)):
-        origin = _moved((start[i, 0], start[i, 1], start[i, 2]), motion[0], motion[1], motion[2])
+        s, c = elementary.sin_and_cos(start[i, 2])
+        begin = start[i, 0], start[i, 1], start[i, 2]
+        origin = _moved(begin, s, c, motion[0], motion[1], motion[2])
+        s, c = elementary.sin_and_cos(origin[2])
         noise_mean[:] = 0.0
         root[:] = 0.0
         root[0, 0] = root[1, 1] = root[2, 2] = 1.0
-        log_weight = 0.0
+        log_weight, factor = 0.0, 1.0
         for k in range(len(slots) if improved else 0):
             if slots[k] < known:
-                pose = _moved_by_noise(origin, L, (noise_mean[0], noise_mean[1], noise_mean[2]))
-                log_weight += _condition_noise_on_measurement(
+                drawn = noise_mean[0], noise_mean[1], noise_mean[2]
+                pose = _moved_by_noise(origin, s, c, L, drawn)
+                factor *= _condition_noise_on_measurement(
                     noise_mean,
                     root,
                     L,
@@ -218,19 +227,25 @@ def step(
                     means[i, slots[k]],
                     covariances[i, slots[k]],
                 )
+                if not WEAKEST < factor < 1.0 / WEAKEST:
+                    log_weight, factor = log_weight + 0.5 * elementary.log(factor), 1.0
         n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
         e0 = noise_mean[0] + root[0, 0] * n0 + root[0, 1] * n1 + root[0, 2] * n2
         e1 = noise_mean[1] + root[1, 0] * n0 + root[1, 1] * n1 + root[1, 2] * n2
         e2 = noise_mean[2] + root[2, 0] * n0 + root[2, 1] * n1 + root[2, 2] * n2
         log_weight += 0.5 * (n0 * n0 + n1 * n1 + n2 * n2) - 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
-        pose = _moved_by_noise(origin, L, (e0, e1, e2))
+        pose = _moved_by_noise(origin, s, c, L, (e0, e1, e2))
         poses[i, 0], poses[i, 1], poses[i, 2] = pose
         for k in range(len(slots)):
             mean, covariance = means[i, slots[k]], covariances[i, slots[k]]
             if first[k]:
                 place(mean, covariance, pose, measurements[k], sensor, own[k])
             else:
-                log_weight += condition_on_measurement(
+                chi2, volume = condition_on_measurement(
                     mean, covariance, pose, measurements[k], sensor, own[k]
                 )
-        log_weights[i] += log_weight
+                log_weight -= 0.5 * chi2
+                factor /= volume
+                if not WEAKEST < factor < 1.0 / WEAKEST:
+                    log_weight, factor = log_weight + 0.5 * elementary.log(factor), 1.0
+        log_weights[i] += log_weight + 0.5 * elementary.log(factor)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.config import Sensor
+from team.estimation import dense, elementary, elementwise
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import EPSILON, cholesky_factor, whitened
 from team.estimation.geometry import compose, tangent, wrapped
@@ -83,7 +84,7 @@ def innovation(
         return NOTHING
     error, S = _predictive(
         particles.poses,
-        np.exp(particles.log_weights),
+        elementwise.exp(particles.log_weights),
         particles.means,
         particles.covariances,
         increment.mean,
@@ -123,7 +124,7 @@ def joint_innovation(
     pose = compose(mean[:3], increment.mean)
     dx, dy = pose[:2] - mean[:2]
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    to_own = tangent(pose[2]).T @ F
+    to_own = dense.product(tangent(pose[2]).T, F)
     m = 2 * len(slots)
     error, A, H = np.empty(m), np.zeros((m, len(columns))), np.empty((m, 3))
     R = np.empty(m)
@@ -134,9 +135,13 @@ def joint_innovation(
         error[rows] = measurements[k, 0] - distance, wrapped(measurements[k, 1] - bearing)
         R[rows] = noise(sensor, distance)
         H[rows] = pose_jacobian(distance, bearing)
-        A[rows, :3] = H[rows] @ to_own
+        A[rows, :3] = dense.product(H[rows], to_own)
         A[rows, 3 + 2 * slot : 5 + 2 * slot] = landmark_jacobian(distance, pose[2] + bearing)
-    S = A @ covariance[np.ix_(columns, columns)] @ A.T + H @ increment.covariance @ H.T + np.diag(R)
+    S = (
+        dense.product(dense.product(A, covariance[np.ix_(columns, columns)]), A.T)
+        + dense.product(dense.product(H, increment.covariance), H.T)
+        + np.diag(R)
+    )
     return _squared(error, S)
 
 
@@ -144,7 +149,7 @@ def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Inn
     squared = _normalised_square(error, S)
     if not math.isfinite(squared):  # rank and finiteness are judged there
         white = whitened(cholesky_factor(S, "the prediction of measurements"), error)
-        squared = float(white @ white)
+        squared = float(dense.product(white, white))
     return Innovation(squared, len(error))
 
 
@@ -259,11 +264,11 @@ def _predict(
 
     root: √w of the particle's weight.
     """
-    c, s = math.cos(start[2]), math.sin(start[2])
+    s, c = elementary.sin_and_cos(start[2])
     x = start[0] + c * motion[0] - s * motion[1]
     y = start[1] + s * motion[0] + c * motion[1]
     heading = start[2] + motion[2]
-    c, s = math.cos(heading), math.sin(heading)
+    s, c = elementary.sin_and_cos(heading)
     l00, l10, l11 = root * L[0, 0], root * L[1, 0], root * L[1, 1]
     l20, l21, l22 = root * L[2, 0], root * L[2, 1], root * L[2, 2]
     for k in range(len(slots)):
@@ -271,7 +276,7 @@ def _predict(
         distance, ex, ey = seen((x, y, heading), means[slots[k]])
         u, v = c * ex + s * ey, c * ey - s * ex
         errors[r] = measurements[k, 0] - distance
-        errors[b] = wrapped(measurements[k, 1] - math.atan2(v, u))
+        errors[b] = wrapped(measurements[k, 1] - elementary.atan2(v, u))
         of_motion[r, 0] = -u * l00 - v * l10
         of_motion[r, 1] = -v * l11
         of_motion[r, 2] = 0.0
@@ -290,12 +295,13 @@ def _centred(
     mean, sine, cosine = 0.0, 0.0, 0.0
     for i in range(len(values)):
         if is_angle:
-            sine += weights[i] * math.sin(values[i])
-            cosine += weights[i] * math.cos(values[i])
+            s, c = elementary.sin_and_cos(values[i])
+            sine += weights[i] * s
+            cosine += weights[i] * c
         else:
             mean += weights[i] * values[i]
     if is_angle:
-        mean = math.atan2(sine, cosine)
+        mean = elementary.atan2(sine, cosine)
     for i in range(len(values)):
         values[i] -= mean
         if is_angle:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 from team.config import MotionModel, Sensor
-from team.estimation import geometry
+from team.estimation import dense, geometry
 from team.estimation.geometry import adjoint, inverse
 from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
@@ -240,7 +240,7 @@ class Segmenter:
         if self._motion.calibrated_speed is not None:
             column = over.forward_column(self._motion, duration_ns)
             if self._sensor.is_mounted:
-                column = self._unmount @ column
+                column = dense.product(self._unmount, column)
             self._forward = carried_on(self._forward, step.mean) + column
         if self._keyframe_ns:
             self._scan_motion = geometry.compose(self._scan_motion, step.mean)

@@ -10,24 +10,25 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.compiled import compiled
+from team.estimation import elementary
+from team.estimation.compiled import compiled, inlined
 from team.estimation.geometry import wrapped
 from team.estimation.models import NEAREST_M
 
 Triple = tuple[float, float, float]
 
 
-@compiled
+@inlined
 def seen(pose: Triple, mean: Float[np.ndarray, "2"]) -> Triple:
     """Distance and the unit vector (ex, ey) from the pose to the landmark."""
     dx, dy = mean[0] - pose[0], mean[1] - pose[1]
     distance = math.sqrt(dx * dx + dy * dy)
     if distance < NEAREST_M:
-        return NEAREST_M, math.cos(pose[2]), math.sin(pose[2])
+        return NEAREST_M, elementary.cos(pose[2]), elementary.sin(pose[2])
     return distance, dx / distance, dy / distance
 
 
-@compiled
+@inlined
 def innovation_of(
     measurement: Float[np.ndarray, "2"],
     own: Float[np.ndarray, " own"],
@@ -50,7 +51,7 @@ def innovation_of(
     if own[3] == 0.0:
         return measurement[0] - distance, of_bearing, rr, rb, bb
     reach = max(measurement[0], NEAREST_M)
-    c, s = math.cos(of_bearing), math.sin(of_bearing)
+    s, c = elementary.sin_and_cos(of_bearing)
     rb, bb = rb * reach, bb * reach * reach
     along = c * c * rr - 2.0 * c * s * rb + s * s * bb
     both = c * s * (rr - bb) + (c * c - s * s) * rb
@@ -64,7 +65,7 @@ def innovation_of(
     )
 
 
-@compiled
+@inlined
 def _condition_on_scalar(
     mean: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "3"],
@@ -72,9 +73,8 @@ def _condition_on_scalar(
     hy: float,
     innovation: float,
     variance: float,
-) -> float:
-    """A landmark given one scalar measurement of row h = (hx, hy), in place; log N(innovation; 0,
-    s).
+) -> tuple[float, float]:
+    """A landmark given one scalar measurement of row h = (hx, hy), in place; (innovation²/s, s).
 
     For 2 × 2, Σ − Σhhᵀ Σ/s = (R Σ + |Σ| h⊥h⊥ᵀ)/s with s = hᵀΣh + R: a sum of positive terms, so
     the covariance stays positive definite.
@@ -88,10 +88,10 @@ def _condition_on_scalar(
     covariance[0] = shrunk * xx + across * hy * hy
     covariance[1] = shrunk * xy - across * hx * hy
     covariance[2] = shrunk * yy + across * hx * hx
-    return -0.5 * (innovation * innovation / total + math.log(2.0 * math.pi * total))
+    return innovation * innovation / total, total
 
 
-@compiled
+@inlined
 def condition_on_measurement(
     mean: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "3"],
@@ -99,8 +99,10 @@ def condition_on_measurement(
     measurement: Float[np.ndarray, "2"],
     sensor: Triple,
     own: Float[np.ndarray, " own"],
-) -> float:
-    """The EKF update of one landmark at a known pose, in place; log p(z | pose, landmark).
+) -> tuple[float, float]:
+    """The EKF update of one landmark at a known pose, in place.
+
+    Returns χ² and V with log p(z | pose, landmark) = −½ (χ² + log V).
 
     The two rows of Hₗ, linearised once, are taken one after the other: the range, then the bearing
     less its regression on the range, since what is left of its error is independent of the range's.
@@ -108,16 +110,21 @@ def condition_on_measurement(
     distance, ex, ey = seen(pose, mean)
     before_x, before_y = mean[0], mean[1]
     of_range, of_bearing, rr, rb, bb = innovation_of(
-        measurement, own, sensor, distance, wrapped(measurement[1] + pose[2] - math.atan2(ey, ex))
+        measurement,
+        own,
+        sensor,
+        distance,
+        wrapped(measurement[1] + pose[2] - elementary.atan2(ey, ex)),
     )
     slope = rb / rr
-    log_likelihood = _condition_on_scalar(mean, covariance, ex, ey, of_range, rr)
+    chi2_range, s_range = _condition_on_scalar(mean, covariance, ex, ey, of_range, rr)
     hx, hy = -ey / distance - slope * ex, ex / distance - slope * ey
     of_bearing -= slope * of_range
     of_bearing -= hx * (mean[0] - before_x) + hy * (mean[1] - before_y)
-    return log_likelihood + _condition_on_scalar(
+    chi2_bearing, s_bearing = _condition_on_scalar(
         mean, covariance, hx, hy, of_bearing, bb - slope * rb
     )
+    return chi2_range + chi2_bearing, (2.0 * math.pi * s_range) * (2.0 * math.pi * s_bearing)
 
 
 @compiled
@@ -131,7 +138,7 @@ def place(
 ) -> None:
     """A landmark at first sight, in place: the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z."""
     distance, direction = max(measurement[0], NEAREST_M), pose[2] + measurement[1]
-    ex, ey = math.cos(direction), math.sin(direction)
+    ey, ex = elementary.sin_and_cos(direction)
     along, both = sensor[0] + sensor[1] * distance * distance, 0.0
     across = sensor[2] * distance * distance
     if len(own) and own[3] >= 0.0:

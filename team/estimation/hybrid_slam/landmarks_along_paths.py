@@ -5,6 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam.landmark_kernel import innovation_of
@@ -67,7 +68,7 @@ def landmarks_along_paths(
                     dx, dy = x - pose[0], y - pose[1]
                     distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
                     ex, ey = dx / distance, dy / distance
-                    of_bearing = wrapped(measurements[k, 1] + pose[2] - math.atan2(dy, dx))
+                    of_bearing = wrapped(measurements[k, 1] + pose[2] - elementary.atan2(dy, dx))
                     if own.shape[1] and own[k, 3] >= 0.0:
                         of_range, of_bearing, total, between, bearing_total = innovation_of(
                             measurements[k], own[k], NO_SENSOR, distance, of_bearing

@@ -1,10 +1,9 @@
 """Moment matching: a mixture of particles becomes one Gaussian, headings on the circle."""
 
-import math
-
 import numpy as np
 from jaxtyping import Float
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 
@@ -19,9 +18,10 @@ def mean_direction(angles: Float[np.ndarray, " M"], weights: Float[np.ndarray, "
     """The direction of Σ wᵢ (cos aᵢ, sin aᵢ)."""
     sine, cosine = 0.0, 0.0
     for i in range(len(angles)):
-        sine += weights[i] * math.sin(angles[i])
-        cosine += weights[i] * math.cos(angles[i])
-    return math.atan2(sine, cosine)
+        s, c = elementary.sin_and_cos(angles[i])
+        sine += weights[i] * s
+        cosine += weights[i] * c
+    return elementary.atan2(sine, cosine)
 
 
 def sample_factor(weights: Float[np.ndarray, " M"]) -> float:

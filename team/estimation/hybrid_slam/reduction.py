@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import UNNAMED, Sensor
-from team.estimation import geometry
+from team.estimation import elementary, geometry
 from team.estimation.models import Increment, located
 from team.estimation.scans import SENSOR, Own, carried, mean_claim, together
 
@@ -53,7 +53,9 @@ def reduced(looks: Sequence[KeyframeScan], end: Float[np.ndarray, "3"]) -> Measu
         for k, landmark in enumerate(look.ids):
             r, b = float(look.ranges[k]), float(look.bearings[k])
             x, y = located(back, r, b)
-            points.setdefault(int(landmark), []).append((np.hypot(x, y), np.arctan2(y, x)))
+            points.setdefault(int(landmark), []).append(
+                (elementary.hypot(x, y), elementary.atan2(y, x))
+            )
             if look.own.size:
                 claim = carried(look.own[k], r, float(back[2]) + b, np.array([x, y]))
                 claims.setdefault(int(landmark), []).append(claim)
@@ -70,9 +72,10 @@ def variances(
     """(rr, rb, bb) of each measurement: as it claims, or the sensor's at its range."""
     of_sensor = np.column_stack(
         (
-            sensor.range_sigma**2 + (sensor.range_sigma_per_m * ranges) ** 2,
+            elementary.squared(sensor.range_sigma)
+            + elementary.squared(sensor.range_sigma_per_m * ranges),
             np.zeros(len(ranges)),
-            np.full(len(ranges), sensor.bearing_sigma**2),
+            np.full(len(ranges), elementary.squared(sensor.bearing_sigma)),
         )
     )
     if not own.size:

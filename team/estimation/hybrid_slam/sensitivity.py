@@ -14,9 +14,9 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.linalg import cho_solve
 
 from team.config import Bias
+from team.estimation import dense, elementary, elementwise
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import cholesky_factor
 from team.estimation.geometry import adjoint, between
@@ -54,7 +54,7 @@ def carried_on(
     column: Float[np.ndarray, "3"], motion: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
     """A shift of the earlier motion, seen at the end of a further motion: Ad(motion⁻¹) column."""
-    c, s = math.cos(motion[2]), math.sin(motion[2])
+    s, c = elementary.sin_and_cos(motion[2])
     x = column[0] - motion[1] * column[2]
     y = column[1] + motion[0] * column[2]
     return np.array([c * x + s * y, -s * x + c * y, column[2]])
@@ -79,15 +79,15 @@ def columns(
     size = 3 * len(path) + 2 * len(landmarks)
     A, right = np.zeros((size, size)), np.zeros((size, len(BIASES)))
     covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 3, 3)
-    metrics = np.linalg.inv(covariances + np.diag(MOTION_JITTER)) if len(path) else covariances
+    metrics = dense.inverse(covariances + np.diag(MOTION_JITTER)) if len(path) else covariances
     shifts = np.array([motion.forward for motion in motions]).reshape(-1, 3)
     rows = _measurement_rows(path, landmarks, *measurements, own, noise)
     _add_motions(A, right, path, metrics, shifts)
     _add_measurements(A, right, rows, *measurements, 3 * len(path))
-    moved = cho_solve((cholesky_factor(A, "the smoother of a window"), True), right).T
+    moved = dense.solve_factored(cholesky_factor(A, "the smoother of a window"), right).T
     twists = np.ascontiguousarray(moved[:, : 3 * len(path)]).reshape(len(BIASES), len(path), 3)
     points = _landmarks_given(twists, rows, *measurements, len(landmarks), noise)
-    c, s = np.cos(path[:, 2]), np.sin(path[:, 2])
+    s, c = elementwise.sin_and_cos(path[:, 2])
     x, y = c * twists[..., 0] - s * twists[..., 1], s * twists[..., 0] + c * twists[..., 1]
     chosen = [BIASES.index(bias) for bias in biases]
     return np.stack([x, y, twists[..., 2]], axis=-1)[chosen], points[chosen]
@@ -141,17 +141,18 @@ def _measurement_rows(
         pose = path[poses[n]]
         dx, dy = landmarks[slots[n], 0] - pose[0], landmarks[slots[n], 1] - pose[1]
         distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
-        direction = math.atan2(dy, dx)
+        direction = elementary.atan2(dy, dx)
         bearing = direction - pose[2]
         of_range, of_bearing = rows[n, 0], rows[n, 1]
-        of_range[0], of_range[1] = -math.cos(bearing), -math.sin(bearing)
-        of_range[3], of_range[4] = math.cos(direction), math.sin(direction)
+        s, c = elementary.sin_and_cos(bearing)
+        sine, cosine = elementary.sin_and_cos(direction)
+        of_range[0], of_range[1] = -c, -s
+        of_range[3], of_range[4] = cosine, sine
         of_range[5] = distance
         of_range[6] = noise.range_variance + noise.range_per_m2 * distance * distance
-        of_bearing[0], of_bearing[1] = math.sin(bearing) / distance, -math.cos(bearing) / distance
+        of_bearing[0], of_bearing[1] = s / distance, -c / distance
         of_bearing[2] = -1.0
-        of_bearing[3] = -math.sin(direction) / distance
-        of_bearing[4] = math.cos(direction) / distance
+        of_bearing[3], of_bearing[4] = -sine / distance, cosine / distance
         of_bearing[5] = 1.0
         of_bearing[6] = noise.bearing_variance
         if own.shape[1] and own[n, 3] >= 0.0:

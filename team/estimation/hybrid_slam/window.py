@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.config import FrontEnd, Sensor
+from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from team.estimation.geometry import inverse, tangent
 from team.estimation.hybrid_slam import fastslam
@@ -74,10 +75,10 @@ class ParticleLandmarks(NamedTuple):
 def noise_of(sensor: Sensor) -> Noise:
     """The variances of a sensor and their white shares, as the kernels take them."""
     return Noise(
-        sensor.range_sigma**2,
-        sensor.range_sigma_per_m**2,
+        elementary.squared(sensor.range_sigma),
+        elementary.squared(sensor.range_sigma_per_m),
         sensor.range_white,
-        sensor.bearing_sigma**2,
+        elementary.squared(sensor.bearing_sigma),
         sensor.bearing_white,
     )
 
@@ -238,7 +239,7 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
         particles = replace(particles, poses=base_poses(particles.poses, mount))
         of_nodes = base_poses(of_nodes, mount)
     poses = np.concatenate((particles.poses, *of_nodes), axis=1)
-    weights = np.exp(particles.log_weights)
+    weights = elementwise.exp(particles.log_weights)
     mean, covariance = moments(
         poses,
         weights,
@@ -272,7 +273,7 @@ def of_base(window: Window) -> Window:
 def motion_alone(motion: Increment) -> LocalMap:
     """The Gaussian of a window's odometry alone, in the window's frame."""
     G = tangent(motion.mean[2])
-    covariance = G @ motion.covariance @ G.T + np.diag(POSE_JITTER)
+    covariance = dense.product(dense.product(G, motion.covariance), G.T) + np.diag(POSE_JITTER)
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))
 
 
@@ -283,7 +284,7 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
     """
     uncalibrated = any(motion.forward.any() for motion in window.motions)
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
-    weights = np.exp(window.particles.log_weights)
+    weights = elementwise.exp(window.particles.log_weights)
     mount = np.array(window.sensor.mount)
     of_sensor = local.mean[None, :3], local.landmarks
     if window.sensor.is_mounted:
@@ -313,4 +314,4 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
 def _mean_pose(
     poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]
 ) -> Float[np.ndarray, "3"]:
-    return np.array([*(weights @ poses[:, :2]), mean_direction(poses[:, 2], weights)])
+    return np.array([*(dense.product(weights, poses[:, :2])), mean_direction(poses[:, 2], weights)])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import dense, elementwise
 from team.estimation.geometry import Pose, wrapped
 from team.estimation.hybrid_slam.moments import mean_direction, sample_factor
 from team.estimation.hybrid_slam.window import POSE_JITTER, Window
@@ -37,17 +38,17 @@ def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
     With the particles' covariances P over (x_k, end), gain = P_ke P_ee⁻¹ and what is left is
     P_kk − gain P_ek; P_ee has POSE_JITTER as the submap's end has.
     """
-    weights = np.exp(window.particles.log_weights)
+    weights = elementwise.exp(window.particles.log_weights)
     poses = np.concatenate((window.paths, window.particles.poses[None]))
     means = np.array([_mean(each, weights) for each in poses])
     off = poses - means[:, None]
-    off[:, :, 2] = np.arctan2(np.sin(off[:, :, 2]), np.cos(off[:, :, 2]))
+    off[:, :, 2] = elementwise.atan2(elementwise.sin(off[:, :, 2]), elementwise.cos(off[:, :, 2]))
     scaled = sample_factor(weights) * weights[None, :, None] * off
-    P_ee = scaled[-1].T @ off[-1] + np.diag(POSE_JITTER)
+    P_ee = dense.product(scaled[-1].T, off[-1]) + np.diag(POSE_JITTER)
     P_ke = np.einsum("kmi,mj->kij", scaled[:-1], off[-1])
     P_kk = np.einsum("kmi,kmj->kij", scaled[:-1], off[:-1]) + np.diag(POSE_JITTER)
-    gains = np.linalg.solve(P_ee, P_ke.transpose(0, 2, 1)).transpose(0, 2, 1)
-    left = P_kk - gains @ P_ke.transpose(0, 2, 1)
+    gains = dense.solve(P_ee, P_ke.transpose(0, 2, 1)).transpose(0, 2, 1)
+    left = P_kk - dense.product(gains, P_ke.transpose(0, 2, 1))
     return WindowPath(
         np.array(keyframes_ns, np.int64),
         means[:-1],
@@ -75,24 +76,28 @@ def placed(
     left; that is taken times covariance_factor, as the map takes the submap's covariance.
     """
     heading = ends.start[2]
-    c, s = np.cos(heading), np.sin(heading)
+    s, c = elementwise.sin_and_cos(heading)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    local_end = turn.T @ (ends.end - ends.start)
+    local_end = dense.product(turn.T, ends.end - ends.start)
     off = local_end - path.end_mean
     off[2] = wrapped(off[2])
-    local = path.means + path.gains @ off
-    poses = ends.start + local @ turn.T
-    poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
+    local = path.means + dense.product(path.gains, off)
+    poses = ends.start + dense.product(local, turn.T)
+    poses[:, 2] = elementwise.atan2(elementwise.sin(poses[:, 2]), elementwise.cos(poses[:, 2]))
     J_end_start = np.column_stack((-turn.T[:, :2], [local_end[1], -local_end[0], -1.0]))
     covariances = np.empty((len(local), 3, 3))
     for k, (gain, left) in enumerate(zip(path.gains, path.covariances, strict=True)):
-        moved = turn @ gain
-        J = np.concatenate((moved @ J_end_start, moved @ turn.T), axis=1)
+        moved = dense.product(turn, gain)
+        J = np.concatenate(
+            (dense.product(moved, J_end_start), dense.product(moved, turn.T)), axis=1
+        )
         J[:, :3] += np.eye(3)
         J[:, 2] += [-s * local[k, 0] - c * local[k, 1], c * local[k, 0] - s * local[k, 1], 0.0]
-        covariances[k] = J @ ends.covariance @ J.T + covariance_factor * (turn @ left @ turn.T)
+        covariances[k] = dense.product(
+            dense.product(J, ends.covariance), J.T
+        ) + covariance_factor * (dense.product(dense.product(turn, left), turn.T))
     return poses, 0.5 * (covariances + covariances.transpose(0, 2, 1))
 
 
 def _mean(poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]) -> Pose:
-    return np.array([*(weights @ poses[:, :2]), mean_direction(poses[:, 2], weights)])
+    return np.array([*(dense.product(weights, poses[:, :2])), mean_direction(poses[:, 2], weights)])

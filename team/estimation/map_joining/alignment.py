@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtri
 
+from team.estimation import dense, elementary, elementwise
+from team.estimation.consistency import chi2_limit
 from team.estimation.gaussian import information
 from team.estimation.geometry import wrapped
 
@@ -43,15 +44,15 @@ def procrustes(
 ) -> Float[np.ndarray, "3"]:
     """a_from_b = argmin Σ wᵢ ‖aᵢ − (R bᵢ + t)‖² over proper rotations R and translations t.
 
-    With U S Vᵀ = Σ wᵢ (bᵢ − b̄)(aᵢ − ā)ᵀ: R = V diag(1, det VUᵀ) Uᵀ, t = ā − R b̄.
+    R turns by the direction of (Σ wᵢ (bᵢ − b̄)·(aᵢ − ā), Σ wᵢ (bᵢ − b̄) × (aᵢ − ā)); t = ā − R b̄.
     """
     share = weights / weights.sum()
-    mean_a, mean_b = share @ in_a, share @ in_b
-    u, _, vt = np.linalg.svd(((in_b - mean_b) * share[:, None]).T @ (in_a - mean_a))
-    proper = np.diag([1.0, np.linalg.det(vt.T @ u.T)])
-    rotation = vt.T @ proper @ u.T
-    shift = mean_a - rotation @ mean_b
-    return np.array([shift[0], shift[1], np.arctan2(rotation[1, 0], rotation[0, 0])])
+    mean_a, mean_b = dense.product(share, in_a), dense.product(share, in_b)
+    spread = dense.product(((in_b - mean_b) * share[:, None]).T, in_a - mean_a)
+    turn = elementary.atan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
+    s, c = elementary.sin_and_cos(turn)
+    x, y = c * mean_b[0] - s * mean_b[1], s * mean_b[0] + c * mean_b[1]
+    return np.array([mean_a[0] - x, mean_a[1] - y, turn])
 
 
 def aligned(
@@ -78,19 +79,25 @@ def aligned(
     about = procrustes(near_a, near_b, 1.0 / variances.reshape(n, 2).sum(axis=1))
     for _ in range(ITERATIONS):
         residual, metric, jacobian = _linearised(about, near_a, covariance_a, near_b, covariance_b)
-        spread = information(jacobian.T @ metric @ jacobian, "an alignment")
-        about = about + spread @ (jacobian.T @ (metric @ residual))
+        spread = information(
+            dense.product(dense.product(jacobian.T, metric), jacobian), "an alignment"
+        )
+        about = about + dense.product(
+            spread, dense.product(jacobian.T, dense.product(metric, residual))
+        )
         about[2] = wrapped(about[2])
     residual, metric, jacobian = _linearised(about, near_a, covariance_a, near_b, covariance_b)
-    spread = information(jacobian.T @ metric @ jacobian, "an alignment")
-    chi2 = float(residual @ metric @ residual)
+    spread = information(dense.product(dense.product(jacobian.T, metric), jacobian), "an alignment")
+    chi2 = float(dense.product(dense.product(residual, metric), residual))
     difference = information(metric, "the metric of an alignment")
     sigma = _shape_heading_sigma(near_b, jacobian, difference)
-    c, s = np.cos(about[2]), np.sin(about[2])
+    s, c = elementwise.sin_and_cos(about[2])
     x, y = c * of_b[0] - s * of_b[1], s * of_b[0] + c * of_b[1]
     a_from_b = np.array([of_a[0] + about[0] - x, of_a[1] + about[1] - y, about[2]])
     lever = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
-    return Alignment(a_from_b, lever @ spread @ lever.T, chi2, 2 * n - 3, sigma)
+    return Alignment(
+        a_from_b, dense.product(dense.product(lever, spread), lever.T), chi2, 2 * n - 3, sigma
+    )
 
 
 def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
@@ -110,9 +117,12 @@ def at_heading(
     pose = np.array([0.0, 0.0, heading])
     residual, metric, jacobian = _linearised(pose, in_a, covariance_a, in_b, covariance_b)
     J = jacobian[:, :2]
-    shift = np.linalg.solve(J.T @ metric @ J, J.T @ (metric @ residual))
-    left = residual - J @ shift
-    return shift, float(left @ metric @ left)
+    shift = dense.solve(
+        dense.product(dense.product(J.T, metric), J),
+        dense.product(J.T, dense.product(metric, residual)),
+    )
+    left = residual - dense.product(J, shift)
+    return shift, float(dense.product(dense.product(left, metric), left))
 
 
 def _shape_heading_sigma(
@@ -120,9 +130,12 @@ def _shape_heading_sigma(
     jacobian: Float[np.ndarray, "m 3"],
     covariance: Float[np.ndarray, "m m"],
 ) -> float:
-    shape = np.eye(len(jacobian)) - jacobian @ np.linalg.pinv(jacobian)
-    variance = np.trace(shape @ covariance @ shape) / (len(jacobian) - 3)
-    extent = float(((in_b - in_b.mean(axis=0)) ** 2).sum())
+    squares = dense.product(jacobian.T, jacobian)
+    shape = np.eye(len(jacobian)) - dense.product(jacobian, dense.solve(squares, jacobian.T))
+    variance = np.trace(dense.product(dense.product(shape, covariance), shape)) / (
+        len(jacobian) - 3
+    )
+    extent = float((elementary.squared(in_b - in_b.mean(axis=0))).sum())
     return float(np.sqrt(variance / extent))
 
 
@@ -137,12 +150,13 @@ def _linearised(
     θ).
     """
     n = len(in_a)
-    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
+    s, c = elementwise.sin_and_cos(a_from_b[2])
     rotation = np.array([[c, -s], [s, c]])
-    turned = in_b @ rotation.T
+    turned = dense.product(in_b, rotation.T)
     all_turned = np.kron(np.eye(n), rotation)
     metric = information(
-        covariance_a + all_turned @ covariance_b @ all_turned.T, "the shared landmarks of two maps"
+        covariance_a + dense.product(dense.product(all_turned, covariance_b), all_turned.T),
+        "the shared landmarks of two maps",
     )
     jacobian = np.zeros((2 * n, 3))
     jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
@@ -190,7 +204,7 @@ def disagreement(shared: SharedPoints, chi2: float, confidence: float) -> str | 
         per point less the 3 of the motion; `confidence` is the quantile above which it counts as a
         disagreement.
     """
-    limit = float(chdtri(2 * sum(shared) - 3, 1.0 - confidence))
+    limit = chi2_limit(2 * sum(shared) - 3, 1.0 - confidence)
     if chi2 > limit:
         return f"{shared} disagree: chi² {chi2:.1f} exceeds {limit:.1f} ({100.0 * confidence:g} %)"
     return None

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED
+from team.estimation import elementwise
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.map_joining.association.crowding import Crowd
 from team.estimation.map_joining.association.growing import (
@@ -143,7 +144,10 @@ class IslandView:
         later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
         if len(later):
             one, two = at[later], at[earlier]
-            close = np.hypot(*(self.joint.mean[one] - self.joint.mean[two]).T) < self.profile.same
+            close = (
+                elementwise.hypot(*(self.joint.mean[one] - self.joint.mean[two]).T)
+                < self.profile.same
+            )
             close &= ~self._left_apart(one, two)
             self._grow("sweep", one[close], two[close], self.profile.tight)
 
@@ -175,7 +179,7 @@ def _unseen(
     """Probability, for each landmark, that all windows that saw it missed another one beside it."""
     counts = np.zeros(len(points))
     for places in seen_by:
-        away = np.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
+        away = elementwise.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
         counts += (away < radius).any(axis=1)
     return np.asarray(np.maximum(OVERLOOKED ** np.maximum(counts - 1.0, 0.0), LEAST_OVERLOOKED))
 

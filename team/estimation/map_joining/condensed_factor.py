@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import dense
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.condensing_kernel import add_blocks
 
@@ -98,11 +99,14 @@ class Condensed:
     def cost_at(self, state: Values, offset: Indices) -> float:
         """cost(x)."""
         d = self.moved(state, offset)
-        return self.cost + float(2.0 * (self.slope @ d) + d @ (self.information @ d))
+        return self.cost + float(
+            2.0 * (dense.product(self.slope, d))
+            + dense.product(d, dense.product(self.information, d))
+        )
 
     def gradient_at(self, state: Values, offset: Indices) -> Values:
         """Half of the cost's derivative: slope + information d."""
-        gradient: Values = self.slope + self.information @ self.moved(state, offset)
+        gradient: Values = self.slope + dense.product(self.information, self.moved(state, offset))
         return gradient
 
     def add(

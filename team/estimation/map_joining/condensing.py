@@ -19,8 +19,8 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from scipy.linalg import cho_factor, cho_solve
 
+from team.estimation import dense
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.condensed_factor import (
     NOBODY,
@@ -200,10 +200,12 @@ def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) 
     for row, left in blocks:
         if row < 0:
             continue
-        g[row : row + 3] += left.T @ (weighted @ r)
+        g[row : row + 3] += dense.product(left.T, dense.product(weighted, r))
         for column, right in blocks:
             if column >= 0:
-                H[row : row + 3, column : column + 3] += left.T @ weighted @ right
+                H[row : row + 3, column : column + 3] += dense.product(
+                    dense.product(left.T, weighted), right
+                )
 
 
 def _schur(
@@ -217,10 +219,10 @@ def _schur(
     remaining = ~out
     cross = H[np.ix_(out, remaining)]
     right = np.column_stack([cross, g[out]])
-    solved = cho_solve(cho_factor(H[np.ix_(out, out)], lower=True), right)
-    information = H[np.ix_(remaining, remaining)] - cross.T @ solved[:, :-1]
-    slope: Values = g[remaining] - cross.T @ solved[:, -1]
-    return float(g[out] @ solved[:, -1]), slope, 0.5 * (information + information.T)
+    solved = dense.solve_factored(dense.cholesky(H[np.ix_(out, out)]), right)
+    information = H[np.ix_(remaining, remaining)] - dense.product(cross.T, solved[:, :-1])
+    slope: Values = g[remaining] - dense.product(cross.T, solved[:, -1])
+    return float(dense.product(g[out], solved[:, -1])), slope, 0.5 * (information + information.T)
 
 
 def _departed(

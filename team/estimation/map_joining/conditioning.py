@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
-from scipy.special import chdtri
 
 from team.config import Bias
-from team.estimation.consistency import chi2_quantile
+from team.estimation import dense
+from team.estimation.consistency import chi2_limit, chi2_quantile
 from team.estimation.contribution import Contribution
 from team.estimation.gaussian import PoseGaussian
 from team.estimation.geometry import tangent
@@ -185,7 +185,7 @@ def _most(dof: int) -> float:
     """The cost above which a map and submaps contradict each other: the χ² quantile of
     CONTRADICTED.
     """
-    return float(chdtri(dof, CONTRADICTED)) if dof > 0 else math.inf
+    return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
 
 
 def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
@@ -239,11 +239,11 @@ def curved(pose: PoseGaussian) -> PoseGaussian:
     exceeds σ_f². The mean stays the most likely pose.
     """
     T = tangent(float(pose.mean[2]))
-    S = T.T @ pose.covariance @ T
+    S = dense.product(dense.product(T.T, pose.covariance), T)
     turn = S[:2, 2]
     of_squares = S[2, 2] * S[:2, :2] + 2.0 * np.outer(turn, turn)
     (ff, fl), (_, ll) = 0.25 * of_squares
     spread = np.array([[ll, -fl], [-fl, ff]])
     covariance = pose.covariance.copy()
-    covariance[:2, :2] += T[:2, :2] @ spread @ T[:2, :2].T
+    covariance[:2, :2] += dense.product(dense.product(T[:2, :2], spread), T[:2, :2].T)
     return PoseGaussian(pose.mean, covariance)

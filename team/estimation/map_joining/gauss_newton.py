@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int64
 
 from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
+from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining import inter_robot_kernel as sightings
@@ -133,7 +134,7 @@ class Island(least_squares.Iterate):
         chi2 = kernel.landmark_chi2(
             self.state, self.graph.offset, factors, settings.covariance_factor
         )
-        gate = settings.landmark_gate * (self.scale / settings.robust_c) ** 2
+        gate = settings.landmark_gate * elementary.squared(self.scale / settings.robust_c)
         return chi2, np.repeat(gate, np.diff(factors.block_start))
 
     @cached_property
@@ -182,13 +183,16 @@ class Island(least_squares.Iterate):
         `dimensions` counts its numbers by the same weight: down-weighted terms are left out of the
         agreement test.
         """
-        factors, factor = self._discounted(self.landmark_weight**2), self.settings.covariance_factor
+        factors, factor = (
+            self._discounted(elementary.squared(self.landmark_weight)),
+            self.settings.covariance_factor,
+        )
         return kernel.costs(self.state, self.graph.offset, factors, factor)
 
     @property
     def weight(self) -> Float[np.ndarray, " F"]:
         """Robust weight of each submap, 1 without a robust loss."""
-        relative: Values = self.chi2 / (self.graph.dimensions * self.scale**2)
+        relative: Values = self.chi2 / (self.graph.dimensions * elementary.squared(self.scale))
         return 1.0 / (1.0 + relative)
 
     @cached_property
@@ -199,7 +203,7 @@ class Island(least_squares.Iterate):
     @property
     def sighting_weight(self) -> Float[np.ndarray, " S"]:
         """Robust weight of each inter-robot measurement, 1 without a robust loss."""
-        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * self.sighting_scale**2))
+        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * elementary.squared(self.sighting_scale)))
 
     @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:
@@ -218,7 +222,7 @@ class Island(least_squares.Iterate):
         if self.settings.robust_c is None:
             return np.ones(len(self.graph.priors))
         of_bias = self.graph.of_bias
-        weight: Values = 1.0 / (1.0 + self.prior_chi2 / self.settings.robust_c**2)
+        weight: Values = 1.0 / (1.0 + self.prior_chi2 / elementary.squared(self.settings.robust_c))
         return np.where(of_bias, weight, 1.0)
 
     def cost_of(self, other: "Island") -> float:
@@ -253,21 +257,23 @@ class Island(least_squares.Iterate):
         if self.settings.robust_c is None:
             chi2 = float(self.chi2[submaps].sum() + self.prior_chi2[priors].sum())
             return chi2 + float(self.sighting_chi2[sightings].sum())
-        scale = (self.scale**2 * self.graph.dimensions)[submaps]
-        cost = float((scale * np.log1p(self.chi2[submaps] / scale)).sum())
+        scale = (elementary.squared(self.scale) * self.graph.dimensions)[submaps]
+        cost = float((scale * elementwise.log1p(self.chi2[submaps] / scale)).sum())
         cost += self._prior_cost(priors)
         own, gate = self._landmark_chi2_and_gate
         of = np.repeat(submaps, np.diff(self.graph.factors.block_start))
         beyond = (own > gate) & of
-        cost += float((gate[beyond] * np.log(own[beyond] / gate[beyond])).sum())
-        scale = 2.0 * self.sighting_scale[sightings] ** 2
-        return cost + float((scale * np.log1p(self.sighting_chi2[sightings] / scale)).sum())
+        cost += float((gate[beyond] * elementwise.log(own[beyond] / gate[beyond])).sum())
+        scale = 2.0 * elementary.squared(self.sighting_scale[sightings])
+        return cost + float(
+            (scale * elementwise.log1p(self.sighting_chi2[sightings] / scale)).sum()
+        )
 
     def _prior_cost(self, chosen: Bool[np.ndarray, " priors"]) -> float:
         """Cauchy's loss of the biases' priors, χ² of the others."""
-        c2 = 1.0 if self.settings.robust_c is None else self.settings.robust_c**2
+        c2 = 1.0 if self.settings.robust_c is None else elementary.squared(self.settings.robust_c)
         of_bias = (self.prior_weight < 1.0) & chosen
-        robust = float((c2 * np.log1p(self.prior_chi2[of_bias] / c2)).sum())
+        robust = float((c2 * elementwise.log1p(self.prior_chi2[of_bias] / c2)).sum())
         return robust + float(self.prior_chi2[chosen & ~of_bias].sum())
 
     @cached_property
@@ -381,8 +387,8 @@ def prior_terms(
     residual = island.state[begin : begin + len(mean)] - mean
     if len(mean) == 3:
         residual[2] = wrapped(residual[2])
-    slope = information @ residual
-    return slope, information, float(residual @ slope)
+    slope = dense.product(information, residual)
+    return slope, information, float(dense.product(residual, slope))
 
 
 def iterated(island: Island) -> Island:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining.joining_kernel import robust_weight
@@ -47,7 +48,7 @@ def sighting_residual(
     distance = max(math.sqrt(vx * vx + vy * vy), NEAREST_M)
     residual = np.empty(2)
     residual[0] = measurement[0] - distance
-    residual[1] = wrapped(measurement[1] - (math.atan2(vy, vx) - observer[2]))
+    residual[1] = wrapped(measurement[1] - (elementary.atan2(vy, vx) - observer[2]))
     jacobian = np.zeros((2, 6))
     jacobian[0, 0], jacobian[0, 1] = vx / distance, vy / distance
     square = distance * distance

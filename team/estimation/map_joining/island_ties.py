@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team.estimation import dense, elementary
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
@@ -89,12 +90,12 @@ def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None]]) -
             points[k] = located(value[:3], distance, bearing)
             x, y = points[k] - value[:2]
             J[rows, begin + 2] = -y, x
-            direction = math.atan2(y, x)
-            c, s = math.cos(direction), math.sin(direction)
+            direction = elementary.atan2(y, x)
+            s, c = elementary.sin_and_cos(direction)
             polar = np.array([[c, -distance * s], [s, distance * c]])
-            noise[rows, rows] = polar @ seen.covariance @ polar.T
+            noise[rows, rows] = dense.product(dense.product(polar, seen.covariance), polar.T)
         begin += int(island.graph.offset[node + 1] - island.graph.offset[node])
-    return points, J @ covariance @ J.T + noise
+    return points, dense.product(dense.product(J, covariance), J.T) + noise
 
 
 def headings_that_fit(

@@ -1,11 +1,11 @@
 """Compiled kernels of map joining: the sparse normal equations of all submaps, and their costs."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining.submap_factor import (
@@ -165,7 +165,7 @@ def with_joined_ranges(state: Values, offset: Indices, factors: SubmapFactors) -
         x, y = 0.0, 0.0
         for k in range(poses):
             x, y = x + mean[3 * k] / (poses + 1), y + mean[3 * k + 1] / (poses + 1)
-        c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        s, c = elementary.sin_and_cos(state[at[0] + 2])
         x_map, y_map = state[at[0]] + c * x - s * y, state[at[0] + 1] + s * x + c * y
         metric = information[factors.information_start[f] : factors.information_start[f] + n * n]
         first = factors.row_start[f]
@@ -173,13 +173,15 @@ def with_joined_ranges(state: Values, offset: Indices, factors: SubmapFactors) -
             row, node = 3 * poses + 2 * landmark, at[1 + poses + landmark]
             own_x, own_y = mean[row] - x, mean[row + 1] - y
             dx, dy = state[node] - x_map, state[node + 1] - y_map
-            own, joined = math.hypot(own_x, own_y), math.hypot(dx, dy)
+            own, joined = elementary.hypot(own_x, own_y), elementary.hypot(dx, dy)
             if not (own > 0.0 and joined > 0.0):
                 continue
             q = min(max(joined / own, 1.0 / LARGEST_RATIO), LARGEST_RATIO)
-            turn = wrapped(math.atan2(dy, dx) - math.atan2(own_y, own_x) - state[at[0] + 2])
+            turn = wrapped(
+                elementary.atan2(dy, dx) - elementary.atan2(own_y, own_x) - state[at[0] + 2]
+            )
             turn = min(max(turn, -LARGEST_TURN_RAD), LARGEST_TURN_RAD)
-            c, s = math.cos(turn), math.sin(turn)
+            s, c = elementary.sin_and_cos(turn)
             xx, xy, yy = block[factors.block_start[f] + landmark]
             across = 2.0 * c * s * xy
             block[factors.block_start[f] + landmark, 0] = q * q * (c * c * xx + s * s * yy - across)
@@ -225,7 +227,7 @@ def landmark_chi2(
         sensitivity = _sensitivity(factors, f, len(mean))
         members = at[: len(at) - len(sensitivity)]
         residual, _ = submap_residual(state, members, shifted_mean(state, at, mean, sensitivity))
-        c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        s, c = elementary.sin_and_cos(state[at[0] + 2])
         begin, end = factors.block_start[f], factors.block_start[f + 1]
         row = len(mean) - 2 * (end - begin)
         for block in range(begin, end):
@@ -307,7 +309,7 @@ def costs(
         n = len(mean)
         members = at[: len(at) - len(sensitivity)]
         residual, _ = submap_residual(state, members, shifted_mean(state, at, mean, sensitivity))
-        c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+        s, c = elementary.sin_and_cos(state[at[0] + 2])
         poses = poses_of(len(members) - 1, n)
         row = 0
         while row < n:

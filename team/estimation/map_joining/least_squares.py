@@ -105,6 +105,12 @@ def _largest(step: Values) -> float:
     return float(np.abs(step).max(initial=0.0))
 
 
+def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """Powers by products: those of the C library differ from processor to processor."""
+    most = int(exponents.max(initial=0))
+    return np.asarray(np.cumprod([1.0, *[base] * most])[exponents])
+
+
 def robust_scale(
     age: Int64[np.ndarray, " k"], robust_c: float | None, start: float, decay: float
 ) -> Float[np.ndarray, " k"]:
@@ -114,4 +120,4 @@ def robust_scale(
     """
     if robust_c is None:
         return np.full(len(age), math.inf)
-    return robust_c * np.maximum(1.0, start * decay ** age.astype(np.float64))
+    return robust_c * np.maximum(1.0, start * _powers(decay, age))

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import elementwise
 from team.estimation.contribution import named
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
@@ -138,7 +139,7 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
     """The reason to defer a merge: another place is about as likely."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
-        f"{shared} leave two places {np.hypot(away[0], away[1]):.1f} m apart: "
+        f"{shared} leave two places {elementwise.hypot(away[0], away[1]):.1f} m apart: "
         f"chi² of one is only {second.cost - search.best.cost:.1f} more"
     )
 

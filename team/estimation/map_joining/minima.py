@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtri
 
+from team.estimation import elementary, elementwise
+from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Stream, named
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining.gauss_newton import (
@@ -99,7 +100,7 @@ def suspicious(island: Island, cost: float) -> bool:
 
 @lru_cache(maxsize=4096)
 def _quantile(dof: int) -> float:
-    return float(chdtri(dof, 1.0 - LIKELY))
+    return chi2_limit(dof, 1.0 - LIKELY)
 
 
 def likely_rise() -> float:
@@ -171,7 +172,8 @@ def _mirrored(island: Island) -> Iterator[Island]:
             a, b = (complex(*island.state[at_l : at_l + 2]) for at_l in pair)
             if a == b:
                 continue
-            turned = ((b - a) / abs(b - a)) ** 2
+            along = (b - a) / elementary.hypot(b.real - a.real, b.imag - a.imag)
+            turned = along * along
             p = island.state[at] + 1j * island.state[at + 1]
             p = a + turned * np.conj(p - a)
             state = island.state.copy()
@@ -294,7 +296,7 @@ def warnings(search: Search) -> list[str]:
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)
         points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
-        farthest = float(np.hypot(away[points], away[points + 1]).max())
+        farthest = float(elementwise.hypot(away[points], away[points + 1]).max())
         found.append(
             f"another map fits about as well: chi² {search.second.cost - search.best.cost:.1f} "
             f"more, up to {farthest:.1f} m away"
@@ -308,8 +310,6 @@ def _heading_sigmas(island: Island) -> dict[Stream, float]:
     return {
         stream: 0.0
         if graph.fixed[list(nodes)].any()
-        else min(
-            float(graph.pattern.diagonal_block(covariance, node)[2, 2]) ** 0.5 for node in nodes
-        )
+        else min(math.sqrt(graph.pattern.diagonal_block(covariance, node)[2, 2]) for node in nodes)
         for stream, nodes in graph.streams.items()
     }

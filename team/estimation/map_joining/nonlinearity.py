@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
+from team.estimation import dense, elementwise
+from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import information
 from team.estimation.geometry import compose, inverse, logarithm
@@ -33,7 +34,7 @@ BENT = 4.0
 """Ratio of χ² by the covariance to the rise of the cost that is reported: the ellipse is too short
 by half.
 """
-UNLIKELY = float(chdtri(1, 1e-3))
+UNLIKELY = chi2_limit(1, 1e-3)
 """Rise of the cost beyond which a place is not considered: 99.9 % quantile of χ² of 1."""
 
 
@@ -91,16 +92,20 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
     # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.
-    c, s = np.cos(mean[2]), np.sin(mean[2])
+    s, c = elementwise.sin_and_cos(mean[2])
     A = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    metric = information(A @ covariance @ A.T, "a pose")
+    metric = information(dense.product(dense.product(A, covariance), A.T), "a pose")
     at = int(island.graph.offset[node])
     found = []
     for walked, rise in profile(island, node):
         pose = walked.state[at : at + 3]
         eta = logarithm(compose(inverse(mean), pose))
-        distance = float(np.hypot(*(pose - mean)[:2]))
-        found.append(UnderstatedUncertainty(distance, rise, float(eta @ metric @ eta)))
+        distance = float(elementwise.hypot(*(pose - mean)[:2]))
+        found.append(
+            UnderstatedUncertainty(
+                distance, rise, float(dense.product(dense.product(eta, metric), eta))
+            )
+        )
     worst = max(found, key=lambda each: each.ratio, default=None)
     return None if worst is None or worst.ratio < BENT else worst
 

@@ -17,7 +17,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import elementary, elementwise
 from team.estimation.map_joining.submap_graph import Graph
+from team.estimation.sparse_cholesky.sparse import (
+    NotPositiveDefiniteError,
+    Pattern,
+    analysed,
+    factorised,
+    solved,
+)
 
 Values = Float[np.ndarray, " _"]
 Indices = Int64[np.ndarray, " _"]
@@ -52,13 +60,13 @@ def relaxed(graph: Graph, state: Values) -> Values | None:
     for node in np.flatnonzero(movable):
         value, size = found[at[node] : at[node + 1]], sizes[node]
         if size == 3:
-            value = np.array([value[0], value[1], math.atan2(value[3], value[2])])
+            value = np.array([value[0], value[1], elementary.atan2(value[3], value[2])])
         moved[graph.offset[node] : graph.offset[node + 1]] = value
     return moved
 
 
 def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
-    return np.array([pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])])
+    return np.array([pose[0], pose[1], elementary.cos(pose[2]), elementary.sin(pose[2])])
 
 
 def _least_squares(
@@ -67,8 +75,7 @@ def _least_squares(
     """The free numbers that minimise the weighted residuals, given the other numbers; None:
     undetermined.
     """
-    from scipy.sparse import csc_array  # slow to import, and no robot uses it
-    from scipy.sparse.linalg import splu
+    from scipy.sparse import csc_array, tril  # slow to import, and no robot uses it
 
     weighted = [each.weights[:, None] * each.coefficients for each in rows]
     counts = np.repeat([each.numbers.shape[1] for each in rows], [len(r.right) for r in rows])
@@ -79,13 +86,19 @@ def _least_squares(
     right = np.concatenate([each.weights * each.right for each in rows])
     B = A[:, np.flatnonzero(free)]
     right = right - A[:, np.flatnonzero(~free)] @ numbers[~free]
-    try:
-        factor = splu((B.T @ B).tocsc(), permc_spec="MMD_AT_PLUS_A")
-    except RuntimeError:  # SuperLU's word for a matrix that is exactly singular
+    normal = tril(B.T @ B, format="csc")
+    normal.sort_indices()
+    sizes, indices = np.ones(B.shape[1], np.int64), normal.indices.astype(np.int64)
+    if (normal.diagonal() == 0.0).any():
         return None
-    solved = numbers.copy()
-    solved[free] = factor.solve(B.T @ right)
-    return solved if np.isfinite(solved).all() else None
+    try:
+        pattern = Pattern(sizes, normal.indptr.astype(np.int64), indices)
+        factor = factorised(analysed(pattern), normal.data)
+    except NotPositiveDefiniteError:
+        return None
+    found = numbers.copy()
+    found[free] = solved(factor, (B.T @ right)[:, None])[:, 0]
+    return found if np.isfinite(found).all() else None
 
 
 def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
@@ -106,8 +119,10 @@ def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
         yield _turns(start, at[nodes[1 : count + 1]], poses[:, 2], 1.0 / np.sqrt(spreads[:, 2]))
     for sighting, observer, teammate in graph.sightings:
         distance, bearing = sighting.measurement.tolist()
-        spread = 0.5 * (sighting.covariance[0, 0] + sighting.covariance[1, 1] * distance**2)
-        point = distance * np.array([[math.cos(bearing), math.sin(bearing)]])
+        spread = 0.5 * (
+            sighting.covariance[0, 0] + sighting.covariance[1, 1] * elementary.squared(distance)
+        )
+        point = distance * np.array([[elementary.cos(bearing), elementary.sin(bearing)]])
         weight = np.array([1.0 / math.sqrt(spread)])
         yield _points(int(at[observer]), at[[teammate]], point, weight)
     for node, mean, information in graph.priors:
@@ -145,7 +160,7 @@ def _turns(
 ) -> _Rows:
     """The equations of headings of these poses relative to a start pose's."""
     n = len(poses)
-    c, s = np.cos(angles), np.sin(angles)
+    s, c = elementwise.sin_and_cos(angles)
     numbers = np.empty((2 * n, 3), dtype=np.int64)
     numbers[0::2, 0], numbers[1::2, 0] = poses + 2, poses + 3
     numbers[:, 1:] = start + 2, start + 3

@@ -16,11 +16,10 @@ A submap with sensitivities S (a row per bias) has the mean mean + Sᵀ b; the J
 bias is −T S_b. Its biases, one number each, follow the other members.
 """
 
-import math
-
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 
@@ -45,7 +44,7 @@ def submap_residual(
     """
     start = at[0]
     poses = poses_of(len(at) - 1, len(mean))
-    c, s = math.cos(state[start + 2]), math.sin(state[start + 2])
+    s, c = elementary.sin_and_cos(state[start + 2])
     residual = np.empty(len(mean))
     offsets = np.empty((len(at) - 1, 2))
     for point in range(len(at) - 1):
@@ -65,7 +64,7 @@ def rotated_information(
     information: Float[np.ndarray, "n n"], heading: float, poses: int
 ) -> Float[np.ndarray, "n n"]:
     """M = T P⁻¹ Tᵀ: the information of a submap with `poses` poses, rotated into the map frame."""
-    c, s = math.cos(heading), math.sin(heading)
+    s, c = elementary.sin_and_cos(heading)
     turned = information.copy()
     n = len(information)
     row = 0
@@ -159,7 +158,7 @@ def biased_normal(
     hessian, gradient = np.zeros((n + 3 + biases, n + 3 + biases)), np.zeros(n + 3 + biases)
     hessian[: n + 3, : n + 3] = unbiased
     gradient[: n + 3] = slope
-    c, s = math.cos(state[at[0] + 2]), math.sin(state[at[0] + 2])
+    s, c = elementary.sin_and_cos(state[at[0] + 2])
     poses = poses_of(len(members) - 1, n)
     turned = np.empty((biases, n))
     for b in range(biases):

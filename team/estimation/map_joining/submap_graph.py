@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED, Bias
+from team.estimation import elementary
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
@@ -174,7 +175,7 @@ class Graph:
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
             np.array([each.sighting.measurement for each in self.sightings]).reshape(-1, 2),
             np.array([each.sighting.information for each in self.sightings]).reshape(-1, 2, 2),
-            int((np.diff(self.factors.member_start) ** 2).sum()),
+            int((elementary.squared(np.diff(self.factors.member_start))).sum()),
         )
 
     @cached_property
@@ -347,13 +348,13 @@ def extended(
         for bias in local.biases:
             if (stream, bias) not in growth.biases:
                 growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[bias_sigma[bias] ** -2]])
+                certainty = np.array([[1.0 / elementary.squared(bias_sigma[bias])]])
                 priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
         common = _in_common(local, common_bias_sigma)
         for error, sigma in common.items():
             if error not in growth.common:
                 growth.common[error] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[sigma**-2]])
+                certainty = np.array([[1.0 / elementary.squared(sigma)]])
                 priors.append(Prior(growth.common[error], np.zeros(1), certainty))
         errors = [growth.biases[stream, bias] for bias in local.biases]
         errors += [growth.common[error] for error in common]

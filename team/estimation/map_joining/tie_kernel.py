@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 
@@ -47,7 +48,7 @@ def tied(
     S = np.empty((m, m))
     c, s = 1.0, 0.0
     for _ in range(iterations):
-        c, s = math.cos(state[2]), math.sin(state[2])
+        s, c = elementary.sin_and_cos(state[2])
         turn = mean[2] - state[2]
         for point in range(m // 2):
             i, j = 2 * point, 2 * point + 1
@@ -149,7 +150,7 @@ def tied_pose(
         for b in range(6):
             for k in range(len(row)):
                 joint[a, b] -= row[k] * gain[b, k]
-    c, s = math.cos(state[2]), math.sin(state[2])
+    s, c = elementary.sin_and_cos(state[2])
     x, y = c * state[3] - s * state[4], s * state[3] + c * state[4]
     G = np.zeros((3, 6))
     G[0, 0], G[1, 1], G[2, 2], G[2, 5] = 1.0, 1.0, 1.0, 1.0

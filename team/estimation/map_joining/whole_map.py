@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team.estimation import dense, elementwise
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining.tie_kernel import Constraints, tied, tied_pose
@@ -57,27 +58,31 @@ def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap
     of_pose = np.tile(np.eye(2, 3), (k, 1))
     of_pose[:, 2] = tie.lever.ravel()
     turn = np.array([[tie.cos, -tie.sin], [tie.sin, tie.cos]])
-    U = whole.covariance[:, :3] @ of_pose.T - whole.covariance[:, known]
-    V = (local.covariance[:, sights].reshape(m, k, 2) @ turn.T).reshape(m, 2 * k)
-    state = whole.mean - U @ tie.multiplier
-    ended = local.mean - V @ tie.multiplier
-    of_whole, of_local = U @ tie.inverse, V @ tie.inverse
+    U = dense.product(whole.covariance[:, :3], of_pose.T) - whole.covariance[:, known]
+    V = (dense.product(local.covariance[:, sights].reshape(m, k, 2), turn.T)).reshape(m, 2 * k)
+    state = whole.mean - dense.product(U, tie.multiplier)
+    ended = local.mean - dense.product(V, tie.multiplier)
+    of_whole, of_local = dense.product(U, tie.inverse), dense.product(V, tie.inverse)
     # (pose, local): what the new pose and the new landmarks are made of.
     own = np.empty((3 + m, 3 + m))
-    own[:3, :3] = whole.covariance[:3, :3] - of_whole[:3] @ U[:3].T
-    own[3:, 3:] = local.covariance - of_local @ V.T
-    own[:3, 3:] = -of_whole[:3] @ V.T
+    own[:3, :3] = whole.covariance[:3, :3] - dense.product(of_whole[:3], U[:3].T)
+    own[3:, 3:] = local.covariance - dense.product(of_local, V.T)
+    own[:3, 3:] = dense.product(-of_whole[:3], V.T)
     own[3:, :3] = own[:3, 3:].T
     old = np.concatenate(
-        [whole.covariance[3:, :3] - of_whole[3:] @ U[:3].T, -of_whole[3:] @ V.T], axis=1
+        [
+            whole.covariance[3:, :3] - dense.product(of_whole[3:], U[:3].T),
+            dense.product(-of_whole[3:], V.T),
+        ],
+        axis=1,
     )
     fresh = np.setdiff1d(np.arange(len(local.ids)), in_local)
     made, G = _composed(state[:3], ended, fresh)
     covariance = np.empty((n + 2 * len(fresh), n + 2 * len(fresh)))
     made_at = np.concatenate([np.arange(3), np.arange(n, len(covariance))])
-    covariance[3:n, 3:n] = whole.covariance[3:, 3:] - of_whole[3:] @ U[3:].T
-    covariance[np.ix_(made_at, made_at)] = G @ own @ G.T
-    covariance[3:n, made_at] = old @ G.T
+    covariance[3:n, 3:n] = whole.covariance[3:, 3:] - dense.product(of_whole[3:], U[3:].T)
+    covariance[np.ix_(made_at, made_at)] = dense.product(dense.product(G, own), G.T)
+    covariance[3:n, made_at] = dense.product(old, G.T)
     covariance[made_at, 3:n] = covariance[3:n, made_at].T
     mean = np.concatenate([made[:3], state[3:], made[3:]])
     return _by_id(np.concatenate([whole.ids, local.ids[fresh]]), mean, covariance)
@@ -137,7 +142,7 @@ def _worst(tie: Constraints, gate: float) -> int | None:
     at = np.arange(len(z))
     own = tie.inverse.reshape(len(z), 2, len(z), 2)[at, :, at]
     try:
-        weighted = np.linalg.solve(own, z[:, :, None])[:, :, 0]
+        weighted = dense.solve(own, z[:, :, None])[:, :, 0]
     except np.linalg.LinAlgError as error:
         raise NotACovarianceError("a known landmark's innovation", "singular") from error
     gain = np.einsum("ki,ki->k", z, weighted)
@@ -210,13 +215,13 @@ def _composed(
     pose: Float[np.ndarray, "3"], local: Float[np.ndarray, " m"], fresh: Int64[np.ndarray, " f"]
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q p"]]:
     """(pose ∘ end pose, pose ∘ fresh local landmarks) and its Jacobian by (pose, local)."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
+    s, c = elementwise.sin_and_cos(pose[2])
     at = np.concatenate([np.arange(2), 3 + _points(fresh)]).reshape(-1, 2)
     rows = np.concatenate([np.arange(2), 3 + np.arange(2 * len(fresh))]).reshape(-1, 2)
     points = local[at]
     mean = np.empty(3 + 2 * len(fresh))
     G = np.zeros((len(mean), 3 + len(local)))
-    mean[rows] = pose[:2] + points @ np.array([[c, s], [-s, c]])
+    mean[rows] = pose[:2] + dense.product(points, np.array([[c, s], [-s, c]]))
     mean[2] = wrapped(pose[2] + local[2])
     G[rows[:, 0], 0] = G[rows[:, 1], 1] = 1.0
     G[rows[:, 0], 2] = -s * points[:, 0] - c * points[:, 1]

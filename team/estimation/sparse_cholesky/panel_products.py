@@ -1,7 +1,7 @@
-"""Dense algebra on big panels, by blocks: nearly all of it is matrix products, which BLAS computes.
+"""Dense algebra on big panels, by blocks: nearly all of it is matrix products.
 
 A panel is Lᵀ on a supernode's columns J, a row per column of L (see `sparse_layout`); R are the
-rows below J. For panels that are not big no sum depends on BLAS (docs/decisions/0028).
+rows below J (docs/decisions/0028).
 """
 
 import math
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.estimation.compiled import compiled
+from team.estimation.dense_kernel import matrix_product
 
 Values = Float[np.ndarray, " _"]
 ROWS = 512
@@ -59,9 +60,9 @@ def factorise_by_blocks(panel: Float[np.ndarray, "w m"], least: Values) -> int:
         failed = factorise_columns(panel, begin, end, least)
         if failed >= 0:
             return failed
-        rows = np.ascontiguousarray(panel[begin:end, end:].T)
+        columns = np.ascontiguousarray(panel[begin:end, end:])
         for first in range(0, width - end, CHUNK):
-            product = rows_of_product(rows, first, min(first + CHUNK, width - end))
+            product = rows_of_product(columns, first, min(first + CHUNK, width - end))
             for j in range(len(product)):
                 later = end + first + j
                 for i in range(later, m):
@@ -71,11 +72,11 @@ def factorise_by_blocks(panel: Float[np.ndarray, "w m"], least: Values) -> int:
 
 @compiled
 def rows_of_product(
-    rows: Float[np.ndarray, "h w"], first: int, last: int
+    columns: Float[np.ndarray, "w h"], first: int, last: int
 ) -> Float[np.ndarray, "c _"]:
-    """Rows first … last − 1 of A Aᵀ, from column `first` on."""
-    product: Float[np.ndarray, "c _"] = np.dot(rows[first:last], rows[first:].T)
-    return product
+    """Rows first … last − 1 of Aᵀ A, from column `first` on."""
+    rows = np.ascontiguousarray(columns[:, first:last].T)
+    return matrix_product(rows, np.ascontiguousarray(columns[:, first:]))
 
 
 @compiled
@@ -99,8 +100,8 @@ def inverse_by_blocks(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w w
         inverse[begin:end, begin:end] = own
         if begin > 0:
             before = np.ascontiguousarray(inverse[:begin, :begin])
-            coupled = np.dot(before, np.ascontiguousarray(panel[:begin, begin:end]))
-            inverse[:begin, begin:end] = -np.dot(coupled, own)
+            coupled = matrix_product(before, np.ascontiguousarray(panel[:begin, begin:end]))
+            inverse[:begin, begin:end] = -matrix_product(coupled, own)
     return inverse
 
 
@@ -115,14 +116,14 @@ def selected_by_blocks(
     inverse = inverse_by_blocks(panel)
     for first in range(0, width, CHUNK):
         rest = np.ascontiguousarray(inverse[first:, first:])
-        own = np.dot(rest[:CHUNK], rest.T)
+        own = matrix_product(rest[:CHUNK], np.ascontiguousarray(rest.T))
         for j in range(len(own)):
             for k in range(first + j, width):
                 result[first + j, k] = own[j, k - first]
     if m > width:
-        y = np.dot(inverse, np.ascontiguousarray(panel[:, width:]))
-        below = np.dot(y, known)
-        coupled = np.dot(below, y.T)
+        y = matrix_product(inverse, np.ascontiguousarray(panel[:, width:]))
+        below = matrix_product(y, known)
+        coupled = matrix_product(below, np.ascontiguousarray(y.T))
         for k in range(width):
             for later in range(k, width):
                 result[k, later] += coupled[k, later]
@@ -145,4 +146,4 @@ def solve_forward(panel: Float[np.ndarray, "w m"], right: Float[np.ndarray, "w k
                     right[i, c] -= factor * right[k, c]
         if end < width:
             later = np.ascontiguousarray(panel[begin:end, end:width])
-            right[end:] -= np.dot(later.T, right[begin:end])
+            right[end:] -= matrix_product(np.ascontiguousarray(later.T), right[begin:end])

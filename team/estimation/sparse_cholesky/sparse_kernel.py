@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.estimation.compiled import compiled
+from team.estimation.dense_kernel import matrix_product
 from team.estimation.sparse_cholesky import panel_products as products
 from team.estimation.sparse_cholesky.sparse_layout import Structure
 
@@ -59,7 +60,7 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
     rows, panel = _panel(structure, panels, s)
     width, m = panel.shape
     big = products.is_big(width, m)
-    below = np.ascontiguousarray(panel[:, width:].T) if big else np.empty((0, 0))
+    below = np.ascontiguousarray(panel[:, width:]) if big else np.empty((0, 0))
     product = np.empty((1, m))
     reached = -1
     begin = 0
@@ -275,11 +276,11 @@ def inverse_among(
         own = np.ascontiguousarray(solution[columns_of[s] : columns_of[s + 1], begin:end])
         products.solve_forward(panel, own)
         if m > width:
-            reached = np.dot(np.ascontiguousarray(panel[:, width:]).T, own)
+            reached = matrix_product(np.ascontiguousarray(panel[:, width:].T), own)
             for i in range(width, m):
                 for c in range(begin, end):
                     solution[rows[i], c] -= reached[i - width, c - begin]
-        result[begin:end, begin:end] += np.dot(own.T, own)
+        result[begin:end, begin:end] += matrix_product(np.ascontiguousarray(own.T), own)
     return result
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from team import translate
 from team.config import Estimator, RobotConfig, Sensor
+from team.estimation import dense
 from team.estimation.baselines import (
     dead_reckoning,
     ekf_slam,
@@ -139,7 +140,7 @@ def _with_start(
     if initial.covariance is None:
         return state
     G = tangent(at[2])
-    own = G.T @ initial.covariance @ G
+    own = dense.product(dense.product(G.T, initial.covariance), G)
     nothing = np.empty(0)
     still = Increment(np.zeros(3), 0.5 * (own + own.T))
     return filter_step(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)

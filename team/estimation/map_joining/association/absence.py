@@ -10,6 +10,8 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import elementwise
+
 SeenTogether = Int64[np.ndarray, "_ _"]
 """For each keyframe the landmarks that it observed together; rows are padded with −1."""
 
@@ -51,7 +53,7 @@ def covered(
     if not len(point):
         return inside
     x, y = (at[view] - points[point, None]).transpose(2, 0, 1)
-    angle = np.sort(np.arctan2(y, x), axis=1)  # what is filled up is last
+    angle = np.sort(elementwise.atan2(y, x), axis=1)  # what is filled up is last
     last = np.nanmax(angle, axis=1)
     gap = np.fmax(np.nanmax(np.diff(angle, axis=1), axis=1), angle[:, 0] + 2.0 * np.pi - last)
     inside[point[gap < np.pi]] = True

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
+from team.estimation import dense, elementary, elementwise
 from team.estimation.map_joining.association.absence import SeenTogether, covered, renumbered
 from team.estimation.map_joining.association.growing import Grown, Indices, Joint, Pair, grow
 from team.estimation.map_joining.association.shares import distance, matched_share
@@ -291,7 +292,9 @@ def free_joint(
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
     local = patch.mean - patch.mean.mean(axis=0)
-    away = np.hypot(*(moved(vote.motion, local)[:, None] - target.mean[None]).transpose(2, 0, 1))
+    away = elementwise.hypot(
+        *(moved(vote.motion, local)[:, None] - target.mean[None]).transpose(2, 0, 1)
+    )
     near = away.min(axis=0) < BEND * profile.same
     near[vote.second] = True
     nearby = np.flatnonzero(near)
@@ -304,7 +307,7 @@ def free_joint(
         target.crowd,
     )
     m = len(nearby)
-    c, s = np.cos(vote.motion[2]), np.sin(vote.motion[2])
+    s, c = elementwise.sin_and_cos(vote.motion[2])
     R = np.kron(np.eye(n), np.array([[c, -s], [s, c]]))
     there = moved(vote.motion, local)
     lever = there - vote.motion[:2]
@@ -312,8 +315,12 @@ def free_joint(
     J[0::2, 0] = J[1::2, 1] = 1.0
     J[0::2, 2], J[1::2, 2] = -lever[:, 1], lever[:, 0]
     covariance = np.zeros((2 * (n + m), 2 * (n + m)))
-    spread = np.array([extent**2, extent**2, np.pi**2])
-    covariance[: 2 * n, : 2 * n] = R @ patch.covariance @ R.T + (J * spread) @ J.T
+    spread = np.array(
+        [elementary.squared(extent), elementary.squared(extent), elementary.squared(np.pi)]
+    )
+    covariance[: 2 * n, : 2 * n] = dense.product(
+        dense.product(R, patch.covariance), R.T
+    ) + dense.product(J * spread, J.T)
     covariance[2 * n :, 2 * n :] = target.covariance
     apart = np.zeros((n + m, n + m), np.bool_)
     apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
@@ -337,7 +344,7 @@ def _grown(
     one, two = np.meshgrid(patch.at, target.at, indexing="ij")
     points = patch.points.mean[vote.first]
     i, j = np.triu_indices(len(points), 1)
-    far = np.argsort(-np.hypot(*(points[i] - points[j]).T), kind="stable")
+    far = np.argsort(-elementwise.hypot(*(points[i] - points[j]).T), kind="stable")
     used: set[int] = set()
     best: Grown | None = None
     for k in far:

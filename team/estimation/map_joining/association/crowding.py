@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
+from team.estimation import elementary
 from team.estimation.submap import LocalMap
 
 CLOSE = 0.1
@@ -48,7 +49,9 @@ class Crowd:
         was observed half a pair is assumed.
         """
         within = np.searchsorted(self._distances, radius) + 1.0
-        found: Float[np.ndarray, " k"] = within / (max(self.landmarks, 1) * np.pi * radius**2)
+        found: Float[np.ndarray, " k"] = within / (
+            max(self.landmarks, 1) * np.pi * elementary.squared(radius)
+        )
         return found
 
     def bounded(self, profile: AssociationProfile) -> AssociationProfile:

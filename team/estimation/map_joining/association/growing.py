@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.association import AssociationProfile
+from team.estimation import dense, elementary, elementwise
 from team.estimation.map_joining.association.crowding import Crowd
 
 Indices = Int64[np.ndarray, " _"]
@@ -93,20 +94,20 @@ def likelihoods(
     P = joint.covariance.reshape(n, 2, n, 2)
     R = P[first, :, first] + P[second, :, second] - P[first, :, second] - P[second, :, first]
     half = 0.5 * (R[:, 0, 0] + R[:, 1, 1])
-    spread = np.hypot(0.5 * (R[:, 0, 0] - R[:, 1, 1]), R[:, 0, 1])
-    slack = profile.slack**2
+    spread = elementwise.hypot(0.5 * (R[:, 0, 0] - R[:, 1, 1]), R[:, 0, 1])
+    slack = elementary.squared(profile.slack)
     a, b, c = R[:, 0, 0] + slack, R[:, 0, 1], R[:, 1, 1] + slack
     determinant = np.maximum(a * c - b * b, 1e-18)
     x, y = difference.T
     chi2 = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
     density = np.full(len(x), profile.density)
     if joint.crowd is not None:
-        radius = np.sqrt(profile.gate) * determinant**0.25
+        radius = np.sqrt(profile.gate) * np.sqrt(np.sqrt(determinant))
         crowded = joint.crowd.density(radius)
         if joint.unseen is not None:
             crowded *= joint.unseen[second]
         density = np.maximum(density, crowded)
-    llr = -0.5 * chi2 - 0.5 * np.log(determinant) - np.log(2.0 * np.pi * density)
+    llr = -0.5 * chi2 - 0.5 * elementwise.log(determinant) - elementwise.log(2.0 * np.pi * density)
     return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))
 
 
@@ -118,14 +119,14 @@ def conditioned(joint: Joint, first: int, second: int, profile: AssociationProfi
     P = joint.covariance
     one, two = slice(2 * first, 2 * first + 2), slice(2 * second, 2 * second + 2)
     gain = P[:, one] - P[:, two]
-    S = gain[one] - gain[two] + profile.slack**2 * np.eye(2)
-    weighted = np.linalg.solve(S, gain.T)
+    S = gain[one] - gain[two] + elementary.squared(profile.slack) * np.eye(2)
+    weighted = dense.solve(S, gain.T)
     difference = joint.mean[first] - joint.mean[second]
-    mean = joint.mean - (weighted.T @ difference).reshape(n, 2)
+    mean = joint.mean - (dense.product(weighted.T, difference)).reshape(n, 2)
     apart = joint.apart.copy()
     both = apart[first] | apart[second]
     apart[second], apart[:, second] = both, both
-    return Joint(mean, P - gain @ weighted, apart, joint.crowd, joint.unseen)
+    return Joint(mean, P - dense.product(gain, weighted), apart, joint.crowd, joint.unseen)
 
 
 def grow(
@@ -197,7 +198,7 @@ def _rivals(
         each, against = _of_one(mine)
         p, q = other[each], other[against]
         x, y = (joint.mean[p] - joint.mean[q]).T
-        differ = (x * x + y * y >= profile.same**2) | joint.apart[p, q]
+        differ = (x * x + y * y >= elementary.squared(profile.same)) | joint.apart[p, q]
         np.maximum.at(rival, each[differ], at.llr[against[differ]])
     return rival
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
+from team.estimation import elementwise
 from team.estimation.map_joining.association.growing import (
     Grown,
     Indices,
@@ -73,7 +74,7 @@ def jointly(
         longer = [more for one in assigned for more in _with(one, own, others, profile, most_sd)]
         longer.sort(key=lambda one: -one.weight)
         best = longer[0].weight
-        lost += sum(float(np.exp(one.weight - best)) for one in longer[BEAM:])
+        lost += sum(float(elementwise.exp(one.weight - best)) for one in longer[BEAM:])
         assigned = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
     return _agreed(joint, assigned, involved, profile, lost)
 
@@ -121,7 +122,7 @@ def _fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[
     """The landmark and its likely fragments: two parts of one landmark are no rivals."""
     n = len(joint.mean)
     at = likelihoods(joint, np.full(n, landmark), np.arange(n), profile)
-    near = np.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
+    near = elementwise.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
     one = (at.llr >= profile.llr_tight) & near & ~joint.apart[landmark]
     return {landmark, *np.flatnonzero(one).tolist()}
 
@@ -138,14 +139,16 @@ def _agreed(
     lost: the weight of the dropped assignments, relative to the best one's.
     """
     best = assigned[0]
-    weights = np.exp([one.weight - best.weight for one in assigned])
+    weights = elementwise.exp(np.array([one.weight - best.weight for one in assigned]))
     others = [{pair.first: pair.second for pair in one.pairs} for one in assigned]
     sure = []
     for pair in best.pairs:
         same = _fragments(best.joint, pair.second, profile)
         having = np.array([each.get(pair.first, -1) in same for each in others])
         against = float(weights[~having].sum()) + lost
-        odds = float(np.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
+        odds = (
+            float(elementwise.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
+        )
         if odds >= profile.odds:
             sure.append(pair._replace(rival=pair.llr - odds))
     if len(sure) == 1 and sure[0].sd > profile.tight:

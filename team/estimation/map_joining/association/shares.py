@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
+from team.estimation import elementwise
 
 WIDE = 3.0
 """Radius around a closure's places that an audit considers, in spacings."""
@@ -53,7 +54,7 @@ def overlap_share(
 
 def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
     """Twice the median distance [m] between neighbouring places, and at least twice `same`."""
-    away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    away = elementwise.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
     np.fill_diagonal(away, np.inf)
     return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
 
@@ -62,7 +63,7 @@ def distance(
     points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, " n"]:
     """Distance [m] from each point to the nearest one of `others`."""
-    away: Float[np.ndarray, " n"] = np.hypot(
+    away: Float[np.ndarray, " n"] = elementwise.hypot(
         *(points[:, None] - others[None]).transpose(2, 0, 1)
     ).min(axis=1)
     return away

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.estimation import dense, elementary, elementwise
+
 MOST_BINS = 60
 """Number of motions, those with the most votes, that are refined."""
 ANGLE_BIN = np.radians(6.0)
@@ -67,7 +69,7 @@ def voted(
         found = _distinct(_refined(own, b, middle, proposed, tolerance), len(part))[:OF_A_PART]
         if found:
             moving = np.array([vote.motion for vote in found])
-            c, s = np.cos(moving[:, 2]), np.sin(moving[:, 2])
+            s, c = elementwise.sin_and_cos(moving[:, 2])
             x, y = centre - middle
             moving[:, :2] += np.column_stack([c * x - s * y, s * x + c * y])
             motions.append(moving)
@@ -109,12 +111,12 @@ def _proposed(
     of_b = of_b + np.arange(len(of_a))
     one, two = a[i[of_a]], a[j[of_a]]
     span = two - one
-    heading = np.arctan2(span[:, 1], span[:, 0])
+    heading = elementwise.atan2(span[:, 1], span[:, 0])
     motions = []
     for p, q in ((k[of_b], last[of_b]), (last[of_b], k[of_b])):
         across = b[q] - b[p]
-        turn = np.arctan2(across[:, 1], across[:, 0]) - heading
-        c, s = np.cos(turn), np.sin(turn)
+        turn = elementwise.atan2(across[:, 1], across[:, 0]) - heading
+        s, c = elementwise.sin_and_cos(turn)
         middle = 0.5 * (one + two)
         moved = np.column_stack(
             [c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]]
@@ -128,7 +130,7 @@ def _baselines(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of points with a distance in this interval, and their distances."""
     i, j = np.triu_indices(len(points), 1)
-    length = np.hypot(*(points[i] - points[j]).T)
+    length = elementwise.hypot(*(points[i] - points[j]).T)
     chosen = (length >= shortest) & (length <= longest)
     return i[chosen], j[chosen], length[chosen]
 
@@ -152,9 +154,9 @@ def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndar
         weight = np.bincount(at, minlength=len(fullest))
         x = np.bincount(at, some[:, 0], len(fullest)) / weight
         y = np.bincount(at, some[:, 1], len(fullest)) / weight
-        cosine = np.bincount(at, np.cos(some[:, 2]), len(fullest))
-        sine = np.bincount(at, np.sin(some[:, 2]), len(fullest))
-        peaks += list(np.column_stack([x, y, np.arctan2(sine, cosine)]))
+        cosine = np.bincount(at, elementwise.cos(some[:, 2]), len(fullest))
+        sine = np.bincount(at, elementwise.sin(some[:, 2]), len(fullest))
+        peaks += list(np.column_stack([x, y, elementwise.atan2(sine, cosine)]))
     return peaks
 
 
@@ -193,7 +195,11 @@ def _refined_together(
         lasting = agree.sum(axis=1) >= 2
         motions, to, agree = motions[lasting], to[lasting], agree[lasting]
         if step < REFINEMENTS - 1 and len(motions):
-            weights = agree / (a.sd**2 + b.sd[to] ** 2 + tolerance**2)
+            weights = agree / (
+                elementary.squared(a.sd)
+                + elementary.squared(b.sd[to])
+                + elementary.squared(tolerance)
+            )
             motions = _aligned(local, b.mean[to], weights)
     return [
         Vote(motion, np.flatnonzero(own), of[own])
@@ -210,14 +216,14 @@ def _neighbours(
     """For each point the nearest one of b, and whether the two are mutually nearest and within
     reach.
     """
-    c, s = np.cos(motions[:, 2:]), np.sin(motions[:, 2:])
+    s, c = elementwise.sin_and_cos(motions[:, 2:])
     x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
     y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
-    away = (x[:, :, None] - b[:, 0]) ** 2 + (y[:, :, None] - b[:, 1]) ** 2
+    away = elementary.squared(x[:, :, None] - b[:, 0]) + elementary.squared(y[:, :, None] - b[:, 1])
     to_b, to_a = away.argmin(axis=2), away.argmin(axis=1)
     nearest = np.take_along_axis(away, to_b[:, :, None], axis=2)[:, :, 0]
     mutual = np.take_along_axis(to_a, to_b, axis=1) == np.arange(len(a))
-    return to_b, mutual & (nearest < reach**2)
+    return to_b, mutual & (nearest < elementary.squared(reach))
 
 
 def _aligned(
@@ -227,12 +233,12 @@ def _aligned(
 ) -> Float[np.ndarray, "B 3"]:
     """The (x, y, θ) that minimise Σ w ‖to − R(θ) a − (x, y)‖², for each of B sets of weights."""
     share = weights / weights.sum(axis=1, keepdims=True)
-    from_, onto = share @ a, (share[:, :, None] * to).sum(axis=1)
+    from_, onto = dense.product(share, a), (share[:, :, None] * to).sum(axis=1)
     p, q = a - from_[:, None], to - onto[:, None]
     along = (share[:, :, None] * p * q).sum(axis=(1, 2))
     across = (share * (p[:, :, 0] * q[:, :, 1] - p[:, :, 1] * q[:, :, 0])).sum(axis=1)
-    angle = np.arctan2(across, along)
-    c, s = np.cos(angle), np.sin(angle)
+    angle = elementwise.atan2(across, along)
+    s, c = elementwise.sin_and_cos(angle)
     x = onto[:, 0] - c * from_[:, 0] + s * from_[:, 1]
     y = onto[:, 1] - s * from_[:, 0] - c * from_[:, 1]
     return np.column_stack([x, y, angle])
@@ -242,6 +248,8 @@ def moved(
     motion: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
     """The points, given about the centroid, in the other side's frame."""
-    c, s = np.cos(motion[2]), np.sin(motion[2])
-    placed: Float[np.ndarray, "n 2"] = points @ np.array([[c, s], [-s, c]]) + motion[:2]
+    s, c = elementwise.sin_and_cos(motion[2])
+    placed: Float[np.ndarray, "n 2"] = (
+        dense.product(points, np.array([[c, s], [-s, c]])) + motion[:2]
+    )
     return placed

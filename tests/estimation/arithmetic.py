@@ -1,0 +1,48 @@
+"""What the estimation computes with, each function's bits as a digest; run it for a table of them.
+
+python -m tests.estimation.arithmetic
+"""
+
+import hashlib
+import json
+
+import numba
+import numpy as np
+from llvmlite.binding import get_host_cpu_name
+
+from team.estimation import dense, elementwise
+
+SIZES = (3, 40, 130)
+"""Dense matrices: by loops, by a part of a tile, by several tiles and blocks."""
+
+
+def processor() -> str:
+    """The processor that the kernels are compiled for."""
+    return numba.config.CPU_NAME or get_host_cpu_name()
+
+
+def digests() -> dict[str, str]:
+    """A digest of what each function makes of the same arguments."""
+    x = np.concatenate([0.08 * np.arange(-500.0, 500.0), np.ldexp(1.37, np.arange(-1000, 1000))])
+    found = {
+        "sin": elementwise.sin(x),
+        "cos": elementwise.cos(x),
+        "atan2": elementwise.atan2(x, x[::-1].copy()),
+        "exp": elementwise.exp(x),
+        "log": elementwise.log(np.abs(x)),
+    }
+    for n in SIZES:
+        A = (elementwise.sin(np.arange(1.0, 1.0 + n * n)) + 0.1).reshape(n, n)
+        found |= {
+            f"product {n}": dense.product(A, A),
+            f"product with a vector {n}": dense.product(A, A[0]),
+            f"inner product {n}": dense.product(A[0], A[1]),
+            f"cholesky {n}": dense.cholesky(dense.product(A, A.T) + np.eye(n)),
+        }
+    return {
+        name: hashlib.sha256(values.tobytes()).hexdigest()[:16] for name, values in found.items()
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps([processor(), digests()]))

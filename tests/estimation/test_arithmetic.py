@@ -1,0 +1,26 @@
+"""The bits of what the estimation computes with do not depend on the processor's features."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from tests.across import CLASSES
+from tests.estimation import arithmetic
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the class is one of x86_64")
+def test_a_processor_without_avx_computes_the_same_bits() -> None:
+    finished = subprocess.run(
+        [sys.executable, "-m", "tests.estimation.arithmetic"],
+        env={**os.environ, **CLASSES["without AVX"]},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    name, found = json.loads(finished.stdout)
+    assert name == "generic" != arithmetic.processor()
+    assert found == arithmetic.digests()

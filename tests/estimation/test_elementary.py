@@ -1,0 +1,135 @@
+"""Elementary functions: their errors in units of the last place, and their special cases."""
+
+import math
+from collections.abc import Callable
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+
+from team.estimation import elementary, elementwise
+
+PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
+DIGITS = 45
+
+
+def _sine(x: Decimal) -> Decimal:
+    """Taylor's series of the angle less whole turns, at an eighth of it and three times doubled."""
+    x = (x - 2 * PI * (x / (2 * PI)).to_integral_value()) / 3**3
+    term = total = x
+    for k in range(1, 40):
+        term = -term * x * x / ((2 * k) * (2 * k + 1))
+        total += term
+    for _ in range(3):
+        total = 3 * total - 4 * total**3
+    return total
+
+
+def _cosine(x: Decimal) -> Decimal:
+    return _sine(x + PI / 2)
+
+
+def _arctangent(t: Decimal) -> Decimal:
+    """Of 0 ≤ t ≤ 1: halved four times, then the series."""
+    for _ in range(4):
+        t = t / (1 + (1 + t * t).sqrt())
+    term, total = t, t
+    for k in range(1, 40):
+        term = -term * t * t
+        total += term / (2 * k + 1)
+    return 16 * total
+
+
+def _direction(y: Decimal, x: Decimal) -> Decimal:
+    ax, ay = abs(x), abs(y)
+    angle = _arctangent(ay / ax) if ay <= ax else PI / 2 - _arctangent(ax / ay)
+    return (angle if x > 0 else PI - angle).copy_sign(y)
+
+
+REFERENCES: dict[str, tuple[Callable[..., Decimal], float]] = {
+    "sin": (_sine, 0.8),
+    "cos": (_cosine, 0.8),
+    "tan": (lambda x: _sine(x) / _cosine(x), 2.0),
+    "atan2": (_direction, 0.7),
+    "exp": (lambda x: x.exp(), 0.9),
+    "log": (lambda x: x.ln(), 0.8),
+    "log1p": (lambda x: (1 + x).ln(), 1.5),
+    "expm1": (lambda x: x.exp() - 1, 3.0),
+    "hypot": (lambda x, y: (x * x + y * y).sqrt(), 1.2),
+}
+"""Each function in forty digits, and how many units of the last place it may be off."""
+
+
+def _arguments(name: str) -> list[tuple[float, ...]]:
+    rng = np.random.default_rng(7)
+    wide = 10.0 ** rng.uniform(-12, 2, 150) * rng.choice([-1.0, 1.0], 150)
+    if name in ("sin", "cos", "tan"):
+        quarters = np.arange(1, 60) * (0.5 * math.pi)
+        far = rng.uniform(-1e6, 1e6, 80)
+        return [(x,) for x in (*rng.uniform(-4, 4, 300), *wide, *quarters, *far)]
+    if name in ("atan2", "hypot"):
+        near, far = rng.normal(size=(300, 2)), 10.0 ** rng.uniform(-250, 250, (100, 2))
+        edge = [(math.sqrt(0.5) * (1 + e), 1.0) for e in rng.uniform(-0.5, 0.5, 50)]
+        pairs = [*near.tolist(), *edge, *far.tolist()]
+        return [(y, x) for y, x in pairs if name == "hypot" or 1e-290 < abs(y) / abs(x) < 1e290]
+    if name == "exp":
+        return [(x,) for x in (*rng.uniform(-700, 700, 200), *rng.uniform(-2, 2, 200), *wide)]
+    if name == "log":
+        return [(10.0**x,) for x in (*rng.uniform(-300, 300, 200), *rng.uniform(-0.1, 0.1, 200))]
+    return [(x,) for x in (*wide, *rng.uniform(-0.99, 20, 200)) if x > -1.0]
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_an_elementary_function_is_right_to_the_last_place(name: str) -> None:
+    reference, most = REFERENCES[name]
+    function = getattr(elementary, name)
+    with localcontext() as context:
+        context.prec = DIGITS
+        for arguments in _arguments(name):
+            exact = reference(*[Decimal(float(x)) for x in arguments])
+            found = function(*[float(x) for x in arguments])
+            assert math.isfinite(found), arguments
+            off = abs(Decimal(found) - exact) / Decimal(math.ulp(float(exact)))
+            assert off <= Decimal(most), (arguments, found, off)
+
+
+def test_special_cases_are_those_of_ieee_754() -> None:
+    inf, nan, tiny, huge = math.inf, math.nan, 5e-324, 1.7e308
+    values = (0.0, -0.0, 1.0, -1.0, inf, -inf, tiny, -tiny, huge, -huge, nan)
+    for y in values:
+        for x in values:
+            for name in ("atan2", "hypot"):
+                found, wanted = getattr(elementary, name)(y, x), getattr(math, name)(y, x)
+                same = found == pytest.approx(wanted, rel=1e-15, abs=0.0, nan_ok=True)
+                assert same, (name, y, x)
+                assert math.copysign(1.0, found) == math.copysign(1.0, wanted) or found != found
+    assert [elementary.exp(x) for x in (-inf, -746.0, -0.0, 710.0, inf)] == [0, 0, 1, inf, inf]
+    assert elementary.exp(-745.0) == math.exp(-745.0) == tiny
+    assert [elementary.log(x) for x in (0.0, 1.0, inf)] == [-inf, 0.0, inf]
+    assert elementary.log(tiny) == pytest.approx(math.log(tiny), rel=1e-15)
+    assert [elementary.log1p(x) for x in (-1.0, 0.0, inf)] == [-inf, 0.0, inf]
+    assert [elementary.expm1(x) for x in (-inf, 0.0, inf)] == [-1.0, 0.0, inf]
+    for name in ("sin", "cos", "tan", "exp", "log", "log1p", "expm1"):
+        assert math.isnan(getattr(elementary, name)(nan)), name
+    assert math.isnan(elementary.sin(inf))
+    assert math.isnan(elementary.log(-1.0))
+    assert elementary.cos(1e15) == pytest.approx(math.cos(math.fmod(1e15, 2.0 * math.pi)), abs=1e-9)
+
+
+def test_an_array_s_functions_are_those_of_its_numbers() -> None:
+    x = np.linspace(0.1, 3.0, 6).reshape(2, 3)
+    for name in ("sin", "cos", "exp", "expm1", "log", "log1p"):
+        of_each = [[getattr(elementary, name)(v) for v in row] for row in x]
+        assert (getattr(elementwise, name)(x) == np.array(of_each)).all(), name
+    for name in ("atan2", "hypot"):
+        of_each = [[getattr(elementary, name)(v, 2.0 - v) for v in row] for row in x]
+        assert (getattr(elementwise, name)(x, 2.0 - x) == np.array(of_each)).all(), name
+    s, c = elementwise.sin_and_cos(x)
+    assert (s == elementwise.sin(x)).all()
+    assert (c == elementwise.cos(x)).all()
+
+
+def test_a_normal_variable_stays_below_with_the_probability_of_tables() -> None:
+    x = np.array([-9.5, -3.0, -1.0, 0.0, 0.5, 1.959963984540054, 4.0, 20.0])
+    tables = [0.5 * math.erfc(-v / math.sqrt(2.0)) for v in x]
+    np.testing.assert_allclose(elementwise.normal_below(x), tables, rtol=0.0, atol=1e-15)
