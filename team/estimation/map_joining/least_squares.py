@@ -106,9 +106,12 @@ def _largest(step: Values) -> float:
 
 
 def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Powers by products: those of the C library differ from processor to processor."""
-    most = int(exponents.max(initial=0))
-    return np.asarray(np.cumprod([1.0, *[base] * most])[exponents])
+    """Powers by products of repeated squares: a C library's differ from processor to processor."""
+    powers, rest = np.ones(len(exponents)), exponents
+    while rest.any():
+        powers = np.where(rest & 1, powers * base, powers)
+        base, rest = base * base, rest >> 1
+    return powers
 
 
 def robust_scale(
