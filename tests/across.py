@@ -18,6 +18,9 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+import msgspec
+
+from sim.scenarios.scenario import Scenario
 from tests import bits
 
 CLASSES: Mapping[str, Mapping[str, str]] = {
@@ -41,8 +44,14 @@ CASES = {
     "waypoints": lambda: bits.world("waypoints"),
     "thesis": lambda: bits.world("thesis", steps=60),
     "pair": lambda: bits.pair("hybrid", "join"),
-    "utias": lambda: bits.with_options(bits.utias(1), duration_s=120.0),
+    "utias": lambda: begun(bits.utias(1), 300.0),
 }
+
+
+def begun(scenario: Scenario, seconds: float) -> Scenario:
+    """The first seconds of a data set."""
+    world = msgspec.structs.replace(scenario.world, duration_s=seconds)
+    return msgspec.structs.replace(scenario, world=world)
 
 
 def measured(name: str, path: Path) -> None:
