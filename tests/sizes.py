@@ -29,6 +29,8 @@ REASONS = {
     "team/wire/zenoh/bus.py": "the same interface over Zenoh",
     "team/recording/shell.py": "the recorder's process: what it fetches, and when it leaves",
     "team/peers/replica.py": "a peer's set: all its sorts of members",
+    "team/estimation/elementary.py": KERNEL,
+    "team/estimation/map_joining/associating.py": "one island: its pairs, their checks and merges",
     "team/estimation/models.py": "the models of motion and of the sensor, with their Jacobians",
     "team/estimation/hybrid_slam/keyframes.py": "one cut of the stream into keyframes",
     "team/estimation/hybrid_slam/landmarks_along_paths.py": KERNEL,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED
-from team.estimation import elementwise
+from team.estimation import elementary, elementwise
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.map_joining.association.crowding import Crowd
 from team.estimation.map_joining.association.growing import (
@@ -144,11 +144,8 @@ class IslandView:
         later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
         if len(later):
             one, two = at[later], at[earlier]
-            close = (
-                elementwise.hypot(*(self.joint.mean[one] - self.joint.mean[two]).T)
-                < self.profile.same
-            )
-            close &= ~self._left_apart(one, two)
+            x, y = (self.joint.mean[one] - self.joint.mean[two]).T
+            close = (elementwise.hypot(x, y) < self.profile.same) & ~self._left_apart(one, two)
             self._grow("sweep", one[close], two[close], self.profile.tight)
 
     def _left_apart(self, one: Indices, two: Indices) -> Bool[np.ndarray, " k"]:
@@ -181,7 +178,8 @@ def _unseen(
     for places in seen_by:
         away = elementwise.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
         counts += (away < radius).any(axis=1)
-    return np.asarray(np.maximum(OVERLOOKED ** np.maximum(counts - 1.0, 0.0), LEAST_OVERLOOKED))
+    chance = elementwise.exp(elementary.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
+    return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))
 
 
 def _apart(
