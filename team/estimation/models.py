@@ -18,7 +18,7 @@ from team.estimation.geometry import Point, Pose, adjoint, compose, exponential,
 
 NEAREST_M = 1e-3
 """A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""
-OFF_AXIS = elementary.cos(math.radians(80.0))
+OFF_AXIS = 0.17364817766693041
 """Least cosine of the angle to the optical axis at which a depth tells a range."""
 
 

@@ -21,7 +21,7 @@ from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.models import Increment, located, variances
 from team.estimation.scans import Own
 
-EVIDENCE = elementary.log(100.0)
+EVIDENCE = 4.605170185988092
 """Log odds that a landmark's accepted measurements must reach; by chance they do so in one case
 of a hundred."""
 MOTION_JITTER = (1e-6, 1e-6, 1e-8)
