@@ -21,6 +21,11 @@ JOIN = (
     "estimation/map_joining/test_minima.py",
 )
 WINDOW = ("estimation/hybrid_slam/test_window.py", "estimation/hybrid_slam/test_pose_nodes.py")
+GENERAL = (
+    "estimation/hybrid_slam/test_landmark_kernel.py",
+    "estimation/hybrid_slam/test_general_measurements.py",
+    "estimation/hybrid_slam/test_mount.py",
+)
 PIPELINE = (
     "robot/test_hybrid.py",
     "estimation/hybrid_slam/test_pose_grid.py",
@@ -30,7 +35,12 @@ PIPELINE = (
 MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "team/estimation/hybrid_slam/window.py": (
         12,
-        (*WINDOW, "estimation/hybrid_slam/test_correlated_measurements.py"),
+        (
+            *WINDOW,
+            "estimation/hybrid_slam/test_correlated_measurements.py",
+            "estimation/hybrid_slam/test_depletion.py",
+            *GENERAL,
+        ),
     ),
     "team/estimation/hybrid_slam/moments.py": (6, WINDOW),
     "team/estimation/hybrid_slam/landmarks_along_paths.py": (
@@ -49,7 +59,7 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "team/estimation/hybrid_slam/landmark_kernel.py": (
         8,
-        ("estimation/hybrid_slam/test_fastslam.py",),
+        ("estimation/hybrid_slam/test_fastslam.py", *GENERAL),
     ),
     "team/estimation/hybrid_slam/innovation.py": (
         6,
@@ -67,7 +77,7 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "team/estimation/hybrid_slam/consensus_kernel.py": (
         10,
-        ("estimation/hybrid_slam/test_consensus.py",),
+        ("estimation/hybrid_slam/test_consensus.py", *GENERAL),
     ),
     "team/estimation/map_joining/conditioning.py": (
         6,

@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
+from team.estimation.geometry import compose, exponential
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.moments import moments, sample_factor
 from team.estimation.models import Increment, increment_of
@@ -388,3 +389,15 @@ def test_a_measurement_that_is_not_a_number_gives_an_error_that_names_the_matrix
 
     with pytest.raises(NotACovarianceError, match="the submap of a window"):
         taken()
+
+
+def test_a_window_without_landmarks_is_its_odometry_in_the_windows_frame() -> None:
+    """Its covariance is that of samples of the motion, and it has no landmarks."""
+    motion = increment_of(ROBOT, 1.0, 2.0, 0.7)
+    local = windows.motion_alone(motion)
+    xi = np.random.default_rng(1).multivariate_normal(np.zeros(3), motion.covariance, 30_000)
+    samples = np.array([compose(motion.mean, exponential(each)) for each in xi])
+    assert len(local.ids) == 0
+    np.testing.assert_array_equal(local.mean, motion.mean)
+    np.testing.assert_allclose(local.covariance, np.cov(samples.T), atol=3e-4)
+    assert np.linalg.eigvalsh(windows.motion_alone(Increment.identity()).covariance)[0] > 0.0

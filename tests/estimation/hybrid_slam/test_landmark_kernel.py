@@ -1,0 +1,96 @@
+"""One measurement of one landmark against the textbook's matrices, correlated covariances included."""
+
+import math
+
+import numpy as np
+import pytest
+
+from team.estimation.geometry import compose, exponential, tangent, wrapped
+from team.estimation.hybrid_slam.consensus_kernel import _prediction
+from team.estimation.hybrid_slam.landmark_kernel import condition_on_measurement
+from team.estimation.models import landmark_jacobian, predicted
+
+SENSOR = (0.04, 0.001, 0.003)
+POSE = (1.5, -0.7, 0.9)
+MEAN, COVARIANCE = np.array([4.0, 2.5]), np.array([[0.3, 0.11], [0.11, 0.2]])
+OWN = {
+    "none": np.empty(0),
+    "refused": np.array([9.0, 9.0, 9.0, -1.0]),
+    "range and bearing": np.array([0.05, 0.006, 0.002, 0.0]),
+    "point": np.array([0.05, 0.006, 0.002, 1.0]),
+}
+
+
+def noise(own: np.ndarray, distance: float) -> np.ndarray:
+    """R of (range, bearing)."""
+    if len(own) and own[3] >= 0.0:
+        return np.array([[own[0], own[1]], [own[1], own[2]]])
+    return np.diag([SENSOR[0] + SENSOR[1] * distance**2, SENSOR[2]])
+
+
+def log_density(e: np.ndarray, S: np.ndarray) -> float:
+    return -0.5 * float(e @ np.linalg.solve(S, e) + np.linalg.slogdet(2.0 * math.pi * S)[1])
+
+
+def kalman(e: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean, covariance and log-likelihood of one joint update of the landmark."""
+    S = H @ COVARIANCE @ H.T + R
+    K = COVARIANCE @ H.T @ np.linalg.inv(S)
+    return MEAN + K @ e, COVARIANCE - K @ H @ COVARIANCE, log_density(e, S)
+
+
+def updated(z: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    mean, packed = MEAN.copy(), COVARIANCE[[0, 0, 1], [0, 1, 1]]
+    likelihood = condition_on_measurement(mean, packed, POSE, z, SENSOR, own)
+    return mean, packed[[[0, 1], [1, 2]]], likelihood
+
+
+@pytest.mark.parametrize("kind", ["none", "refused", "range and bearing"])
+def test_the_range_and_then_the_bearing_are_the_joint_update(kind: str) -> None:
+    """Range first, then the bearing less its regression on the range: the same Gaussian."""
+    h = np.array(predicted(np.array(POSE), MEAN))
+    z = h + np.array([0.2, -0.05])
+    H = landmark_jacobian(h[0], POSE[2] + h[1])
+    expected = kalman(z - h, H, noise(OWN[kind], h[0]))
+    for got, textbook in zip(updated(z, OWN[kind]), expected, strict=True):
+        np.testing.assert_allclose(got, textbook, rtol=1e-10)
+
+
+def test_a_measured_point_is_a_linear_measurement_in_the_plane() -> None:
+    """Its density is that of (range, bearing of the predicted range), so `distance` times it."""
+    h = np.array(predicted(np.array(POSE), MEAN))
+    z = h + np.array([0.3, 0.4])
+    to_map = tangent(POSE[2] + z[1])[:2, :2]
+    point = np.array(POSE[:2]) + to_map @ np.array([z[0], 0.0])
+    along = np.diag([1.0, z[0]])
+    covariance = to_map @ along @ noise(OWN["point"], h[0]) @ along @ to_map.T
+    mean, spread, likelihood = kalman(point - MEAN, np.eye(2), covariance)
+    got = updated(z, OWN["point"])
+    np.testing.assert_allclose(got[0], mean, rtol=1e-10)
+    np.testing.assert_allclose(got[1], spread, rtol=1e-10)
+    assert got[2] == pytest.approx(likelihood + math.log(h[0]), rel=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["none", "range and bearing"])
+def test_one_measurement_predicts_another_with_all_of_their_noise(kind: str) -> None:
+    """S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ, its Jacobians by differences."""
+    own = OWN[kind]
+    seen, z, pose = np.array([3.0, 0.4]), np.array([2.4, 0.9]), np.array([0.8, -0.3, 0.2])
+    A = np.array([[0.2, 0.0, 0.0], [0.05, 0.1, 0.0], [-0.02, 0.03, 0.07]])
+    spread = A @ A.T
+
+    def h(xi: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        point = seen[0] * np.array([math.cos(seen[1]), math.sin(seen[1])])
+        return np.array(predicted(compose(pose, exponential(xi)), point))
+
+    def slopes(f, at: np.ndarray) -> np.ndarray:
+        step = 1e-6 * np.eye(len(at))
+        return np.array([(f(at + d) - f(at - d)) / 2e-6 for d in step]).T
+
+    Hx = slopes(lambda xi: h(xi, seen), np.zeros(3))
+    Hl = slopes(lambda s: h(np.zeros(3), s), seen)
+    expected = h(np.zeros(3), seen)
+    S = noise(own, expected[0]) + Hx @ spread @ Hx.T + Hl @ noise(own, seen[0]) @ Hl.T
+    e = np.array([z[0] - expected[0], wrapped(z[1] - expected[1])])
+    log = _prediction(pose, spread, seen, z, SENSOR, own, own)
+    assert log == pytest.approx(log_density(e, S), rel=1e-6)
