@@ -41,8 +41,8 @@ def kalman(e: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.
 
 def updated(z: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     mean, packed = MEAN.copy(), COVARIANCE[[0, 0, 1], [0, 1, 1]]
-    likelihood = condition_on_measurement(mean, packed, POSE, z, SENSOR, own)
-    return mean, packed[[[0, 1], [1, 2]]], likelihood
+    squared, volume = condition_on_measurement(mean, packed, POSE, z, SENSOR, own)
+    return mean, packed[[[0, 1], [1, 2]]], -0.5 * (squared + math.log(volume))
 
 
 @pytest.mark.parametrize("kind", ["none", "refused", "range and bearing"])
