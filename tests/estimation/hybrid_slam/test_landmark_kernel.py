@@ -1,4 +1,4 @@
-"""One measurement of one landmark against the textbook's matrices, correlated covariances included."""
+"""One measurement of a landmark against the textbook, correlated covariances included."""
 
 import math
 
