@@ -10,6 +10,9 @@ comes from the ranges. Then only what ranges and bearings determine is learnt: t
 scales, drag and veer. The sensor's own figures stay, since a team can not observe the scale of its
 own range measurements.
 
+Of detections without identities the rates of clutter and of missed ones are learnt, too
+(`detections`); no label is looked at, except for the figures that are learnt against the truth.
+
 How consistent the submaps' covariances are (`covariance_factor`, and the monitor's `normal_scale`
 with it) is learnt without the truth in both cases, from the maps of single robots (`consistency`).
 """
@@ -24,8 +27,9 @@ import numpy as np
 from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.calibration import claims, motion, sensor
-from sim.calibration.consistency import covariance_factor, normal_scale
+from sim.calibration.consistency import covariance_factor, factor_by_cost, normal_scale
 from sim.calibration.data import Reference, references, true_paths
+from sim.calibration.detections import claim_notes, detection_figures, windows_of
 from sim.calibration.figures import (
     CalibrationError,
     Figure,
@@ -33,7 +37,7 @@ from sim.calibration.figures import (
     nested,
     with_figures,
 )
-from sim.calibration.join import config_of, joined_team
+from sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
 from sim.calibration.own import marker_spread, own_constants
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import WorldStreams
@@ -66,7 +70,8 @@ class Calibration:
     """The learnt figures by the part of a robot's configuration that they belong to, and notes for
     the user.
 
-    robots: figures of single robots' sensors, where robots differ.
+    robots: figures of single robots' sensors, where robots differ. detections: what is clutter and
+    what is missed, where there are detections without identities.
     """
 
     motion: tuple[Figure, ...]
@@ -75,6 +80,7 @@ class Calibration:
     notes: tuple[str, ...]
     central: tuple[Figure, ...] = ()
     robots: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)
+    detections: tuple[Figure, ...] = ()
 
 
 def calibrated(
@@ -86,8 +92,22 @@ def calibrated(
     suffice.
     """
     if all(world.landmarks is not None and true_paths(world.streams) for _, world in worlds):
-        return _by_truth(worlds, scenario, progress)
-    return _by_the_map(worlds, scenario, progress)
+        found = _by_truth(worlds, scenario, progress)
+    else:
+        found = _by_the_map(worlds, scenario, progress)
+    windows = [
+        each
+        for _, world in worlds
+        for stream in world.streams
+        if stream.landmark_detections.hidden is not None
+        for each in windows_of(stream, config_of(stream.robot, scenario))
+    ]
+    if not windows:
+        return found
+    progress("clutter and missed detections of the windows")
+    figures = detection_figures(windows)
+    notes = claim_notes(figures, found.central, scenario.robots[0].front_end.association)
+    return replace(found, detections=figures, notes=(*found.notes, *notes))
 
 
 def _by_truth(
@@ -163,11 +183,13 @@ def _by_the_map(
         found = (f for f in _motion_figures(data, learnt) if f.name in SCALES)
         figures = tuple(_with_systematic(f) for f in found)
         learnt = with_figures(scenario, figures, ())
-    folds = []
+    teams = []
     for label, world in worlds:
         progress(f"joined map of {label} with what was learnt")
-        folds.append(joined_team(world, learnt).fold)
-    of_central = _central_figures(folds, scenario, (), progress)
+        teams.append(joined_team(world, learnt))
+    of_central = _central_figures([team.fold for team in teams], scenario, (), progress)
+    if not of_central and len(teams) == 1:
+        of_central = _by_cost(teams[0], scenario.central, progress)
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
     if any(each.seen.covariances is not None for each in data):
         note += "; so do the factors of covariances that come with measurements, and the mount"
@@ -194,6 +216,18 @@ def _central_figures(
     central = msgspec.structs.replace(central, covariance_factor=factor.value)
     normal = normal_scale(folds, central)
     return found if normal is None else (*found, normal)
+
+
+def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tuple[Figure, ...]:
+    """The covariance factor of fewer robots than can be compared, whose landmarks have no
+    identities: association depends on it.
+    """
+    if not any(len(each.local.unnamed.counts) for each in team.contributions):
+        return ()
+    progress("the map under other covariance factors")
+    starts = team.fold.starts.values()
+    figure = factor_by_cost(lambda config: fold_of(team.contributions, starts, config), central)
+    return () if figure is None else (figure,)
 
 
 def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:

@@ -12,10 +12,11 @@ not show in D. a and b share the states of the biases that the team has in commo
 each sees it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -71,6 +72,27 @@ def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure |
     return Figure("covariance_factor", factor, factor * spread / ratio, "")
 
 
+def factor_by_cost(
+    refold: Callable[[CentralConfig], Fold], central: CentralConfig
+) -> Figure | None:
+    """The factor, at least 1, under which the joint cost of the map is its degrees of freedom.
+
+    For too few robots to compare their maps: it knows only of errors that differ from window to
+    window. The landmarks are associated anew under each factor, as more of them fit where it is
+    larger. Its standard deviation is that of χ². None without degrees of freedom.
+    """
+    factor = central.covariance_factor
+    for _ in range(MOST_ROUNDS):
+        fold = refold(msgspec.structs.replace(central, covariance_factor=factor))
+        found = joint_cost(fold)
+        if not fold.contributions or found.dof <= 0:
+            return None
+        before, factor = factor, max(1.0, factor * found.chi2 / found.dof)
+        if abs(factor / before - 1.0) < SETTLED:
+            break
+    return Figure("covariance_factor", factor, factor * float(np.sqrt(2.0 / found.dof)), "")
+
+
 def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
     """The covariance scale that the monitor computes under these settings where everything is
     consistent.
@@ -124,10 +146,13 @@ def _apart(
     The two maps share the states of the biases that the whole team has in common.
     """
     submaps = island.graph.submaps
+    id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     numbers = {
-        each.contribution.key: (each.contribution.local.ids.astype(np.int64) + APART).tolist()
+        each.contribution.key: [
+            id_of[node] + (APART if each.contribution.robot == robot else 0)
+            for node in each.landmarks.tolist()
+        ]
         for each in submaps
-        if each.contribution.robot == robot
     }
     graph, state = extended(
         EMPTY_GRAPH,

@@ -15,7 +15,7 @@ from sim.world.streams import (
     RobotStream,
     WorldStreams,
 )
-from team.config import MotionModel, RobotConfig
+from team.config import UNNAMED, MotionModel, RobotConfig
 from team.estimation.odometry import OdometryInterval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
 
@@ -90,10 +90,15 @@ def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
 
 
 def scan_of(seen: ObservationMeasurement) -> Scan:
-    """The scan as a robot's front end receives it."""
+    """The scan as a robot's front end receives it: detections without identities have the numbers
+    of their rows, and never those of their labels.
+    """
+    ids = seen.ids
+    if seen.hidden:
+        ids = np.arange(UNNAMED, UNNAMED + len(seen.ranges), dtype=np.uint32)
     if seen.points is not None:
-        return point_scan(seen.ids, seen.points, seen.covariances)
-    return polar_scan(seen.ids, seen.ranges, seen.bearings, seen.covariances)
+        return point_scan(ids, seen.points, seen.covariances)
+    return polar_scan(ids, seen.ranges, seen.bearings, seen.covariances)
 
 
 def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> OdometryInterval:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -22,7 +23,8 @@ time.
 HUBER = 2.0
 """The loss is linear beyond this number of standard deviations."""
 
-Fit = Callable[[Sequence[Reference]], Mapping[str, float]]
+T = TypeVar("T")
+Fit = Callable[[Sequence[T]], Mapping[str, float]]
 
 
 class CalibrationError(ValueError):
@@ -70,14 +72,22 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
     return groups
 
 
-def jackknifed(fit: Fit, data: Sequence[Reference], units: Mapping[str, str]) -> tuple[Figure, ...]:
-    """The fit of all data, with σ² = (G − 1)/G Σ (fit without a group − their mean)²; Efron and
+def jackknifed(
+    fit: Fit[Reference], data: Sequence[Reference], units: Mapping[str, str]
+) -> tuple[Figure, ...]:
+    """The fit of all data, with the uncertainty of `left_out` over robots or stretches of time."""
+    return left_out(fit, groups_of(data), units)
+
+
+def left_out(
+    fit: Fit[T], groups: Sequence[Sequence[T]], units: Mapping[str, str]
+) -> tuple[Figure, ...]:
+    """The fit of all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)²; Efron and
     Stein 1981.
 
     Errors may be correlated within a group; between groups they are independent. A figure that the
     data without one group do not determine is left out.
     """
-    groups = groups_of(data)
     values = fit([part for group in groups for part in group])
     rest = [
         fit([part for j, group in enumerate(groups) if j != i for part in group])
@@ -87,8 +97,8 @@ def jackknifed(fit: Fit, data: Sequence[Reference], units: Mapping[str, str]) ->
     for name, value in values.items():
         if not all(name in each for each in rest):
             continue
-        left_out = np.array([each[name] for each in rest])
-        spread = float(np.sum((left_out - left_out.mean()) ** 2))
+        without = np.array([each[name] for each in rest])
+        spread = float(np.sum((without - without.mean()) ** 2))
         sigma = float(np.sqrt((len(groups) - 1) / len(groups) * spread))
         figures.append(Figure(name, float(value), sigma, units[name]))
     return tuple(figures)

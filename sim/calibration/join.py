@@ -1,12 +1,13 @@
 """The team's map and paths from its own measurements: the reference where there is no truth."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
+from central.config import CentralConfig
 from central.desk.evaluation.errors import Path, on_circle
 from central.tick_fold import join_settings
 from sim.calibration.data import interval_of, scan_of
@@ -25,11 +26,13 @@ from team.estimation.geometry import compose
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.window import Window
+from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
     InitialPoseFactor,
+    Tick,
     converged,
     folded,
     started,
@@ -55,6 +58,7 @@ class JoinedTeam:
     landmarks: Mapping[int, Float[np.ndarray, "2"]]
     paths: Mapping[str, Path]
     fold: Fold
+    contributions: Sequence[Contribution] = ()
 
 
 def joined_team(
@@ -71,11 +75,11 @@ def joined_team(
     for each in world.streams:
         tracks[each.robot] = _tracks(config_of(each.robot, scenario), each)
         progress(each.robot)
-    fold: Fold = EMPTY_FOLD
-    for stream in world.streams:
-        if stream.start is not None and tracks.get(stream.robot):
-            start = stream.start
-            fold = started(fold, InitialPoseFactor(stream.robot, 1, start.pose, start.covariance))
+    starts = [
+        InitialPoseFactor(stream.robot, 1, stream.start.pose, stream.start.covariance)
+        for stream in world.streams
+        if stream.start is not None and tracks.get(stream.robot)
+    ]
     contributions = [
         Contribution(robot, 1, t.closed.sequence, t.closed.end_ns, t.closed.local)
         for robot, windows in tracks.items()
@@ -86,14 +90,7 @@ def joined_team(
             "no robot has odometry and measurements of landmarks that make a submap: without "
             "ground truth `calibrate` learns from the joined map"
         )
-    tick_ns = round(scenario.central.tick_s * 1e9)
-    ticks: dict[int, list[Contribution]] = {}
-    for contribution in sorted(contributions, key=lambda c: c.key):
-        ticks.setdefault(-(-contribution.end_ns // tick_ns), []).append(contribution)
-    settings = join_settings(scenario.central)
-    for tick in sorted(ticks):
-        fold = folded(fold, ticks[tick], settings)
-    fold = converged(fold, settings)
+    fold = fold_of(contributions, starts, scenario.central)
     graph, state = fold.main.graph, fold.main.state
     landmarks = {
         id_: state[graph.offset[node] : graph.offset[node] + 2].copy()
@@ -104,7 +101,30 @@ def joined_team(
         at = graph.offset[list(nodes)]
         ends = state[at[:, np.newaxis] + np.arange(3)]
         paths[robot] = _bent(tracks[robot], ends)
-    return JoinedTeam(landmarks, paths, fold)
+    return JoinedTeam(landmarks, paths, fold, contributions)
+
+
+def fold_of(
+    contributions: Sequence[Contribution],
+    starts: Iterable[InitialPoseFactor],
+    central: CentralConfig,
+) -> Fold:
+    """The solved fold of these submaps; landmarks without identities are associated."""
+    fold: Fold = EMPTY_FOLD
+    for start in starts:
+        fold = started(fold, start)
+    tick_ns = round(central.tick_s * 1e9)
+    ticks: dict[int, list[Contribution]] = {}
+    for contribution in sorted(contributions, key=lambda c: c.key):
+        ticks.setdefault(-(-contribution.end_ns // tick_ns), []).append(contribution)
+    settings = join_settings(central)
+    unnamed = any(len(each.local.unnamed.counts) for each in contributions)
+    for tick in sorted(ticks):
+        if unnamed:
+            fold = taken(fold, Tick(ticks[tick]), settings)
+        else:
+            fold = folded(fold, ticks[tick], settings)
+    return converged(fold, settings)
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:

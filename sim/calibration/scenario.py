@@ -9,7 +9,7 @@ from sim.calibration.calibrate import Calibration
 from sim.calibration.figures import Figure, nested
 from sim.scenarios.scenario import Scenario, builtin_names
 from sim.world.config import FolderWorld, LiveWorld
-from team.config import MotionModel, Sensor
+from team.config import AssociationSettings, MotionModel, Sensor
 
 
 def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
@@ -32,6 +32,7 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
     parts = (
         ("defaults.motion", calibration.motion, MotionModel),
         ("defaults.sensor", calibration.sensor, Sensor),
+        ("defaults.front_end.association", calibration.detections, AssociationSettings),
         ("central", calibration.central, CentralConfig),
     )
     for name, figures, declared in parts:

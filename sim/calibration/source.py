@@ -27,7 +27,7 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
 
 def _with_its_robots(path: Path) -> Scenario:
     """The data set's own scenario with the robots that have files in it, however many."""
-    if kind_of(path) == "folder":
+    if kind_of(path) != "utias":
         return with_options(load(scenario_beside(path)), dataset=path)
     with opened_set(str(path), UTIAS_MARKER) as files:
         present = present_robots(files)

@@ -64,6 +64,7 @@ def calibrate(
         ("motion", found.motion),
         ("sensor", found.sensor),
         *((robot, figures) for robot, figures in found.robots.items()),
+        ("detections", found.detections),
         ("central", found.central),
     )
     for part, figures in parts:

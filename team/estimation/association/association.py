@@ -43,8 +43,26 @@ class Associated:
     clutter: Bool[np.ndarray, " N"]
 
 
-def associated(scans: Scans, settings: AssociationSettings) -> Associated:
-    """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
+@dataclass(frozen=True)
+class Clusters:
+    """The detections of a window, each of one landmark, before what is doubtful is left out.
+
+    landmark_of: by detection. names: of each landmark, NOBODY where it has none. now: the window
+    smoothed under this association. slips: where the odometry was wrong; `scans` has their motions
+    with a larger covariance.
+    """
+
+    scans: Scans
+    landmark_of: Int64[np.ndarray, " N"]
+    names: Int64[np.ndarray, " L"]
+    now: Smoothed
+    slips: tuple[Slip, ...]
+
+
+def clustered(scans: Scans, settings: AssociationSettings) -> Clusters:
+    """Track, smooth, associate again and merge. Raises LinAlgError where the window has no
+    solution.
+    """
     first = tracked(scans, settings)
     scans = _with_slips(scans, first.slips)
     landmark_of, names = first.landmark_of, np.array(first.names, np.int64)
@@ -53,14 +71,21 @@ def associated(scans: Scans, settings: AssociationSettings) -> Associated:
     now = smoothed(scans, landmark_of, now.poses, points)
     landmark_of, names, points = _merged(scans, landmark_of, names, now, settings)
     now = smoothed(scans, landmark_of, now.poses, points)
-    landmark_of = _certain(scans, landmark_of, names, now, settings)
+    return Clusters(scans, landmark_of, names, now, tuple(first.slips))
+
+
+def associated(scans: Scans, settings: AssociationSettings) -> Associated:
+    """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
+    found = clustered(scans, settings)
+    scans, names, now = found.scans, found.names, found.now
+    landmark_of = _certain(scans, found.landmark_of, names, now, settings)
     confirmed = _confirmed(landmark_of, names, settings)
     clutter = _missed_too_often(scans, landmark_of, confirmed, now, settings)
     remaining = np.where(np.append(confirmed, False)[landmark_of], landmark_of, NOBODY)
     landmark_of, names, _ = _renumbered(remaining, names, now.landmarks)
     seen = _seen(scans, landmark_of, len(names))
     counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(names))
-    return Associated(landmark_of, names, counts, seen, tuple(first.slips), clutter)
+    return Associated(landmark_of, names, counts, seen, found.slips, clutter)
 
 
 def _with_slips(scans: Scans, slips: list[Slip]) -> Scans:

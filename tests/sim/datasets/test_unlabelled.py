@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from sim.calibration.data import scan_of
+from sim.calibration.source import measurements_of
 from sim.datasets.kinds import kind_of
 from sim.datasets.tables import DatasetError
 from sim.datasets.unlabelled import unlabelled
@@ -10,6 +12,7 @@ from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import scenario_beside, streams_of
 from sim.world.config import UnlabelledWorld
 from sim.world.streams import NO_LABEL, OBSERVATIONS, ODOMETRY
+from team.config import UNNAMED
 
 
 def write(folder, **tables):
@@ -48,6 +51,15 @@ def car(tmp_path):
 
 def streams(folder, robots=1, **fields):
     return unlabelled(UnlabelledWorld(path=str(folder), **fields), robots)
+
+
+def test_calibration_takes_a_set_without_names_and_hears_no_label(steps):
+    world, scenario = measurements_of(steps)
+    (stream,) = world.streams
+    assert scenario.name == "dlr"
+    seen = stream.observations(int(np.flatnonzero(stream.kinds == OBSERVATIONS)[0]))
+    assert 3 in seen.ids
+    assert scan_of(seen).ids.tolist() == [UNNAMED, UNNAMED + 1]
 
 
 def test_a_set_in_steps_keeps_every_number(steps):

@@ -59,6 +59,9 @@ class Placement(NamedTuple):
 
     absent: number of landmarks that one side has where the other side observed and has none.
     evidence: log-likelihood ratio of the pairs less the penalty for the absent landmarks.
+    as_rival: the same where a landmark is absent only if the other side has none at all beside it,
+        matched or not. Where maps are bent, few of the pairs of a place are found, and what they
+        leave over is no evidence against it.
     """
 
     grown: Grown
@@ -66,6 +69,7 @@ class Placement(NamedTuple):
     motion: Float[np.ndarray, "3"]
     absent: int
     evidence: float
+    as_rival: float
 
 
 class Closure(NamedTuple):
@@ -125,9 +129,17 @@ def aligned(
         joint, there = joint_of(vote)
         grown = _grown(patch, there, joint, vote, profile)
         if grown is not None:
-            absent = _absent(grown, patch, there, profile)
-            evidence = grown.llr - profile.absent * absent
-            found.append(Placement(grown, there, vote.motion, absent, evidence))
+            absent, surely = _absent(grown, patch, there, profile)
+            found.append(
+                Placement(
+                    grown=grown,
+                    there=there,
+                    motion=vote.motion,
+                    absent=absent,
+                    evidence=grown.llr - profile.absent * absent,
+                    as_rival=grown.llr - profile.absent * surely,
+                )
+            )
             most = max(most, len(grown.pairs))
     return sorted(found, key=lambda each: -each.evidence)
 
@@ -190,22 +202,26 @@ def _against(closure: Closure, others: Sequence[Placement]) -> Closure:
     """The closure with the figures of the best rival, if one of `others` is better than its present
     one.
     """
-    best = max(others, key=lambda each: each.evidence, default=None)
-    if best is None or best.evidence <= closure.rival_llr:
+    best = max(others, key=lambda each: each.as_rival, default=None)
+    if best is None or best.as_rival <= closure.rival_llr:
         return closure
-    return closure._replace(rival_pairs=len(best.grown.pairs), rival_llr=best.evidence)
+    return closure._replace(rival_pairs=len(best.grown.pairs), rival_llr=best.as_rival)
 
 
 def _promise(vote: Vote, patch: Side, target: Side, profile: AssociationProfile) -> float:
     """Estimated evidence for an alignment, from where the points lie as it is voted."""
     local = patch.points.mean - patch.points.mean.mean(axis=0)
     sides = (moved(vote.motion, local), vote.first), (target.points.mean, vote.second)
-    absent = _missing(*sides, (patch.views, target.views), profile)
+    absent, _ = _missing(*sides, (patch.views, target.views), profile)
     return WORTH * len(vote.first) - profile.absent * absent
 
 
-def _absent(grown: Grown, patch: Side, there: Side, profile: AssociationProfile) -> int:
-    """Number of landmarks of either side that are not matched where the other side observed."""
+def _absent(
+    grown: Grown, patch: Side, there: Side, profile: AssociationProfile
+) -> tuple[int, int]:
+    """Number of landmarks of either side that are not matched where the other side observed, and of
+    those of them beside which it has none.
+    """
     mean = grown.joint.mean
     here = np.full(int(max(there.views.max(initial=-1), there.within.max())) + 1, -1)
     here[there.within] = np.arange(len(there.within))
@@ -223,19 +239,23 @@ def _missing(
     two: tuple[Float[np.ndarray, "m 2"], Indices],
     views: tuple[SeenTogether, SeenTogether],
     profile: AssociationProfile,
-) -> int:
+) -> tuple[int, int]:
     """Number of unmatched points of two sides, given with the matched ones' indices, inside the
-    other side's views.
+    other side's views, and of those of them that no point of the other side is close to.
 
     A point close to a matched place may be a split-off part of that landmark, and is not counted.
     """
-    count = 0
+    count = surely = 0
     for (points, matched), (own, theirs), seen in ((one, two, views[1]), (two, one, views[0])):
         left = np.delete(points, matched, axis=0)
         if len(left):
             left = left[distance(left, own[theirs]) >= profile.same]
-            count += int(covered(left, own, seen).sum())
-    return count
+        if len(left):
+            left = left[covered(left, own, seen)]
+            count += len(left)
+        if len(left):
+            surely += int((distance(left, own) >= profile.same).sum())
+    return count, surely
 
 
 def _named(grown: Grown, there: Side) -> list[tuple[int, int]]:

@@ -94,15 +94,15 @@ def test_robots_with_unknown_initial_poses_become_one_map_by_what_they_see() -> 
 
 
 def test_in_a_grid_of_equal_rooms_robots_with_unknown_initial_poses_wait() -> None:
-    for seed in range(4):
+    # Of 200 seeds the last one was merged while rivals were charged with what they left over.
+    for seed, heading in ((0, 0.0), (1, 0.0), (80, np.pi)):
         rng = np.random.default_rng(seed)
         room = rng.uniform(0.5, 7.5, (9, 2))
         world = np.concatenate([room + 8.0 * np.array([i, j]) for i in range(4) for j in range(4)])
         submaps = []
         for robot, row in (("r1", 1), ("r2", 2)):
-            path = np.column_stack(
-                [np.arange(4.0, 29.0, 3.0), np.full(9, 8.0 * row + 4.0), np.zeros(9)]
-            )
+            along = np.arange(4.0, 29.0, 3.0)[:: -1 if heading else 1]
+            path = np.column_stack([along, np.full(9, 8.0 * row + 4.0), np.full(9, heading)])
             submaps += drive(robot, path, world, rng)[0]
         fold = _folded(submaps)
         assert len(fold.islands) == 2

@@ -1,0 +1,245 @@
+"""Learns from detections without identities how many are clutter and how many are missed.
+
+Each window is associated anew, without any identity (`team.estimation.association`). After the scan
+that found a landmark first, every scan that looks at its place is a trial: with n of them, v
+detections are binomial with the detection probability p. A scan looks at a place if the place lies
+between the nearest and the farthest, and between the outermost bearings, of the other landmarks
+that the scan detected; whether it detected the landmark itself is left out of that, else p would be
+too large.
+Clutter is seen again by chance alone, with probability g in each. The share of clutter among the
+landmarks that were found, p and g are those of the greatest likelihood (expectation and
+maximisation). Landmarks that are seen as rarely as clutter count as clutter.
+
+What the detections' covariances claim is compared with the cost of the smoothed windows, which has
+the mean of one for each degree of freedom where the claims of detections and odometry are right.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from sim.calibration.data import interval_of, scan_of
+from sim.calibration.figures import Figure, left_out
+from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream
+from team.config import AssociationSettings, RobotConfig
+from team.estimation.association.association import Clusters, clustered
+from team.estimation.association.certainty import view_of
+from team.estimation.association.scans import NOBODY, Scans, seen_from
+from team.estimation.hybrid_slam.keyframes import Segmenter
+from team.estimation.hybrid_slam.unnamed import events_of, scans_of
+
+LEAST_TRIALS = 50
+"""Least number of trials from which the rates are learnt."""
+LEAST_SEEN = 3
+"""A landmark of so many detections is no clutter. Only such landmarks say what a scan looked at:
+clutter may lie farther off than any landmark can be seen."""
+GROUPS = 5
+"""Number of stretches of all windows that are left out in turn."""
+ROUNDS = 200
+SETTLED = 1e-6
+DIFFERENT = 1.3
+"""A claim does not hold where the errors are more than this factor larger, or smaller."""
+UNLIKE = 0.1
+"""A detection probability that differs by more than this from the scenario's is noted."""
+
+UNITS = {
+    "detection_probability": "",
+    "clutter_share": "",
+    "clutter_per_m2": "1/m²",
+    "errors_over_claims": "",
+}
+
+
+class WindowLooks(NamedTuple):
+    """What the scans of one window saw again.
+
+    trials, again: for each landmark, the number of scans that looked at its place after its first
+    detection, and of those of them that detected it. further: number of its other detections.
+    area [m²]: of the view, times the number of scans. cost, dof: of the smoothed window.
+    """
+
+    trials: Int64[np.ndarray, " L"]
+    again: Int64[np.ndarray, " L"]
+    further: Int64[np.ndarray, " L"]
+    detections: int
+    area: float
+    cost: float
+    dof: int
+
+
+def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
+    """The windows of a robot that have detections without identities; one without a solution is
+    left out.
+    """
+    front = config.front_end
+    segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s)
+    window_ns, start_ns = round(front.window_s * 1e9), None
+    keyframes, found = [], []
+    for counter in range(1, len(stream)):
+        if stream.kinds[counter] == OBSERVATIONS:
+            measurement = stream.observations(counter)
+            segmenter.observe(measurement.stamp_ns, *scan_of(measurement))
+        elif stream.kinds[counter] == ODOMETRY:
+            interval = interval_of(stream.odometry(counter), config.motion)
+            if start_ns is None:
+                start_ns = interval.end_ns - interval.duration_ns
+                segmenter.begin(start_ns)
+            keyframes += segmenter.drive(interval)
+            if interval.end_ns - start_ns >= window_ns:
+                keyframes += segmenter.cut(interval.end_ns)[0]
+                segmenter.leave()
+                if any(each.looks for each in keyframes):
+                    scans = scans_of(events_of(keyframes), config.sensor)
+                    found += _looks(scans, front.association)
+                start_ns, keyframes = interval.end_ns, []
+                segmenter.begin(start_ns)
+    return found
+
+
+def _looks(scans: Scans, settings: AssociationSettings) -> list[WindowLooks]:
+    try:
+        return [looks_of(clustered(scans, settings))]
+    except np.linalg.LinAlgError:
+        return []
+
+
+def looks_of(found: Clusters) -> WindowLooks:
+    """The trials of each landmark of a window, and which of them found it."""
+    scans, landmarks = found.scans, found.now.landmarks
+    unnamed = found.names == NOBODY
+    trials = np.zeros(len(landmarks), np.int64)
+    again = np.zeros(len(landmarks), np.int64)
+    known = np.zeros(len(landmarks), np.bool_)
+    ranges = np.hypot(scans.points[:, 0], scans.points[:, 1])
+    bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
+    counts = np.bincount(found.landmark_of, minlength=len(landmarks))
+    real = counts >= LEAST_SEEN
+    bounds = scans.bounds
+    for k, pose in enumerate(found.now.poses):
+        rows = slice(bounds[k], bounds[k + 1])
+        own = found.landmark_of[rows]
+        if not len(own):
+            continue
+        at = seen_from(np.broadcast_to(pose, (len(landmarks), 3)), landmarks)
+        other = (own[None] != np.arange(len(landmarks))[:, None]) & real[own]
+        looked = known & other.any(axis=1)
+        for measured, place in (
+            (ranges[rows], np.hypot(at[:, 0], at[:, 1])),
+            (bearings[rows], np.arctan2(at[:, 1], at[:, 0])),
+        ):
+            looked &= np.where(other, measured, np.inf).min(axis=1) <= place
+            looked &= place <= np.where(other, measured, -np.inf).max(axis=1)
+        trials += looked
+        detected = np.isin(np.arange(len(landmarks)), own)
+        again += looked & detected
+        known |= detected
+    view = view_of(scans)
+    return WindowLooks(
+        trials=trials[unnamed],
+        again=again[unnamed],
+        further=(counts - 1 - again)[unnamed],
+        detections=int(np.count_nonzero(unnamed[found.landmark_of])),
+        area=view.area * view.looks,
+        cost=found.now.squared,
+        dof=found.now.dof,
+    )
+
+
+class Rates(NamedTuple):
+    """detected: probability that a landmark in view is detected. share: of the detections, what is
+    clutter. density: clutter per scan and square metre of its view. claimed: squared errors inside
+    windows in units of what is claimed.
+    """
+
+    detected: float
+    share: float
+    density: float
+    claimed: float
+
+
+def rates(windows: Sequence[WindowLooks]) -> Rates | None:
+    """The rates of the greatest likelihood; None where there are fewer than LEAST_TRIALS trials."""
+    n, v, more = (
+        np.concatenate([np.zeros(0, np.int64), *(getattr(each, name) for each in windows)])
+        for name in ("trials", "again", "further")
+    )
+    if n.sum() < LEAST_TRIALS:
+        return None
+    p, g, share = 0.8, 0.1, 0.3
+    for _ in range(ROUNDS):
+        before = p, g, share
+        clutter = _clutter(v, n, p, g, share)
+        share = float(clutter.mean())
+        p = float(((1.0 - clutter) * v).sum() / max(((1.0 - clutter) * n).sum(), 1e-9))
+        g = float((clutter * v).sum() / max((clutter * n).sum(), 1e-9))
+        p, g = (float(np.clip(each, 1e-3, 1.0 - 1e-3)) for each in (p, g))
+        if np.abs(np.subtract(before, (p, g, share))).max() < SETTLED:
+            break
+    clutter, seen = _clutter(v, n, p, g, share), 1 + v + more
+    few, judged = seen < LEAST_SEEN, n > 0
+    if (few & judged).any():  # where no scan looked again, as many are clutter as elsewhere
+        clutter[~judged] = clutter[few & judged].mean()
+    false = float((clutter * seen)[few].sum())
+    cost, dof = (sum(getattr(each, name) for each in windows) for name in ("cost", "dof"))
+    return Rates(
+        detected=p,
+        share=false / max(sum(each.detections for each in windows), 1),
+        density=false / max(sum(each.area for each in windows), 1e-9),
+        claimed=cost / max(dof, 1),
+    )
+
+
+def _clutter(
+    v: Int64[np.ndarray, " L"], n: Int64[np.ndarray, " L"], p: float, g: float, share: float
+) -> Float[np.ndarray, " L"]:
+    """The probability of each landmark that was found to be clutter.
+
+    The binomial coefficient of both hypotheses is the same.
+    """
+    real = v * np.log(p) + (n - v) * np.log1p(-p) + np.log1p(-min(share, 1.0 - 1e-9))
+    false = v * np.log(g) + (n - v) * np.log1p(-g) + np.log(max(share, 1e-9))
+    probability: Float[np.ndarray, " L"] = 1.0 / (1.0 + np.exp(np.clip(real - false, -500, 500)))
+    return probability
+
+
+def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
+    """The rates of all windows, with their uncertainty from leaving out stretches of them."""
+    if len(windows) < GROUPS:
+        return ()
+    edges = np.linspace(0, len(windows), GROUPS + 1).astype(int)
+    groups = [windows[a:b] for a, b in pairwise(edges)]
+
+    def fit(part: Sequence[WindowLooks]) -> dict[str, float]:
+        found = rates(part)
+        return {} if found is None else dict(zip(UNITS, found, strict=True))
+
+    return left_out(fit, groups, UNITS)
+
+
+def claim_notes(
+    figures: Sequence[Figure], central: Sequence[Figure], settings: AssociationSettings
+) -> tuple[str, ...]:
+    """Warnings where what is claimed does not hold, in words."""
+    value = {each.name: each.value for each in (*figures, *central)}
+    notes = []
+    inside, between = value.get("errors_over_claims", 1.0), value.get("covariance_factor", 1.0)
+    if not 1.0 / DIFFERENT <= inside <= DIFFERENT:
+        notes.append(
+            f"inside windows the errors are {inside**0.5:.2g} times what detections and odometry "
+            "claim"
+        )
+    if between > DIFFERENT:
+        notes.append(
+            f"between windows the errors are {between**0.5:.2g} times what the submaps claim: "
+            f"launch with covariance_factor {between:.2g}, else landmarks are not found again"
+        )
+    detected = value.get("detection_probability")
+    if detected is not None and abs(detected - settings.detection_probability) > UNLIKE:
+        notes.append(
+            f"{detected:.0%} of the landmarks in view are detected, the scenario says "
+            f"{settings.detection_probability:.0%}"
+        )
+    return tuple(notes)
