@@ -47,14 +47,15 @@ def covered(
     if not len(points) or not views.size:
         return inside
     at = np.where((views >= 0)[..., None], own[views], np.nan)
-    low, high = np.nanmin(at, axis=1), np.nanmax(at, axis=1)
+    low, high = np.fmin.reduce(at, axis=1), np.fmax.reduce(at, axis=1)
     near = (points[:, None] >= low) & (points[:, None] <= high)
     point, view = np.nonzero(near.all(axis=2))
     if not len(point):
         return inside
     x, y = (at[view] - points[point, None]).transpose(2, 0, 1)
     angle = np.sort(elementwise.atan2(y, x), axis=1)  # what is filled up is last
-    last = np.nanmax(angle, axis=1)
-    gap = np.fmax(np.nanmax(np.diff(angle, axis=1), axis=1), angle[:, 0] + 2.0 * np.pi - last)
+    last = np.fmax.reduce(angle, axis=1)
+    widest = np.fmax.reduce(angle[:, 1:] - angle[:, :-1], axis=1)
+    gap = np.fmax(widest, angle[:, 0] + 2.0 * np.pi - last)
     inside[point[gap < np.pi]] = True
     return inside

@@ -216,9 +216,7 @@ def _promise(vote: Vote, patch: Side, target: Side, profile: AssociationProfile)
     return WORTH * len(vote.first) - profile.absent * absent
 
 
-def _absent(
-    grown: Grown, patch: Side, there: Side, profile: AssociationProfile
-) -> tuple[int, int]:
+def _absent(grown: Grown, patch: Side, there: Side, profile: AssociationProfile) -> tuple[int, int]:
     """Number of landmarks of either side that are not matched where the other side observed, and of
     those of them beside which it has none.
     """

@@ -20,6 +20,8 @@ REFINEMENTS = 4
 MOST_HYPOTHESES = 100_000
 OF_A_PART = 16
 """Number of a part's motions that are refined on all points."""
+MOST_COUNTED = 4_000_000
+"""Number of cells up to which votes are counted cell by cell."""
 MOST_DISTANCES = 2_000_000
 """Number of distances between points that are in memory at once."""
 
@@ -145,9 +147,9 @@ def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndar
         low = cells.min(axis=0, initial=0)
         size = cells.max(axis=0, initial=0) - low + 1
         code = ((cells[:, 0] - low[0]) * size[1] + cells[:, 1] - low[1]) * turns + angle
-        values, of, counts = np.unique(code, return_inverse=True, return_counts=True)
+        of, counts = _numbered(code, int(size[0] * size[1]) * turns)
         fullest = np.argsort(-counts, kind="stable")[:MOST_BINS]
-        rank = np.full(len(values), -1)
+        rank = np.full(len(counts), -1)
         rank[fullest] = np.arange(len(fullest))
         inside = rank[of] >= 0
         at, some = rank[of[inside]], motions[inside]
@@ -158,6 +160,21 @@ def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndar
         sine = np.bincount(at, elementwise.sin(some[:, 2]), len(fullest))
         peaks += list(np.column_stack([x, y, elementwise.atan2(sine, cosine)]))
     return peaks
+
+
+def _numbered(
+    codes: Int64[np.ndarray, " v"], beyond: int
+) -> tuple[Int64[np.ndarray, " v"], Int64[np.ndarray, " _"]]:
+    """For each code the rank of its value among the distinct ones, and how often each occurs.
+
+    beyond: all codes are smaller. Codes of a small range are counted, which is faster than sorting.
+    """
+    if beyond > MOST_COUNTED:
+        _, of, counts = np.unique(codes, return_inverse=True, return_counts=True)
+        return of, counts
+    counts = np.bincount(codes, minlength=1)
+    rank = np.cumsum(counts > 0) - 1
+    return rank[codes], counts[counts > 0]
 
 
 def _refined(

@@ -1,5 +1,6 @@
 import numpy as np
 
+from team.estimation.map_joining.association import voting
 from team.estimation.map_joining.association.voting import PointSet, moved, voted
 
 
@@ -31,3 +32,12 @@ def test_a_pattern_that_stands_twice_gives_two_alignments_of_equal_size():
 
 def test_two_maps_of_one_point_have_no_alignment():
     assert voted(_points(np.zeros((1, 2))), _points(np.zeros((5, 2))), 0.3, 15.0) == []
+
+
+def test_votes_are_counted_cell_by_cell_as_they_are_sorted() -> None:
+    codes = np.random.default_rng(0).integers(0, 900, 400)
+    counted, ordered = (
+        voting._numbered(codes, beyond) for beyond in (900, voting.MOST_COUNTED + 1)
+    )
+    for one, two in zip(counted, ordered, strict=True):
+        np.testing.assert_array_equal(one, two)
