@@ -8,7 +8,7 @@ likelihood. The sensors differ only in their noise; one parameter is varied at a
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -20,6 +20,9 @@ from sim.studies.experiments.drawing import figure, ruled
 from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.studies.experiments.task import Task
 from team.config import Estimator, FusionRule
+
+if TYPE_CHECKING:  # Matplotlib takes half a second to import
+    from matplotlib.figure import Figure
 
 SIZE_M, LANDMARKS, VIEW_M, STEPS = 60.0, 40, 12.0, 150
 SPACING_M = 0.5 * SIZE_M / LANDMARKS**0.5
@@ -206,23 +209,34 @@ def _means(runs: Sequence[dict[str, Any]]) -> dict[str, float | None]:
 
 def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> Picture:
     def draw(path: Path) -> None:
-        shown = [each for each in FIGURES if each[0] in ("f1", "duplicates", "rmse", "nees")]
-        made = figure(9.0, 6.0)
-        for axes, (name, heading, _) in zip(made.subplots(2, 2).flat, shown, strict=True):
-            for system, points in of_axis.items():
-                at = [(float(x), means[name]) for x, means in points.items()]
-                known = [(x, y) for x, y in at if y is not None]
-                if known:
-                    axes.plot(*zip(*known, strict=True), marker="o", markersize=3, label=system)
-            axes.set_xlabel(axis)
-            axes.set_title(heading, fontsize=10)
-            if axis == "spacing / noise":
-                axes.set_xscale("log")
-            if name in ("rmse", "nees"):
-                axes.set_yscale("log")
-            ruled(axes)
-        made.axes[0].legend(fontsize=8)
-        made.savefig(path, dpi=120)
+        drawn(axis, of_axis).savefig(path, dpi=120)
 
     file = "association-" + axis.replace(" / ", "-")
     return Picture(file, f"Association over {axis}.", draw)
+
+
+def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
+    """Six panels; a system has one colour in all of them, also where another one has no curve."""
+    shown = [each for each in FIGURES if each[0] not in ("wrong_percent", "gospa")]
+    made = figure(12.0, 6.0)
+    colours = {system.name: f"C{k}" for k, system in enumerate(SYSTEMS)}
+    curves = {}
+    for axes, (name, heading, _) in zip(made.subplots(2, 3).flat, shown, strict=True):
+        for system, points in of_axis.items():
+            at = [(float(x), means[name]) for x, means in points.items()]
+            known = [(x, y) for x, y in at if y is not None]
+            if known:
+                curves[system], *_ = axes.plot(
+                    *zip(*known, strict=True), marker="o", markersize=3, color=colours[system]
+                )
+        axes.set_xlabel(axis)
+        axes.set_title(heading, fontsize=10)
+        if axis == "spacing / noise":
+            axes.set_xscale("log")
+        if name in ("rmse", "nees"):
+            axes.set_yscale("log")
+        ruled(axes)
+    made.legend(
+        curves.values(), curves.keys(), fontsize=8, ncols=len(curves), loc="outside lower center"
+    )
+    return made

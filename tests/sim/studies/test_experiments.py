@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from sim.cli.main import app
 from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments import accuracy_few, accuracy_worlds
+from sim.studies.experiments import accuracy_few, accuracy_worlds, association
 from sim.studies.experiments.catalogue import ENTRIES, Entry
 from sim.studies.experiments.curves import curves_task
 from sim.studies.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
@@ -222,3 +222,28 @@ def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(
     figures = accuracy_few.few_figures([run])
     names = ("wrong", "silent", "beyond", "beyond_silent", "alarms")
     assert tuple(figures[name] for name in names) == (wrong, silent, beyond, untold, alarms)
+
+
+def test_a_system_has_one_colour_in_every_panel_of_the_pictures_of_association() -> None:
+    """With names there is no F1; its absence from a panel once shifted the colours of the rest."""
+    means: dict[str, float | None] = {name: 1.0 for name, *_ in association.FIGURES}
+    unscored = means | {"f1": None, "duplicates": None}
+    systems = [each.name for each in association.SYSTEMS]
+    of_axis = {
+        name: {"0": unscored if name == association.NAMED.name else means} for name in systems
+    }
+    made = association.drawn("clutter", of_axis)
+    (legend,) = made.legends
+    told = dict(
+        zip(
+            [text.get_text() for text in legend.get_texts()],
+            [line.get_color() for line in legend.get_lines()],
+            strict=True,
+        )
+    )
+    assert sorted(told) == sorted(systems)
+    assert len(set(told.values())) == len(systems)
+    for axes in made.axes:
+        colours = [line.get_color() for line in axes.get_lines() if len(line.get_xdata()) == 1]
+        missing = told[association.NAMED.name] if axes.get_title() in ("F1", "duplicates") else None
+        assert colours == [told[name] for name in systems if told[name] != missing]
