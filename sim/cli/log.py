@@ -139,7 +139,9 @@ def cut(
         fail(f"--from {from_s} --to {to_s}: give seconds, the first before the second", WRONG_USE)
     chosen = _channels(channels)
     refuse_existing(output)
-    typer.echo(f"{output}: {cut_log(open_log(log), output, from_s, to_s, chosen)} messages")
+    opened = open_log(log)
+    warn_of_holes(opened)
+    typer.echo(f"{output}: {cut_log(opened, output, from_s, to_s, chosen)} messages")
 
 
 @app.command()
@@ -154,6 +156,7 @@ def merge(
     refuse_existing(output)
     merged = merge_logs([open_log(log) for log in logs], output)
     typer.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
+    warn_of_holes(open_log(output))
 
 
 @app.command()

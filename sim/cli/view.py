@@ -20,6 +20,7 @@ from sim.cli.options import (
     fail,
     refuse_existing,
     scenario_of,
+    warn_of_holes,
 )
 
 if TYPE_CHECKING:
@@ -89,6 +90,8 @@ def view(
 
     if not follow or log.exists():
         opened = open_log(log)
+        if not follow:
+            warn_of_holes(opened)
         if export is not None or layout is not None:
             _write(opened, export, layout)
             return

@@ -3,6 +3,7 @@ cell.
 """
 
 import csv
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -20,6 +21,10 @@ SHOWN = 60
 """Letters of a faulty cell or line that an error shows."""
 LARGEST_NAME = 2**31 - 1
 """Landmarks with names have numbers up to this; the numbers beyond it are of those without."""
+
+
+NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
+"""A landmark's name as a text that ends in its number."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,23 @@ class CsvTable:
         return np.array(parsed, dtype=np.int64)
 
     def names(self, column: str) -> UInt32[np.ndarray, " rows"]:
-        """Landmarks' numbers; raises DatasetError."""
-        return np.array(self._parsed(column, _landmark), dtype=np.uint32)
+        """Landmarks' numbers; of texts with one beginning, as tag36h11:5, the numbers at their
+        ends. Raises DatasetError.
+        """
+        ends = [NAMED.fullmatch(cell) for cell in self.columns[column]]
+        named = [end for end in ends if end is not None]
+        if not named or len(named) < len(ends):
+            return np.array(self._parsed(column, _landmark), dtype=np.uint32)
+        for row, end in enumerate(named):
+            if end[1] != named[0][1]:
+                raise self.error(
+                    row,
+                    column,
+                    f"{end[0][:SHOWN]!r} and {named[0][0][:SHOWN]!r} begin differently, and the "
+                    "number at the end alone would count: give each landmark a number of its own",
+                )
+        bare = CsvTable(self.name, {column: [end[2] for end in named]}, self.lines)
+        return np.array(bare._parsed(column, _landmark), dtype=np.uint32)
 
     def rows(self, chosen: Iterable[bool]) -> "CsvTable":
         """The chosen rows."""
@@ -204,7 +224,10 @@ def _landmark(text: str) -> int:
     try:
         value = int(text.removesuffix(".0"))
     except ValueError:
-        raise ValueError(f"{text[:SHOWN]!r} is not a whole number") from None
+        raise ValueError(
+            f"{text[:SHOWN]!r} is not a whole number, nor are all rows texts that end in one, as "
+            "tag36h11:5"
+        ) from None
     if not 0 <= value <= LARGEST_NAME:
         raise ValueError(f"{value} is out of bounds: a landmark has a number from 0 to 2^31 - 1")
     return value

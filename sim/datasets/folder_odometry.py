@@ -20,6 +20,9 @@ from team.config import Bounds
 
 FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 LONG_GAP_NS = 2_000_000_000
+RESET_M, RESET_TIMES, USUAL_M_S, LEAST_STEPS = 0.5, 20.0, 0.25, 10
+"""A reset of odometry: least length [m], speed beside the usual one, which is taken to be as large
+at least [m/s], and the least number of steps of which the usual one is known."""
 WHIRLING_RAD_S = 2.0 * np.pi
 """A median yaw rate above this [rad/s] is probably not in radians."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0
@@ -54,6 +57,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     used = slice(None)
     if form == POSES:
         steps, ends, used = between(numbers), stamps[1:], slice(1, None)
+        steps = _without_resets(rows, numbers, steps, duration)
     elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
         steps, ends, used = numbers[:-1], stamps[1:], slice(0, -1)
     else:
@@ -74,6 +78,36 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     _judge_pace(rows, duration)
     _judge_speeds(rows, form, steps, duration)
     return intervals, rows.notes
+
+
+def _without_resets(
+    rows: Rows,
+    poses: Float[np.ndarray, "N 3"],
+    steps: Float[np.ndarray, "M 3"],
+    duration: Int64[np.ndarray, " M"],
+) -> Float[np.ndarray, "M 3"]:
+    """The motions; where the odometry was reset, or a row is wrong, the motion before goes on.
+
+    A step of RESET_M or more is a reset if it leads to the very first pose again, faster than any
+    usual step, or if it is RESET_TIMES as fast as nine steps of ten.
+    """
+    lengths, seconds = np.hypot(*steps[:, :2].T), duration * 1e-9
+    if len(steps) < LEAST_STEPS:
+        return steps
+    usual = max(float(np.quantile(lengths / seconds, 0.9)), USUAL_M_S)
+    home = (poses[1:] == poses[0]).all(axis=1) & (lengths > 2.0 * usual * seconds)
+    reset = (lengths > RESET_M) & (home | (lengths > RESET_TIMES * usual * seconds))
+    if not reset.any():
+        return steps
+    going = np.maximum.accumulate(np.where(reset, -1, np.arange(len(steps))))
+    before = np.maximum(going, 0)
+    rates = np.where(going[:, np.newaxis] < 0, 0.0, steps[before] / seconds[before, np.newaxis])
+    rows.note(
+        np.append(False, reset),
+        f"at which its pose jumps, by {lengths[reset].max():.1f} m at most: its odometry was reset "
+        "there, or the row is wrong; it is taken to have moved on as before",
+    )
+    return np.where(reset[:, np.newaxis], rates * seconds[:, np.newaxis], steps)
 
 
 def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray, "N 3 3"] | None:

@@ -23,7 +23,7 @@ from sim.scenarios.source import scenario_beside, streams_of, with_present_robot
 from sim.scenarios.toml import folder_scenario
 from sim.world.streams import StartPose, WorldStreams
 from team.recording.check import holes
-from team.recording.reader import open_log
+from team.recording.reader import LogError, open_log
 from team.ros2.bags import BagError, is_bag
 from team.ros2.topics import TopicsError, load_topics
 
@@ -191,7 +191,10 @@ def is_own_log(path: Path) -> bool:
 
 def _log(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:
     lacks = [f"{path} is not whole, {finding}" for finding in holes(open_log(path))]
-    return *measurements_in(path), lacks
+    try:
+        return *measurements_in(path), lacks
+    except LogError as error:
+        raise DatasetError("; ".join([*lacks, str(error)])) from None
 
 
 def _data_set(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:

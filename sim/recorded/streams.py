@@ -17,13 +17,15 @@ from sim.world.streams import (
     robot_stream,
 )
 from team import translate
-from team.recording.reader import open_log
+from team.recording.reader import LogError, open_log
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats, ids, stamps
 from team.wire.bus import opened
 
 CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.WORLD_CONFIG)
+
+PART = "`teamslam log cut LOG --from S --to S -o PART.mcap` makes a log of a part without that"
 
 
 def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
@@ -40,7 +42,10 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
         raise ScenarioError(f"{path}: the log does not say the world's scenario")
     scenario = loads(configurations[-1])
     clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
-    return recorded_streams(messages, path.name, clocks), scenario
+    try:
+        return recorded_streams(messages, path.name, clocks), scenario
+    except ValueError as error:
+        raise LogError(path, str(error), PART) from None
 
 
 def recorded_streams(

@@ -278,8 +278,12 @@ def robot_stream(
             f"{robot}: a measurement at {stamps.min()} ns is before its start, {start_ns}"
         )
     begins = intervals.end_ns - intervals.duration_ns
-    if np.any(begins[1:] != intervals.end_ns[:-1]):
-        raise ValueError(f"{robot}: odometry intervals are not contiguous in time")
+    for k in np.flatnonzero(begins[1:] != intervals.end_ns[:-1])[:1].tolist():
+        ends_s, begins_s = 1e-9 * intervals.end_ns[k], 1e-9 * begins[k + 1]
+        raise ValueError(
+            f"{robot}: odometry intervals are not contiguous in time: one ends at {ends_s:.3f} s, "
+            f"the next begins at {begins_s:.3f} s"
+        )
     order = np.lexsort((kinds, stamps))
     return RobotStream(
         robot=robot,

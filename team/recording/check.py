@@ -12,7 +12,7 @@ from team.recording.inventory import Inventory
 from team.recording.last_words import MISSING, LastWords
 from team.recording.reader import Log, LogError
 from team.recording.records import index_damage
-from team.recording.repair import salvaged
+from team.recording.repair import REPAIRED, salvaged
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -41,7 +41,7 @@ def checked(log: Log) -> list[Finding]:
     (`holes`). Memory: 16 bytes a message, and one chunk.
     """
     found = _of_file(log)
-    evidence = _Evidence(part=_noted(log, CUT))
+    evidence = _evidence(log)
     unsound: dict[str, tuple[int, str]] = {}
     for chunk in salvaged(log):
         if isinstance(chunk, LogError):
@@ -65,13 +65,14 @@ def checked(log: Log) -> list[Finding]:
 
 
 def holes(log: Log) -> list[Finding]:
-    """The messages that a log lacks or has twice; empty for a complete log.
+    """The messages that a log lacks or has twice, and whether its recorder finished it; empty for
+    a complete log.
 
     Liveliness and the recorder's own messages are not published on a counted key: their counters
     are ignored.
     """
-    evidence = _Evidence(part=_noted(log, CUT))
-    damaged = []
+    evidence = _evidence(log)
+    damaged = [] if log.complete else [Finding(FILE, UNFINISHED)]
     for chunk in salvaged(log):
         if isinstance(chunk, LogError):
             damaged.append(Finding(FILE, chunk.what))
@@ -83,9 +84,13 @@ def holes(log: Log) -> list[Finding]:
 
 @dataclass
 class _Evidence:
-    """The evidence about missing samples in the samples of a log."""
+    """The evidence about missing samples in the samples of a log.
+
+    part: it is a cut of another log. repaired: it was made of one that its recorder did not finish.
+    """
 
     part: bool
+    repaired: bool
     inventory: Inventory = field(default_factory=Inventory)
     counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
     tallies: dict[str, list[TallyCount]] = field(default_factory=lambda: defaultdict(list))
@@ -97,7 +102,7 @@ class _Evidence:
         self.counters[sample.key].take(sample)
         self.inventory.take(sample)
         row = ch.channel_of(sample.key)
-        if row is not None and row[0] in (ch.END, ch.HEAD, ch.ROBOT_HEAD, *_OF_AN_END):
+        if row is not None and row[0] in (ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ROBOT_DONE, *_FINAL):
             self.channels.add(row[0])
         if row is None or row[0] not in (ch.TALLY, ch.STATUS):
             return
@@ -130,10 +135,16 @@ class _Evidence:
                 part=self.part, numbered=numbered, tallies=counts
             ):
                 yield Finding(key, line + (DRAWN if ch.VIEW.owner(key) is not None else ""))
+        if self.repaired and not self.part and not self.channels & _FINAL:
+            yield Finding(FILE, NO_FINAL)
         if not self.part:
             for key, line in (*self.inventory.findings(), *self.last_words.findings()):
                 yield Finding(key, line)
-            if self.channels and not self.channels & {ch.END, ch.HEAD, ch.ROBOT_HEAD}:
+            if self.channels & set(_OF_AN_END) and not self.channels & {
+                ch.END,
+                ch.HEAD,
+                ch.ROBOT_HEAD,
+            }:
                 yield Finding(ch.END.key(), NO_END)
         for note in self.last_word:
             if note.startswith(MISSING):
@@ -141,18 +152,25 @@ class _Evidence:
 
 
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
-_OF_AN_END = (ch.ROBOT_DONE, ch.FINAL_MAP)
+_FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
+_OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
 """Channels whose publisher has received the end of the streams."""
 NO_END = "missing: how many measurements there were is not known"
+UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
+NO_FINAL = "repaired, and without a final map: what came after its recorder died is not in it"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
 
 
 def _of_file(log: Log) -> list[Finding]:
     if not log.complete:
-        return [Finding(FILE, "its recorder did not finish it; `teamslam repair` completes it")]
+        return [Finding(FILE, UNFINISHED)]
     with log.path.open("rb") as file:
         damage = index_damage(file)
     return [] if damage is None else [Finding(FILE, damage)]
+
+
+def _evidence(log: Log) -> _Evidence:
+    return _Evidence(part=_noted(log, CUT), repaired=_noted(log, REPAIRED))
 
 
 def _unsound(sample: Sample) -> str | None:

@@ -10,6 +10,9 @@ from team.recording.reader import Log, LogError, open_log
 from team.recording.recorder import Recorder
 from team.wire.bus import Sample
 
+REPAIRED = "repaired"
+"""Name of the metadata that marks a log as made of an unfinished one, and names that one."""
+
 
 class Report(NamedTuple):
     """The result of a repair: messages copied, newest team time among them [ns], chunks that were
@@ -34,13 +37,14 @@ def salvaged(log: Log) -> Iterator[list[Sample] | LogError]:
 def repaired(path: str | Path, out: str | Path) -> Report:
     """Copies every undamaged chunk of the log at `path` to a new, complete log `out`.
 
-    The metadata is copied. Raises `LogError` when `path` is no log, `RecorderError` when `out`
-    exists.
+    The metadata is copied; of a log that its recorder did not finish with a note. Raises `LogError`
+    when `path` is no log, `RecorderError` when `out` exists.
     """
     log = open_log(path)
     messages, until_ns = 0, None
     damaged: list[str] = []
-    with Recorder(out, log.team, log.metadata) as recorder:
+    note = {} if log.complete else {REPAIRED: log.path.name}
+    with Recorder(out, log.team, {**log.metadata, **note}) as recorder:
         for chunk in salvaged(log):
             if isinstance(chunk, LogError):
                 damaged.append(chunk.what)

@@ -247,7 +247,7 @@ def test_a_killed_recorders_log_is_read_and_repaired(path: Path, tmp_path: Path)
     assert report == (1_000, stream(500)[-1].stamp_ns, ())
     again = open_log(out)
     assert again.complete
-    assert (again.team, again.metadata) == ("t", {"seed": "7"})
+    assert (again.team, again.metadata) == ("t", {"seed": "7", "repaired": path.name})
     assert list(again.samples()) == stream(500)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,10 @@ _TAKEN = frozenset(
 )
 _ENDLESS_S = 1e9
 """Length [s] of the batch's only window."""
+
+
+JITTER_NS = 1_000_000
+"""Odometry intervals that are further apart have one missing between them."""
 
 
 class BatchReferenceError(RuntimeError):
@@ -139,6 +144,14 @@ def _chain(
     ]
     if not odometry:
         return None
+    for before, after in pairwise(odometry):
+        if abs(after.end_ns - after.duration_ns - before.end_ns) > JITTER_NS:
+            raise BatchReferenceError(
+                f"{config.id}: no odometry from {1e-9 * before.end_ns:.3f} to "
+                f"{1e-9 * (after.end_ns - after.duration_ns):.3f} s, so nothing links its poses: "
+                "`teamslam log cut LOG --from S --to S -o PART.mcap` makes a log of a part without "
+                "that"
+            )
     first_ns, last_ns = odometry[0].end_ns - odometry[0].duration_ns, odometry[-1].end_ns
     grid = _grid(config) if sightings else None
     segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)

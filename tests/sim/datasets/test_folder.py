@@ -434,3 +434,40 @@ def test_import_of_a_folder_without_measurements_makes_none(tmp_path: Path) -> N
     assert isinstance(done.exception, DatasetError)
     assert "neither odometry nor observations" in str(done.exception)
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("wrong", [(12, "0,0,0"), (12, "90,3,1"), (1, "0,-60,0")])
+def test_odometry_that_is_reset_or_has_a_wrong_row_goes_on_as_before(
+    tmp_path: Path, wrong: tuple[int, str]
+) -> None:
+    """Ten poses a second, half a metre a second ahead; from one on they begin at another pose."""
+    first, pose = wrong
+    rows = ["t_s,x_m,y_m,theta_rad"]
+    x, y, theta = (float(part) for part in pose.split(","))
+    for k in range(30):
+        if k < first or pose != "0,0,0":
+            rows.append(f"{k / 10:.1f},{k / 20:.6f},0,0")
+        else:
+            rows.append(f"{k / 10:.1f},{(k - first) / 20:.6f},0,0")
+    if pose != "0,0,0":
+        rows[first + 1] = f"{first / 10:.1f},{x},{y},{theta}"
+    stream = only(data_set(tmp_path, odometry="\n".join(rows) + "\n"))
+    assert stream.intervals.increments is not None
+    expected = np.tile([0.05, 0.0, 0.0], (29, 1))
+    if first == 1:
+        expected[:2] = 0.0  # nobody knows how it had moved before
+    np.testing.assert_allclose(stream.intervals.increments, expected, atol=1e-9)
+    assert "at which its pose jumps, by" in " ".join(stream.notes)
+
+
+def test_landmarks_whose_names_end_in_numbers_have_these(tmp_path: Path) -> None:
+    head = "t_s,landmark,range_m,bearing_rad\n"
+    named = head + "1,tag36h11:5,2,0\n1,tag36h11:12,3,0.5\n2,,,\n"
+    stream = only(data_set(tmp_path / "a", odometry=SPEEDS, observations=named))
+    assert sorted(stream.landmark_detections.ids.tolist()) == [5, 12]
+    for row, words in (
+        ("1,tag25h9:5,2,0\n", "line 5, column landmark: 'tag25h9:5' and 'tag36h11:5' begin"),
+        ("1,door,2,0\n", "'tag36h11:5' is not a whole number, nor are all rows texts that end"),
+    ):
+        with pytest.raises(DatasetError, match=words):
+            only(data_set(tmp_path / row[2:6], odometry=SPEEDS, observations=named + row))
