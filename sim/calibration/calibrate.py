@@ -10,8 +10,7 @@ comes from the ranges. Then only what ranges and bearings determine is learnt: t
 scales, drag and veer. The sensor's own figures stay, since a team can not observe the scale of its
 own range measurements.
 
-Of detections without identities the rates of clutter and of missed ones are learnt, too
-(`detections`); no label is looked at, except for the figures that are learnt against the truth.
+Of detections without identities clutter and misses are learnt (`detections`), without labels.
 
 How consistent the submaps' covariances are (`covariance_factor`, and the monitor's `normal_scale`
 with it) is learnt without the truth in both cases, from the maps of single robots (`consistency`).
@@ -99,7 +98,6 @@ def calibrated(
         each
         for _, world in worlds
         for stream in world.streams
-        if stream.landmark_detections.hidden is not None
         for each in windows_of(stream, config_of(stream.robot, scenario))
     ]
     if not windows:

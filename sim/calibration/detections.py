@@ -74,6 +74,8 @@ def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
     """The windows of a robot that have detections without identities; one without a solution is
     left out.
     """
+    if stream.landmark_detections.hidden is None:
+        return []
     front = config.front_end
     segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s)
     window_ns, start_ns = round(front.window_s * 1e9), None

@@ -91,9 +91,10 @@ def association_result(log: Collected) -> AssociationResult | None:
     if not labels:
         return None
     detections = list(_detections(log, labels))
-    identity = _identities(log) or _own_numbers(place for _, place, _ in detections)
+    places = [place for _, place, _ in detections]
+    # Without submaps a place's number is that of the estimator's own map.
+    identity = _identities(log) or {place: place[3] for place in places if place is not None}
     label = np.array([each[0] for each in detections], np.int64)
-    places = [each[1] for each in detections]
     windows = [each[2] for each in detections]
     local = _numbered(places)
     joined = _numbered([None if p is None else identity.get(p, p) for p in places])
@@ -112,7 +113,7 @@ def association_result(log: Collected) -> AssociationResult | None:
     right, wrong = _merges(label, places, identity)
     return AssociationResult(
         pairs=_pairs(label[known], joined[known]),
-        inside=_pairs(label[known], local[known], _windows(windows)[known]),
+        inside=_pairs(label[known], local[known], _numbered(windows)[known]),
         label_of=label_of,
         landmarks=len(label_of),
         duplicates=len(named) - len(set(named)),
@@ -213,21 +214,12 @@ def _identities(log: Collected) -> dict[Place, int]:
     return found
 
 
-def _own_numbers(places: Iterable[Place | None]) -> dict[Place, int]:
-    """The numbers of local landmarks in the map of an estimator without submaps."""
-    return {place: place[3] for place in places if place is not None}
-
-
 def _numbered(values: Sequence[object]) -> Int64[np.ndarray, " n"]:
     """Equal values have equal numbers from 0 on; None has −1."""
     numbers: dict[object, int] = {}
     return np.array(
         [-1 if v is None else numbers.setdefault(v, len(numbers)) for v in values], np.int64
     )
-
-
-def _windows(windows: list[tuple[str, int, int]]) -> Int64[np.ndarray, " n"]:
-    return _numbered(windows)
 
 
 def _pairs(
