@@ -39,7 +39,7 @@ run: $(VENV)/.runtime
 # tests/conftest.py says which worker gets what.
 test: $(VENV)/.dev
 	tests/get-chromium
-	$(BIN)/pytest --numprocesses 2
+	$(BIN)/pytest --numprocesses 3
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

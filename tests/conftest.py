@@ -1,6 +1,6 @@
 """What holds in every test run: one BLAS thread, checked shapes, repeatable examples.
 
-System tests run one by one, beside the others.
+Two workers run system tests one by one, beside the others.
 """
 
 import os
@@ -13,6 +13,7 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
+from xdist.workermanage import WorkerController
 
 import tests.kernels
 import tests.shapes
@@ -25,9 +26,11 @@ install_import_hook(["team", "central", "sim"], f"{tests.shapes.__name__}.checke
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
+def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before a test's own fixtures; those of a module are checked with its first test."""
     tests.shapes.begin_test()
+    if "PYTEST_XDIST_WORKER" in os.environ and not item.nodeid.startswith(SYSTEM):
+        os.setpriority(os.PRIO_PROCESS, 0, max(BESIDE, os.getpriority(os.PRIO_PROCESS, 0)))
 
 
 SYSTEM = "tests/system/"
@@ -41,10 +44,19 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     session.config.stash[tests.kernels.AT_IMPORT] = tests.kernels.called()
 
 
-FIRST = (SYSTEM, "tests/recording/", "tests/keys/", "tests/wire/")
-"""The tests that start processes come first, theirs is the longest share; then tests that need few
-kernels, so that in a fresh clone the first launch compiles them while nobody else does the same.
+LAUNCHED = tuple(f"{SYSTEM}test_{name}.py" for name in ("launch", "replay"))
+"""They look at the same launches, which are made once for the worker that runs both."""
+FIRST = (
+    *LAUNCHED, f"{SYSTEM}test_bad_input.py", SYSTEM,
+    "tests/recording/", "tests/keys/", "tests/wire/", "tests/sim/",
+)  # fmt: skip
+"""The tests that start processes come first, they take longest; of them first a launch, which in a
+fresh clone compiles the kernels, beside it those that need few; long ones are not last.
 """
+TEAMS = 2
+"""So many workers run tests of processes at a time; the third has what they leave of the time."""
+BESIDE = 5
+"""Niceness of the tests that start no processes: those of a team are punctual on a busy machine."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -57,13 +69,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class Shares(LoadScopeScheduling):
-    """A worker gets a file, whose tests share what is made for them, or all tests of processes.
+    """A worker gets a file, whose tests share what is made for them.
 
-    Those run one by one, so that they do not starve each other.
+    Files of tests/system go to the first TEAMS workers while there are others for the rest, so that
+    many teams do not starve each other. Much of their time they wait.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return SYSTEM if nodeid.startswith(SYSTEM) else nodeid.partition("::")[0]
+        file = nodeid.partition("::")[0]
+        return SYSTEM if file in LAUNCHED else file
+
+    def _assign_work_unit(self, node: WorkerController) -> None:
+        if list(self.registered_collections).index(node) >= TEAMS:
+            others = (each for each in self.workqueue if not each.startswith(SYSTEM))
+            if (other := next(others, None)) is not None:
+                self.workqueue.move_to_end(other, last=False)
+        super()._assign_work_unit(node)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -37,12 +37,15 @@ def checked(function: F) -> Callable[..., object]:
     """The function with its arguments and its result checked, as far as CALLS goes.
 
     jaxtyping calls it twice for a function: for what checks the arguments, and for what checks the
-    result with them.
+    result with them. The check is made at the first call: no worker calls every function.
     """
     name = (function.__module__, function.__qualname__)
-    check = beartype(function, conf=_CONFIGURATION)
+    check: Callable[..., object] | None = None
 
     def counted(*args: object, **kwargs: object) -> object:
+        nonlocal check
+        if check is None:
+            check = beartype(function, conf=_CONFIGURATION)
         _calls[name] += 1
         if _calls[name] == 2 * CALLS:
             _let_through(*name)

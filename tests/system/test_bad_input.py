@@ -13,9 +13,7 @@ import pytest
 from sim.datasets.utias_writer import write_utias
 from sim.scenarios.scenario import load
 from sim.scenarios.source import streams_of
-from team.recording.reader import open_log
 from tests.support import ROOT
-from tests.system.conftest import Launched
 from tests.system.processes import Process, Processes
 from tests.system.scenarios import short
 
@@ -208,24 +206,3 @@ async def test_what_is_no_log_is_told(
 ) -> None:
     (team.folder / "mine.mcap").write_bytes(content)
     assert f"mine.mcap: {what}" in await refused(team, *command, "mine.mcap")
-
-
-async def test_a_log_that_is_cut_is_replayed_and_reported_with_a_hint_and_completed_by_repair(
-    team: Processes, launched: Launched
-) -> None:
-    cut = team.folder / "cut.mcap"
-    whole = launched.log.read_bytes()
-    cut.write_bytes(whole[: len(whole) * 3 // 4])
-    hint = f"{cut} is cut: `teamslam repair {cut}"
-    replay = await team.start(
-        *("replay", cut, "--speed", "max", "--listen", "tcp/127.0.0.1:0", "--wait", "0")
-    )
-    assert await replay.ended() == 0, replay.said()
-    assert hint in replay.said()
-    report = await team.start("report", cut, "--output", "out", "--json", "figures.json")
-    assert await report.ended() == 0, report.said()
-    assert hint in report.said()
-    assert json.loads((team.folder / "figures.json").read_text())["complete"] is False
-    repair = await team.start("repair", cut, "--output", "fixed.mcap")
-    assert await repair.ended() == 0, repair.said()
-    assert open_log(team.folder / "fixed.mcap").complete

@@ -1,5 +1,6 @@
 """`teamslam replay`: a log's traffic again, into a program that knows nothing of us."""
 
+import json
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -88,3 +89,24 @@ async def test_a_replay_can_be_its_own_router_and_waits_for_who_listens(
         assert await replay.ended() == 0, replay.said()
         await until(lambda: len(arrived) >= len(expected), "all has arrived")
     assert arrived == expected
+
+
+async def test_a_log_that_is_cut_is_replayed_and_reported_with_a_hint_and_completed_by_repair(
+    team: Processes, launched: Launched
+) -> None:
+    cut = team.folder / "cut.mcap"
+    whole = launched.log.read_bytes()
+    cut.write_bytes(whole[: len(whole) * 3 // 4])
+    hint = f"{cut} is cut: `teamslam repair {cut}"
+    replay = await team.start(
+        *("replay", cut, "--speed", "max", "--listen", "tcp/127.0.0.1:0", "--wait", "0")
+    )
+    assert await replay.ended() == 0, replay.said()
+    assert hint in replay.said()
+    report = await team.start("report", cut, "--output", "out", "--json", "figures.json")
+    assert await report.ended() == 0, report.said()
+    assert hint in report.said()
+    assert json.loads((team.folder / "figures.json").read_text())["complete"] is False
+    repair = await team.start("repair", cut, "--output", "fixed.mcap")
+    assert await repair.ended() == 0, repair.said()
+    assert open_log(team.folder / "fixed.mcap").complete
