@@ -25,7 +25,7 @@ REMOVABLE = (
 
 
 def lend_kernels(sources: Path, folder: Path) -> None:
-    """Fill a folder with the compiled kernels of these sources, where NUMBA_CACHE_DIR names one for ours.
+    """Fill a folder with the kernels of these sources, where NUMBA_CACHE_DIR names one for ours.
 
     There they are found by the path of their sources; otherwise they lie beside them.
     """
