@@ -20,7 +20,7 @@ from team.wire.channels import Channel
 ROOT = Path(__file__).parents[1]
 
 
-def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0, what: str = "") -> None:
+def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0, what: str = "") -> None:
     """Return as soon as the condition holds; fail when it does not within the time."""
     wake = threading.Event()
     end = time.monotonic() + timeout_s
@@ -29,7 +29,7 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0, what: str
         wake.wait(0.002)
 
 
-def received(bus: Bus, count: int, timeout_s: float = 20.0) -> list[Sample]:
+def received(bus: Bus, count: int, timeout_s: float = 60.0) -> list[Sample]:
     """The first `count` samples or more; fails when fewer arrive within the time."""
     samples: list[Sample] = []
 
@@ -41,6 +41,14 @@ def received(bus: Bus, count: int, timeout_s: float = 20.0) -> list[Sample]:
     return samples
 
 
+@contextlib.contextmanager
+def nobody_listens() -> Iterator[str]:
+    """An endpoint that refuses all connections, and that nobody else on this machine can take."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        yield f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+
+
 class Link:
     """A TCP link to `endpoint` that a test can cut and mend."""
 
@@ -49,6 +57,7 @@ class Link:
         self._to = (host, int(port))
         self._open: list[socket.socket] = []
         self._whole = True
+        self._turn = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
@@ -63,12 +72,13 @@ class Link:
         self._listener.close()
 
     def cut(self) -> None:
-        self._whole = False
-        for connection in self._open:
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-            connection.close()
-        self._open.clear()
+        with self._turn:
+            self._whole = False
+            for connection in self._open:
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+                connection.close()
+            self._open.clear()
 
     def mend(self) -> None:
         self._whole = True
@@ -77,13 +87,20 @@ class Link:
         with contextlib.suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
-                if not self._whole:
-                    near.close()
-                    continue
-                far = socket.create_connection(self._to)
-                self._open += [near, far]
-                for pair in ((near, far), (far, near)):
-                    threading.Thread(target=_pump, args=pair, daemon=True).start()
+                with self._turn:
+                    self._join(near)
+
+    def _join(self, near: socket.socket) -> None:
+        try:
+            if not self._whole:
+                raise ConnectionError
+            far = socket.create_connection(self._to)
+        except OSError:  # cut, or nobody listens now: the next one may come through
+            near.close()
+            return
+        self._open += [near, far]
+        for pair in ((near, far), (far, near)):
+            threading.Thread(target=_pump, args=pair, daemon=True).start()
 
 
 def _pump(source: socket.socket, sink: socket.socket) -> None:

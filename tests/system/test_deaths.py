@@ -51,8 +51,7 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: 
         assert Path(f"/proc/{pid}/fd/0").readlink() == Path(os.devnull)
         os.kill(pid, signal.SIGKILL)
         killed.append(f"{'-'.join(words)} (pid {pid}) was ended by SIGKILL: it is started again")
-        await until(lambda text=killed[-1]: text in launch.said(), killed[-1], 20.0)  # type: ignore[misc]
-        await until(lambda old=pid, of=words: old != other(team, of), "it lives again", 20.0)  # type: ignore[misc]
+        await until(lambda text=killed[-1]: text in launch.said(), killed[-1])  # type: ignore[misc]
     assert await launch.ended(120.0) == 0, launch.said()
     await team.none_left(0.0)
     assert "Traceback" not in launch.said()
@@ -82,10 +81,12 @@ async def test_a_recorder_that_is_killed_goes_on_and_what_it_had_reads_and_can_b
 ) -> None:
     launch, folder = await launched(team)
     path = folder / "log.mcap"
-    await until(lambda: submaps_in(path) > 0, "the recorder flushes", 10.0)
+    await until(lambda: submaps_in(path) > 0, "the recorder flushes")
     os.kill(await team.pid("template"), signal.SIGKILL)  # then it starts from scratch
+    launch.signal(signal.SIGSTOP)  # what starts again must not write before it is looked at
     os.kill(await team.pid("record"), signal.SIGKILL)
     cut = open_log(Path(shutil.copy(path, team.folder / "cut.mcap")))
+    launch.signal(signal.SIGCONT)
     assert not cut.complete
     assert submaps_in(cut.path) > 0
     assert await launch.ended(120.0) == 0, launch.said()
@@ -116,12 +117,12 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
     await endpoint_of(folder)
     pids = set[int]()
     for _ in range(FRUITLESS):
-        await until(lambda: other(team, ("robot", "r1")) not in (None, *pids), "r1", 30.0)
+        await until(lambda: other(team, ("robot", "r1")) not in (None, *pids), "r1")
         pid = other(team, ("robot", "r1"))
         assert pid is not None
         pids.add(pid)
         os.kill(pid, signal.SIGKILL)
-    assert await launch.ended(60.0) == 1
+    assert await launch.ended() == 1
     await team.none_left(0.0)
     result = json.loads((team.folder / "result.json").read_text())
     assert result["given_up"] == ["robot-r1"]
@@ -168,7 +169,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
 ) -> None:
     launch, folder = await launched(team)
     launch.signal(number)
-    assert await launch.ended(20.0) == 1
+    assert await launch.ended() == 1
     await team.none_left(0.0)
     assert "interrupted: every process of the team was ended" in launch.said()
     assert f"{folder / 'log.mcap'} holds what was recorded" in launch.said()
@@ -182,5 +183,5 @@ async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> N
     assert len(team.alive()) == 9, "the launch, its template, and seven that are forked from it"
     launch.signal(signal.SIGKILL)
     assert await launch.ended() == -signal.SIGKILL
-    await team.none_left(5.0)
+    await team.none_left()
     assert list(open_log(folder / "log.mcap").samples())

@@ -47,7 +47,7 @@ class Centre(threading.Thread):
 
 def ordered(monkeypatch: pytest.MonkeyPatch, robot: str = "r3", **answer: object) -> Centre:
     """An order that is given; one that is answered may take its time, the others are given up."""
-    monkeypatch.setattr(orders, "CENTRE_S", 30.0 if robot == "r3" else 1.0)
+    monkeypatch.setattr(orders, "CENTRE_S", 30.0 if robot == "r3" else 2.0)
     network = MemoryNetwork()
     reply = msgspec.structs.replace(FUSED, **answer) if answer else None
     centre = Centre(network, reply)
@@ -120,7 +120,7 @@ def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(
     thread.start()
     try:
         give_up(MemoryBus(network), "r3", "it fell into the water", 30.0)
-        monkeypatch.setattr(orders, "CENTRE_S", 0.2)
+        monkeypatch.setattr(orders, "CENTRE_S", 2.0)
         with pytest.raises(WithdrawError, match="the team has no robot r9; its robots: r3"):
             give_up(MemoryBus(network), "r9", "", 1.0)
     finally:
