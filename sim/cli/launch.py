@@ -207,8 +207,8 @@ def _keep_showing(url: str, log: Path) -> None:
     """Keep the page until the user ends the command."""
     from team.shell import process
 
-    typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
-    with process("launch", endless=True) as stop:
+    with process("launch", endless=True) as stop:  # who reads of Ctrl-C may press it at once
+        typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
         stop.wait()
 
 

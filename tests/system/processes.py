@@ -23,7 +23,7 @@ PROGRAM = (sys.executable, "-P", "-m", "sim")
 _PROC = Path("/proc")
 
 
-async def until(condition: Callable[[], object], what: str, timeout_s: float = 60.0) -> None:
+async def until(condition: Callable[[], object], what: str, timeout_s: float = 180.0) -> None:
     """Return as soon as the condition holds; fail when it does not within the time."""
     end = time.monotonic() + timeout_s
     while not condition():
@@ -59,7 +59,7 @@ class Process:
         await until(lambda: text in self.said() or self.exit is not None, f"{self.name}: {text}")
         assert text in self.said(), f"{self.name} ended with {self.exit}:\n{self.said()}"
 
-    async def ended(self, timeout_s: float = 90.0) -> int:
+    async def ended(self, timeout_s: float = 300.0) -> int:
         """Its exit status, once it has ended by itself."""
         try:
             return await asyncio.wait_for(self._process.wait(), timeout_s)

@@ -52,7 +52,7 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: 
         os.kill(pid, signal.SIGKILL)
         killed.append(f"{'-'.join(words)} (pid {pid}) was ended by SIGKILL: it is started again")
         await until(lambda text=killed[-1]: text in launch.said(), killed[-1])  # type: ignore[misc]
-    assert await launch.ended(120.0) == 0, launch.said()
+    assert await launch.ended() == 0, launch.said()
     await team.none_left(0.0)
     assert "Traceback" not in launch.said()
     result = json.loads((team.folder / "result.json").read_text())
@@ -89,7 +89,7 @@ async def test_a_recorder_that_is_killed_goes_on_and_what_it_had_reads_and_can_b
     launch.signal(signal.SIGCONT)
     assert not cut.complete
     assert submaps_in(cut.path) > 0
-    assert await launch.ended(120.0) == 0, launch.said()
+    assert await launch.ended() == 0, launch.said()
     await team.none_left(0.0)
     assert "was ended by SIGKILL: it is started again" in launch.said()
     samples = open_log(path).samples([ch.FINAL_MAP])
@@ -153,7 +153,7 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
         await seen.sees(1, ch.SUBMAP, "r1")
     pid = await team.pid("world")
     os.kill(pid, signal.SIGSTOP)
-    assert await launch.ended(120.0) == 0, launch.said()
+    assert await launch.ended() == 0, launch.said()
     await team.none_left(0.0)
     assert f"world (pid {pid}) is stopped (SIGSTOP?) and has said nothing for" in launch.said()
     assert json.loads((team.folder / "result.json").read_text())["restarts"] == {"world": 1}
