@@ -47,6 +47,7 @@ REASONS = {
     "team/estimation/baselines/batch.py": "the batch estimate; baseline",
     "team/estimation/baselines/batch_factors.py": "its residuals and their places; baseline",
     "central/tick_fold.py": "one fold by ticks, with its way back",
+    "central/desk/evaluation/association.py": "one score, from the counts to what a map shows",
     "central/desk/evaluation/evaluation.py": "a log's figures, one record a section",
     "central/desk/report/page.py": "one page, section after section",
     "central/desk/pictures/run.py": "a run's pictures, one a function",
