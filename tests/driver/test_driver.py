@@ -260,7 +260,7 @@ class Listener:
         wanted = m.MeasurementsRequest(
             stamp_ns=0, robot="r1", incarnation=1, first=first, last=last
         )
-        for reply in self.bus.ask(ch.MEASUREMENTS, "r1", wanted, 5.0):
+        for reply in self.bus.ask(ch.MEASUREMENTS, "r1", wanted, 30.0):
             self.take(reply)
 
     def say(self):
@@ -343,8 +343,9 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
 
         def complete():
             robot.look()
-            robot.say()
-            return len(robot.got) == driver._journal.count(1)
+            robot.say()  # that it is done, once it has all and has heard that this is the end
+            whole = len(robot.got) == driver._journal.count(1)
+            return whole and robot.heads[-1].state == "ended"
 
         with driver._lock:
             driver._journal.mark("ended")

@@ -63,7 +63,7 @@ def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path: Pat
         part = part_of(path, 2)
         team.says(10)
         team.ends(lambda: logged(part, c.ODOMETRY) == 120 and logged(part, c.OWN_POSE) == 7)
-        thread.join(20.0)
+        thread.join(60.0)
         second.close()
     assert parts_of(path) == [path, part]
     assert join(path) == [path]

@@ -156,7 +156,7 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path: Path, endp
         wait_until(lambda: any(one.key == "central/final" for one in open_log(path).samples()))
         assert thread.is_alive()
         team.close()
-        thread.join(20.0)
+        thread.join(60.0)
     assert not thread.is_alive()
     log = open_log(path)
     assert log.complete
@@ -244,7 +244,7 @@ def test_what_is_said_while_the_recorder_is_cut_off_is_in_the_log(
         link.mend()
         team.says(20)
         team.ends(lambda: logged(path, c.ODOMETRY) == 420 and logged(path, c.OWN_POSE) == 42)
-        thread.join(20.0)
+        thread.join(60.0)
     log = open_log(path)
     samples = list(log.samples())
     assert sorted(messages_of(samples, c.ODOMETRY), key=lambda x: x.stamp_ns) == team.published

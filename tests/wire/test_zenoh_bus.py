@@ -375,7 +375,7 @@ def test_close_wakes_a_receiver_and_ends_the_bus(endpoint: str) -> None:
     thread = threading.Thread(target=lambda: got.append(bus.receive(60.0)))
     thread.start()
     bus.close()
-    thread.join(10.0)
+    thread.join(60.0)
     bus.close()
     assert not thread.is_alive()
     for act in (bus.receive, lambda: bus.subscribe(c.SUBMAP), lambda: bus.publish(progress(0))):
