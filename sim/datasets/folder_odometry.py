@@ -17,12 +17,10 @@ from sim.datasets.folder_tables import (
 from sim.datasets.utias_rows import on_circle
 from sim.world.streams import Intervals, moved
 from team.config import Bounds
+from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
 LONG_GAP_NS = 2_000_000_000
-RESET_M, RESET_TIMES, USUAL_M_S, LEAST_STEPS = 0.5, 20.0, 0.25, 10
-"""A reset of odometry: least length [m], speed beside the usual one, which is taken to be as large
-at least [m/s], and the least number of steps of which the usual one is known."""
 WHIRLING_RAD_S = 2.0 * np.pi
 """A median yaw rate above this [rad/s] is probably not in radians."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0

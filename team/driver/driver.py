@@ -207,7 +207,7 @@ class Driver:
             if lasts_ns is not None and before is None:  # by speeds before, or a stream anew
                 self._begin_anew(stamp_ns - lasts_ns, stamp_ns)
             elif lasts_ns is not None and before is not None:
-                step = between(before, pose)
+                step = self._going_on(between(before, pose), lasts_ns, stamp_ns, pose)
                 self._odometer.judge(step, lasts_ns, "odometry_pose", stamp_ns)
                 told = self._increment(stamp_ns, lasts_ns, step, covariance)
             if not self._incarnation:
@@ -441,6 +441,17 @@ class Driver:
         )
         self._begin(stamp_ns, known=False)
         self._odometer = Odometer(self.robot, self._bounds)
+
+    def _going_on(self, step: Pose, lasts_ns: int, stamp_ns: int, pose: Pose) -> Pose:
+        """The motion between two odometry poses; the one before goes on where they were reset."""
+        if not self._odometer.was_reset(step, lasts_ns, pose):
+            return step
+        self._warn(
+            f"reset{stamp_ns}",
+            f"{self.robot}: the odometry's pose jumps by {np.hypot(*step[:2]):.1f} m at "
+            f"{1e-9 * stamp_ns:.3f} s: it was reset, and is taken to have moved on as before",
+        )
+        return self._odometer.as_before(lasts_ns)
 
     def _head(self, stamp_ns: int) -> dict[str, Any]:
         """The fields that every measurement has; incarnation and number are set when it is

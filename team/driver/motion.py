@@ -6,6 +6,7 @@ import numpy as np
 
 from team.config import Bounds
 from team.driver.measured import MeasurementError, wrapped
+from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 TOLERANCE = 0.1
 """An interval's start may differ from the last one's end by this share of it (clock jitter)."""
@@ -22,7 +23,9 @@ class Odometer:
     """The odometry so far: the end of its last interval, and the odometry pose there if given.
 
     speeds: of the last interval, ahead [m/s] and turning [rad/s]. gap_ns: time before
-    the last interval that no odometry covers, beyond clock jitter; 0: none.
+    the last interval that no odometry covers, beyond clock jitter; 0: none. home: the first pose.
+    steps, fastest: the number of intervals and their highest speed [m/s]. rates: of the last one,
+    (ahead, left, turn) per second.
     """
 
     robot: str
@@ -31,6 +34,10 @@ class Odometer:
     pose: Pose | None = None
     speeds: tuple[float, float] = (0.0, 0.0)
     gap_ns: int = field(default=0, init=False)
+    home: Pose | None = field(default=None, init=False)
+    steps: int = field(default=0, init=False)
+    fastest: float = field(default=0.0, init=False)
+    rates: Pose = field(default=(0.0, 0.0, 0.0), init=False)
 
     def until(self, stamp_ns: int, duration_ns: int | None, call: str) -> int | None:
         """How long an interval is that ends now; None for a first one that does not say it.
@@ -79,8 +86,27 @@ class Odometer:
     def taken(self, stamp_ns: int, step: Pose, duration_ns: int, pose: Pose | None) -> None:
         """Note that the interval has been written to the file."""
         self.end_ns, self.pose = stamp_ns, pose
+        self.home = self.home or pose
         if duration_ns:
+            seconds = duration_ns * 1e-9
+            self.rates = step[0] / seconds, step[1] / seconds, step[2] / seconds
+            self.steps += 1
+            self.fastest = max(self.fastest, float(np.hypot(*step[:2])) / seconds)
             self.speeds = step[0] * 1e9 / duration_ns, step[2] * 1e9 / duration_ns
+
+    def was_reset(self, step: Pose, duration_ns: int, pose: Pose) -> bool:
+        """Whether odometry poses begin anew: the first pose again, faster than the robot ever was,
+        or a step that is RESET_TIMES as fast.
+        """
+        way, usual_m = float(np.hypot(*step[:2])), max(self.fastest, USUAL_M_S) * duration_ns * 1e-9
+        home = pose == self.home and way > 2.0 * usual_m
+        known = self.steps >= LEAST_STEPS and way > RESET_M
+        return known and (home or way > RESET_TIMES * usual_m)
+
+    def as_before(self, duration_ns: int) -> Pose:
+        """The motion of an interval at the rates of the one before."""
+        seconds = duration_ns * 1e-9
+        return self.rates[0] * seconds, self.rates[1] * seconds, self.rates[2] * seconds
 
     def bridge(self) -> tuple[Pose, list[float]]:
         """The motion over the gap at the last speeds, with a large covariance.

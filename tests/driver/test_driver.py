@@ -183,6 +183,20 @@ def test_a_short_gap_is_bridged_by_a_motion_of_which_little_is_known(alone):
     assert (again.incarnation, again.stamp_ns, again.duration_ns) == (1, 4 * S + 800_000_000, 3 * S)
 
 
+@pytest.mark.parametrize("back", [(0.0, 0.0, 0.0), (70.0, 0.0, 1.0)])
+def test_poses_that_begin_anew_are_no_motion_and_the_one_before_goes_on(alone, back):
+    robot = alone()
+    for k in range(20):
+        robot.odometry_pose(Decimal(k) / 10, 0.05 * k, 0.0, 0.0)
+    with pytest.warns(DriverWarning, match=r"odometry's pose jumps by [0-9.]+ m at 2\.000 s: it w"):
+        robot.odometry_pose(2.0, *back)
+    robot.odometry_pose(2.1, back[0], back[1], back[2] + 0.01)
+    *_, before, at, after = messages(robot)
+    steps = [floats(each.increment, "increment").tolist() for each in (before, at, after)]
+    assert steps[0] == pytest.approx(steps[1])
+    assert steps[2] == pytest.approx([0.0, 0.0, 0.01])
+
+
 def drive(robot, ticks, *, poses=False):
     for k in ticks:
         t = Decimal(k) / 10
