@@ -15,6 +15,7 @@ from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import fastslam_kernel
+from team.estimation.hybrid_slam.blocks import measured
 from team.estimation.models import Increment, variances
 from team.estimation.scans import Own, unclaimed
 
@@ -186,9 +187,7 @@ def filter_step(
         known,
         slots,
         first,
-        np.column_stack((ranges, bearings)),
-        variances(sensor),
-        unclaimed(len(ids)) if own is None else own,
+        measured(ranges, bearings, variances(sensor), unclaimed(len(ids)) if own is None else own),
         proposal == "fastslam2",
         poses,
         log_weights,

@@ -1,4 +1,4 @@
-"""Compiled kernel of the FastSLAM step of all particles.
+"""Compiled kernel of the FastSLAM step of all particles, sixteen at once (`blocks`).
 
 Arrays by particle: poses (M, 3), landmark means (M, L, 2), landmark covariances as (xx, xy, yy) in
 (M, L, 3). The kernel writes into arrays that its caller has just allocated.
@@ -11,16 +11,57 @@ from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled, inlined
-from team.estimation.geometry import swept, wrapped
-from team.estimation.hybrid_slam.landmark_kernel import (
-    Triple,
-    condition_on_measurement,
-    innovation_of,
-    place,
-    seen,
+from team.estimation.geometry import wrapped
+from team.estimation.hybrid_slam.blocks import (
+    ACROSS,
+    ALONG,
+    BB,
+    BOTH,
+    COSINE,
+    COSINE_READ,
+    DISTANCE,
+    EX,
+    EY,
+    HEADING,
+    LANES,
+    MEAN_X,
+    MEAN_Y,
+    OF_BEARING,
+    OF_RANGE,
+    OWN,
+    RB,
+    READ,
+    RR,
+    SINE,
+    SINE_READ,
+    XX,
+    XY,
+    YY,
+    Block,
+    Measured,
+    U,
+    V,
+    X,
+    Y,
+    drive,
+    load_landmark,
+    load_poses,
+    predict,
 )
+from team.estimation.hybrid_slam.landmark_kernel import Triple
+from team.estimation.models import NEAREST_M
 
 Ids = UInt32[np.ndarray, " L"]
+Square = tuple[float, float, float, float, float, float, float, float, float]
+
+(
+    # The pose at the mean of the motion, its heading by sine and cosine.
+    AT_X, AT_Y, AT_HEADING, AT_SINE, AT_COSINE,
+    # Mean m and root A of the motion's noise, and the normal numbers of its draw.
+    M0, M1, M2, A00, A01, A02, A10, A11, A12, A20, A21, A22, N0, N1, N2,
+    LOG_WEIGHT,
+    END,
+) = range(OWN, OWN + 22 * LANES, LANES)  # fmt: skip
 
 
 @compiled
@@ -47,10 +88,7 @@ def slots_of(
     return ids[:count].copy(), slots, first
 
 
-WEAKEST = 1e-150
-"""The logarithm of a product of densities is taken when the product is below this, or above its
-inverse.
-"""
+LOG_2_PI = elementary.log(2.0 * math.pi)
 SMALLEST_VARIANCE = 1e-200
 """A variance of motion below this is taken as zero [m², rad²]."""
 
@@ -81,93 +119,213 @@ def semidefinite_factor(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarra
     return L
 
 
-@inlined
-def _moved(pose: Triple, s: float, c: float, forward: float, left: float, turn: float) -> Triple:
-    """The pose after (forward, left, turn), given in it; s, c are of its heading."""
-    return (
-        pose[0] + c * forward - s * left,
-        pose[1] + s * forward + c * left,
-        wrapped(pose[2] + turn),
-    )
+@compiled
+def _begin(
+    block: Block,
+    start: Float[np.ndarray, "M 3"],
+    motion: Float[np.ndarray, "3"],
+    normals: Float[np.ndarray, "M 3"],
+    begin: int,
+) -> None:
+    """The particles from `begin` on at start ∘ motion; the noise is N(0, I)."""
+    load_poses(block, start, begin)
+    drive(block, motion)
+    last = len(start) - 1
+    for j in range(LANES):
+        i = min(begin + j, last)
+        block[N0 + j], block[N1 + j], block[N2 + j] = normals[i, 0], normals[i, 1], normals[i, 2]
+    for j in range(LANES):
+        block[AT_X + j], block[AT_Y + j] = block[X + j], block[Y + j]
+        block[AT_HEADING + j] = block[HEADING + j]
+        block[AT_SINE + j], block[AT_COSINE + j] = block[SINE + j], block[COSINE + j]
+        block[M0 + j], block[M1 + j], block[M2 + j] = 0.0, 0.0, 0.0
+        block[A00 + j], block[A01 + j], block[A02 + j] = 1.0, 0.0, 0.0
+        block[A10 + j], block[A11 + j], block[A12 + j] = 0.0, 1.0, 0.0
+        block[A20 + j], block[A21 + j], block[A22 + j] = 0.0, 0.0, 1.0
+        block[LOG_WEIGHT + j] = 0.0
+
+
+@compiled
+def _move_by_noise(block: Block, L: Float[np.ndarray, "3 3"]) -> None:
+    """The poses after Exp(L m), of the mean m of the noise (`geometry.swept`)."""
+    l00, l10, l11, l20, l21, l22 = L[0, 0], L[1, 0], L[1, 1], L[2, 0], L[2, 1], L[2, 2]
+    for j in range(LANES):
+        m0, m1, m2 = block[M0 + j], block[M1 + j], block[M2 + j]
+        forward, left, turn = l00 * m0, l10 * m0 + l11 * m1, l20 * m0 + l21 * m1 + l22 * m2
+        turn = min(max(turn, -elementary.FARTHEST), elementary.FARTHEST)
+        of_turn, by_turn = elementary.sin_and_cos_near(turn)
+        small, square = abs(turn) < 1e-4, turn * turn
+        per = 1.0 / (1.0 if small else turn)
+        along = 1.0 - square * (1.0 / 6.0) if small else of_turn * per
+        across = turn * (0.5 - square * (1.0 / 24.0)) if small else (1.0 - by_turn) * per
+        forward, left = along * forward - across * left, across * forward + along * left
+        s, c = block[AT_SINE + j], block[AT_COSINE + j]
+        block[X + j] = block[AT_X + j] + c * forward - s * left
+        block[Y + j] = block[AT_Y + j] + s * forward + c * left
+        block[HEADING + j] = wrapped(block[AT_HEADING + j] + turn)
+        block[SINE + j], block[COSINE + j] = s * by_turn + c * of_turn, c * by_turn - s * of_turn
 
 
 @inlined
-def _moved_by_noise(
-    pose: Triple, s: float, c: float, L: Float[np.ndarray, "3 3"], noise: Triple
-) -> Triple:
-    """The pose after Exp(L ε), for a lower triangular L; s, c are of its heading."""
-    turn = L[2, 0] * noise[0] + L[2, 1] * noise[1] + L[2, 2] * noise[2]
-    x, y = swept(L[0, 0] * noise[0], L[1, 0] * noise[0] + L[1, 1] * noise[1], turn)
-    return _moved(pose, s, c, x, y, turn)
+def _conditioned(
+    mean: Triple, root: Square, row: Triple, innovation: float, variance: float
+) -> tuple[Triple, Square, float]:
+    """N(m, A Aᵀ) given row·ε + v = row·m + innovation, v ~ N(0, variance): m, A and a quotient.
 
-
-@inlined
-def _condition_noise(
-    noise_mean: Float[np.ndarray, "3"],
-    root: Float[np.ndarray, "3 3"],
-    row: Triple,
-    innovation: float,
-    variance: float,
-) -> float:
-    """N(m, A Aᵀ) given row·ε + v = row·m + innovation, v ~ N(0, variance); in place.
-
-    Potter's square-root update: the covariance can not lose its sign. Returns by what |det A|² is
-    multiplied. Maybeck 1979, section 7.3.
+    Potter's square-root update: the covariance can not lose its sign. The quotient is that by which
+    |det A|² is multiplied. Maybeck 1979, section 7.3.
     """
-    phi0 = root[0, 0] * row[0] + root[1, 0] * row[1] + root[2, 0] * row[2]
-    phi1 = root[0, 1] * row[0] + root[1, 1] * row[1] + root[2, 1] * row[2]
-    phi2 = root[0, 2] * row[0] + root[1, 2] * row[1] + root[2, 2] * row[2]
-    total: float = phi0 * phi0 + phi1 * phi1 + phi2 * phi2 + variance
-    share = 1.0 / (1.0 + math.sqrt(variance / total))
-    for i in range(3):
-        gain = (root[i, 0] * phi0 + root[i, 1] * phi1 + root[i, 2] * phi2) / total
-        noise_mean[i] += gain * innovation
-        root[i, 0] -= share * gain * phi0
-        root[i, 1] -= share * gain * phi1
-        root[i, 2] -= share * gain * phi2
-    return variance / total
+    a00, a01, a02, a10, a11, a12, a20, a21, a22 = root
+    p0 = a00 * row[0] + a10 * row[1] + a20 * row[2]
+    p1 = a01 * row[0] + a11 * row[1] + a21 * row[2]
+    p2 = a02 * row[0] + a12 * row[1] + a22 * row[2]
+    total = p0 * p0 + p1 * p1 + p2 * p2 + variance
+    per = 1.0 / total
+    left = variance * per
+    share = 1.0 / (1.0 + math.sqrt(left))
+    g0 = (a00 * p0 + a01 * p1 + a02 * p2) * per
+    g1 = (a10 * p0 + a11 * p1 + a12 * p2) * per
+    g2 = (a20 * p0 + a21 * p1 + a22 * p2) * per
+    mean = mean[0] + g0 * innovation, mean[1] + g1 * innovation, mean[2] + g2 * innovation
+    g0, g1, g2 = share * g0, share * g1, share * g2
+    root = (
+        a00 - g0 * p0, a01 - g0 * p1, a02 - g0 * p2,
+        a10 - g1 * p0, a11 - g1 * p1, a12 - g1 * p2,
+        a20 - g2 * p0, a21 - g2 * p1, a22 - g2 * p2,
+    )  # fmt: skip
+    return mean, root, left
+
+
+@compiled
+def _condition_noise(block: Block, L: Float[np.ndarray, "3 3"]) -> None:
+    """The motion's noise ε given what was predicted of one known landmark at ε = m, in place.
+
+    There z = h + H L (ε − m) + v with the joint covariance S = Hₗ Σ Hₗᵀ + R of v. The range is
+    taken first, then the bearing less its regression on the range, so each is scalar. The logarithm
+    of |det A| is added to that of the weight.
+    """
+    l00, l10, l11, l20, l21, l22 = L[0, 0], L[1, 0], L[1, 1], L[2, 0], L[2, 1], L[2, 2]
+    for j in range(LANES):
+        ex, ey, per = block[EX + j], block[EY + j], 1.0 / block[DISTANCE + j]
+        xx, xy, yy = block[XX + j], block[XY + j], block[YY + j]
+        S_rr = xx * ex * ex + 2.0 * xy * ex * ey + yy * ey * ey + block[RR + j]
+        S_rb = (xy * (ex * ex - ey * ey) + (yy - xx) * ex * ey) * per + block[RB + j]
+        S_bb = (xx * ey * ey - 2.0 * xy * ex * ey + yy * ex * ex) * (per * per) + block[BB + j]
+        slope = S_rb / S_rr
+        u, v = block[U + j], block[V + j]
+        r0, r1 = -u * l00 - v * l10, -v * l11
+        b0 = (v * l00 - u * l10) * per - l20 - slope * r0
+        b1, b2 = -u * l11 * per - l21 - slope * r1, -l22
+        m0, m1, m2 = block[M0 + j], block[M1 + j], block[M2 + j]
+        root = (
+            block[A00 + j], block[A01 + j], block[A02 + j],
+            block[A10 + j], block[A11 + j], block[A12 + j],
+            block[A20 + j], block[A21 + j], block[A22 + j],
+        )  # fmt: skip
+        of_range = block[OF_RANGE + j]
+        of_bearing = block[OF_BEARING + j] - slope * of_range
+        mean, root, left = _conditioned((m0, m1, m2), root, (r0, r1, 0.0), of_range, S_rr)
+        of_bearing -= b0 * (mean[0] - m0) + b1 * (mean[1] - m1) + b2 * (mean[2] - m2)
+        mean, root, lower = _conditioned(mean, root, (b0, b1, b2), of_bearing, S_bb - slope * S_rb)
+        block[M0 + j], block[M1 + j], block[M2 + j] = mean
+        block[A00 + j], block[A01 + j], block[A02 + j] = root[0], root[1], root[2]
+        block[A10 + j], block[A11 + j], block[A12 + j] = root[3], root[4], root[5]
+        block[A20 + j], block[A21 + j], block[A22 + j] = root[6], root[7], root[8]
+        block[LOG_WEIGHT + j] += 0.5 * elementary.log_of_normal(left * lower)
+
+
+@compiled
+def _draw(block: Block) -> None:
+    """The noise m + A n in place of its mean; log N(ε; 0, I) − log N(ε; m, A Aᵀ) but for |det A|.
+
+    Both are of the weight's logarithm.
+    """
+    for j in range(LANES):
+        n0, n1, n2 = block[N0 + j], block[N1 + j], block[N2 + j]
+        e0 = block[M0 + j] + block[A00 + j] * n0 + block[A01 + j] * n1 + block[A02 + j] * n2
+        e1 = block[M1 + j] + block[A10 + j] * n0 + block[A11 + j] * n1 + block[A12 + j] * n2
+        e2 = block[M2 + j] + block[A20 + j] * n0 + block[A21 + j] * n1 + block[A22 + j] * n2
+        block[M0 + j], block[M1 + j], block[M2 + j] = e0, e1, e2
+        before = n0 * n0 + n1 * n1 + n2 * n2
+        block[LOG_WEIGHT + j] += 0.5 * before - 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
+
+
+@compiled
+def _place(block: Block, row: Float[np.ndarray, "11"]) -> None:
+    """A landmark at first sight: the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z."""
+    distance, sine, cosine = max(row[READ], NEAREST_M), row[SINE_READ], row[COSINE_READ]
+    along, both, across = row[ALONG], row[BOTH], row[ACROSS]
+    for j in range(LANES):
+        s, c = block[SINE + j], block[COSINE + j]
+        ex, ey = c * cosine - s * sine, s * cosine + c * sine
+        block[MEAN_X + j] = block[X + j] + distance * ex
+        block[MEAN_Y + j] = block[Y + j] + distance * ey
+        block[XX + j] = along * ex * ex + across * ey * ey - 2.0 * both * ex * ey
+        block[XY + j] = (along - across) * ex * ey + both * (ex * ex - ey * ey)
+        block[YY + j] = along * ey * ey + across * ex * ex + 2.0 * both * ex * ey
 
 
 @inlined
-def _condition_noise_on_measurement(
-    noise_mean: Float[np.ndarray, "3"],
-    root: Float[np.ndarray, "3 3"],
-    L: Float[np.ndarray, "3 3"],
-    pose: Triple,
-    measurement: Float[np.ndarray, "2"],
-    sensor: Triple,
-    own: Float[np.ndarray, " own"],
-    mean: Float[np.ndarray, "2"],
-    covariance: Float[np.ndarray, "3"],
-) -> float:
-    """The motion's noise ε given one (range, bearing) of a known landmark, in place.
+def _landmark_given(
+    covariance: Triple, hx: float, hy: float, variance: float
+) -> tuple[float, float, Triple, float]:
+    """A landmark given one scalar of row h = (hx, hy): its gain, its covariance, and 1/s.
 
-    `pose` is the particle's pose at ε = m; there z = h + H L (ε − m) + v with the joint covariance
-    S = Hₗ Σ Hₗᵀ + R of v. The range is taken first, then the bearing less its regression on the
-    range, so each is scalar. Returns by what |det A|² is multiplied.
+    For 2 × 2, Σ − Σhhᵀ Σ/s = (R Σ + |Σ| h⊥h⊥ᵀ)/s with s = hᵀΣh + R: a sum of positive terms, so
+    the covariance stays positive definite.
     """
-    distance, ex, ey = seen(pose, mean)
-    s, c = elementary.sin_and_cos(pose[2])
-    u, v = c * ex + s * ey, c * ey - s * ex
-    xx, xy, yy = covariance[0], covariance[1], covariance[2]
-    of_range, of_bearing, rr, rb, bb = innovation_of(
-        measurement, own, sensor, distance, wrapped(measurement[1] - elementary.atan2(v, u))
+    xx, xy, yy = covariance
+    wx, wy = xx * hx + xy * hy, xy * hx + yy * hy
+    per = 1.0 / (hx * wx + hy * wy + variance)
+    shrunk, across = variance * per, (xx * yy - xy * xy) * per
+    left = (
+        shrunk * xx + across * hy * hy,
+        shrunk * xy - across * hx * hy,
+        shrunk * yy + across * hx * hx,
     )
-    S_rr = xx * ex * ex + 2.0 * xy * ex * ey + yy * ey * ey
-    S_rr += rr
-    S_rb = (xy * (ex * ex - ey * ey) + (yy - xx) * ex * ey) / distance + rb
-    S_bb = (xx * ey * ey - 2.0 * xy * ex * ey + yy * ex * ex) / (distance * distance) + bb
-    slope = S_rb / S_rr
-    r0, r1 = -u * L[0, 0] - v * L[1, 0], -v * L[1, 1]
-    b0 = (v * L[0, 0] - u * L[1, 0]) / distance - L[2, 0] - slope * r0
-    b1 = -u * L[1, 1] / distance - L[2, 1] - slope * r1
-    b2 = -L[2, 2]
-    m0, m1, m2 = noise_mean[0], noise_mean[1], noise_mean[2]
-    of_bearing -= slope * of_range
-    by_range = _condition_noise(noise_mean, root, (r0, r1, 0.0), of_range, S_rr)
-    of_bearing -= b0 * (noise_mean[0] - m0) + b1 * (noise_mean[1] - m1) + b2 * (noise_mean[2] - m2)
-    by_bearing = _condition_noise(noise_mean, root, (b0, b1, b2), of_bearing, S_bb - slope * S_rb)
-    return by_range * by_bearing
+    return wx * per, wy * per, left, per
+
+
+@compiled
+def _condition_landmark(block: Block) -> None:
+    """The EKF update of the landmark by what was predicted of it, and the weight of that.
+
+    The two rows of Hₗ, linearised once, are taken one after the other: the range, then the bearing
+    less its regression on the range, since what is left of its error is independent of the range's.
+    """
+    for j in range(LANES):
+        ex, ey, per = block[EX + j], block[EY + j], 1.0 / block[DISTANCE + j]
+        rr, rb, of_range = block[RR + j], block[RB + j], block[OF_RANGE + j]
+        slope = rb / rr
+        covariance = block[XX + j], block[XY + j], block[YY + j]
+        gx, gy, covariance, per_range = _landmark_given(covariance, ex, ey, rr)
+        dx, dy = gx * of_range, gy * of_range
+        hx, hy = -ey * per - slope * ex, ex * per - slope * ey
+        of_bearing = block[OF_BEARING + j] - slope * of_range - (hx * dx + hy * dy)
+        gx, gy, covariance, per_bearing = _landmark_given(
+            covariance, hx, hy, block[BB + j] - slope * rb
+        )
+        block[MEAN_X + j] += dx + gx * of_bearing
+        block[MEAN_Y + j] += dy + gy * of_bearing
+        block[XX + j], block[XY + j], block[YY + j] = covariance
+        chi2 = of_range * of_range * per_range + of_bearing * of_bearing * per_bearing
+        volume = elementary.log_of_normal(per_range * per_bearing) - 2.0 * LOG_2_PI
+        block[LOG_WEIGHT + j] += 0.5 * (volume - chi2)
+
+
+@compiled
+def _store_landmark(
+    block: Block,
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+    slot: int,
+    begin: int,
+) -> None:
+    for j in range(min(LANES, len(means) - begin)):
+        i = begin + j
+        means[i, slot, 0], means[i, slot, 1] = block[MEAN_X + j], block[MEAN_Y + j]
+        covariances[i, slot, 0], covariances[i, slot, 1] = block[XX + j], block[XY + j]
+        covariances[i, slot, 2] = block[YY + j]
 
 
 @compiled
@@ -179,9 +337,7 @@ def step(
     known: int,
     slots: Int64[np.ndarray, " n"],
     first: Bool[np.ndarray, " n"],
-    measurements: Float[np.ndarray, "n 2"],
-    sensor: Triple,
-    own: Float[np.ndarray, "n own"],
+    rows: Measured,
     improved: bool,
     poses: Float[np.ndarray, "M 3"],
     log_weights: Float[np.ndarray, " M"],
@@ -199,53 +355,29 @@ def step(
 
     Slots below `known` hold landmarks of earlier steps. A first sight has a flat prior and adds
     nothing; a second measurement of it in the same step updates it, but has no part in the
-    proposal. own: rows of `team.estimation.scans`. The last four arrays are written in place.
+    proposal. rows: the measurements (`blocks.measured`). The last four arrays are written in place.
     Thrun et al. 2005, section 13.5-13.8; Montemerlo 2003, chapter 4.
     """
-    noise_mean, root = np.empty(3), np.empty((3, 3))
-    for i in range(len(start)):
-        s, c = elementary.sin_and_cos(start[i, 2])
-        begin = start[i, 0], start[i, 1], start[i, 2]
-        origin = _moved(begin, s, c, motion[0], motion[1], motion[2])
-        s, c = elementary.sin_and_cos(origin[2])
-        noise_mean[:] = 0.0
-        root[:] = 0.0
-        root[0, 0] = root[1, 1] = root[2, 2] = 1.0
-        log_weight, factor = 0.0, 1.0
+    block = np.empty(END)
+    for begin in range(0, len(start), LANES):
+        _begin(block, start, motion, normals, begin)
         for k in range(len(slots) if improved else 0):
             if slots[k] < known:
-                drawn = noise_mean[0], noise_mean[1], noise_mean[2]
-                pose = _moved_by_noise(origin, s, c, L, drawn)
-                factor *= _condition_noise_on_measurement(
-                    noise_mean,
-                    root,
-                    L,
-                    pose,
-                    measurements[k],
-                    sensor,
-                    own[k],
-                    means[i, slots[k]],
-                    covariances[i, slots[k]],
-                )
-                if not WEAKEST < factor < 1.0 / WEAKEST:
-                    log_weight, factor = log_weight + 0.5 * elementary.log(factor), 1.0
-        n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
-        e0 = noise_mean[0] + root[0, 0] * n0 + root[0, 1] * n1 + root[0, 2] * n2
-        e1 = noise_mean[1] + root[1, 0] * n0 + root[1, 1] * n1 + root[1, 2] * n2
-        e2 = noise_mean[2] + root[2, 0] * n0 + root[2, 1] * n1 + root[2, 2] * n2
-        log_weight += 0.5 * (n0 * n0 + n1 * n1 + n2 * n2) - 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
-        pose = _moved_by_noise(origin, s, c, L, (e0, e1, e2))
-        poses[i, 0], poses[i, 1], poses[i, 2] = pose
+                _move_by_noise(block, L)
+                load_landmark(block, means, covariances, slots[k], begin)
+                predict(block, rows[k])
+                _condition_noise(block, L)
+        _draw(block)
+        _move_by_noise(block, L)
         for k in range(len(slots)):
-            mean, covariance = means[i, slots[k]], covariances[i, slots[k]]
             if first[k]:
-                place(mean, covariance, pose, measurements[k], sensor, own[k])
+                _place(block, rows[k])
             else:
-                chi2, volume = condition_on_measurement(
-                    mean, covariance, pose, measurements[k], sensor, own[k]
-                )
-                log_weight -= 0.5 * chi2
-                factor /= volume
-                if not WEAKEST < factor < 1.0 / WEAKEST:
-                    log_weight, factor = log_weight + 0.5 * elementary.log(factor), 1.0
-        log_weights[i] += log_weight + 0.5 * elementary.log(factor)
+                load_landmark(block, means, covariances, slots[k], begin)
+                predict(block, rows[k])
+                _condition_landmark(block)
+            _store_landmark(block, means, covariances, slots[k], begin)
+        for j in range(min(LANES, len(start) - begin)):
+            i = begin + j
+            poses[i, 0], poses[i, 1], poses[i, 2] = block[X + j], block[Y + j], block[HEADING + j]
+            log_weights[i] += block[LOG_WEIGHT + j]

@@ -8,16 +8,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
+from jaxtyping import Float, UInt32
 
 from team.config import Sensor
-from team.estimation import dense, elementary, elementwise
-from team.estimation.compiled import compiled
-from team.estimation.gaussian import EPSILON, cholesky_factor, whitened
+from team.estimation import dense
+from team.estimation.gaussian import cholesky_factor, whitened
 from team.estimation.geometry import compose, tangent, wrapped
+from team.estimation.hybrid_slam import innovation_kernel
 from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of
-from team.estimation.hybrid_slam.landmark_kernel import Triple, innovation_of, seen
+from team.estimation.hybrid_slam.fastslam_kernel import slots_of
 from team.estimation.models import (
     Increment,
     landmark_jacobian,
@@ -78,23 +77,21 @@ def innovation(
     calibration, own are the noises that they claim. R is white, as in the particles' weights.
     Raises NotACovarianceError if S is not positive definite.
     """
-    _, slots, _ = slots_of(particles.ids, ids)
-    known = slots < len(particles.ids)
-    if not known.any():
-        return NOTHING
-    error, S = _predictive(
+    squared, error, S = innovation_kernel.predictive_of_known(
         particles.poses,
-        elementwise.exp(particles.log_weights),
+        particles.log_weights,
         particles.means,
         particles.covariances,
+        particles.ids,
         increment.mean,
-        semidefinite_factor(increment.covariance),
-        slots[known],
-        np.column_stack((ranges, bearings))[known],
+        increment.covariance,
+        ids,
+        ranges,
+        bearings,
         variances(sensor),
-        (unclaimed(len(ids)) if own is None else own)[known],
+        unclaimed(len(ids)) if own is None else own,
     )
-    return _squared(error, S)
+    return _judged(squared, error, S) if len(error) else NOTHING
 
 
 def joint_innovation(
@@ -142,168 +139,14 @@ def joint_innovation(
         + dense.product(dense.product(H, increment.covariance), H.T)
         + np.diag(R)
     )
-    return _squared(error, S)
+    return _judged(innovation_kernel.normalised_square(error, S), error, S)
 
 
-def _squared(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> Innovation:
-    squared = _normalised_square(error, S)
-    if not math.isfinite(squared):  # rank and finiteness are judged there
+def _judged(
+    squared: float, error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]
+) -> Innovation:
+    """The kernel's square, unless it found none: rank and finiteness are judged here."""
+    if not math.isfinite(squared):
         white = whitened(cholesky_factor(S, "the prediction of measurements"), error)
         squared = float(dense.product(white, white))
     return Innovation(squared, len(error))
-
-
-@compiled
-def _normalised_square(error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]) -> float:
-    """νᵀ S⁻¹ ν by the Cholesky factor of S; NaN where a pivot is not above rounding."""
-    m = len(error)
-    L, white = np.empty((m, m)), np.empty(m)
-    total = 0.0
-    for j in range(m):
-        for k in range(j):
-            rest = S[j, k]
-            for i in range(k):
-                rest -= L[j, i] * L[k, i]
-            L[j, k] = rest / L[k, k]
-        pivot, rest = S[j, j], error[j]
-        for i in range(j):
-            pivot -= L[j, i] * L[j, i]
-            rest -= L[j, i] * white[i]
-        if not pivot > m * EPSILON * S[j, j]:
-            return math.nan
-        L[j, j] = math.sqrt(pivot)
-        white[j] = rest / L[j, j]
-        total += white[j] * white[j]
-    return total
-
-
-@compiled
-def _predictive(
-    poses: Float[np.ndarray, "M 3"],
-    weights: Float[np.ndarray, " M"],
-    means: Float[np.ndarray, "M L 2"],
-    covariances: Float[np.ndarray, "M L 3"],
-    motion: Float[np.ndarray, "3"],
-    L: Float[np.ndarray, "3 3"],
-    slots: Int64[np.ndarray, " n"],
-    measurements: Float[np.ndarray, "n 2"],
-    sensor: Triple,
-    own: Float[np.ndarray, "n own"],
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
-    """(z − ẑ, S) of n measurements as (range, bearing, range, …), m = 2n; L Lᵀ is the motion's Q.
-
-    S = A Aᵀ + blocks: row j of A is √wᵢ (Hₓ L, dᵢ) of all particles, one behind the other.
-    """
-    count, m = len(poses), 2 * len(slots)
-    # What was read less what each particle predicts lies near zero, where angles have a mean.
-    errors = np.empty((m, count))
-    A, of_landmark = np.empty((m, 4 * count)), np.empty((m, 2, count))
-    S = np.zeros((m, m))
-    for i in range(count):
-        root = math.sqrt(weights[i])
-        _predict(
-            poses[i], motion, root, means[i], L, slots, measurements, errors[:, i],
-            A[:, 4 * i : 4 * i + 3], of_landmark[:, :, i],
-        )  # fmt: skip
-        for k in range(len(slots)):
-            r, b = 2 * k, 2 * k + 1
-            distance = measurements[k, 0] - errors[r, i]
-            of_range, of_bearing, rr, rb, bb = innovation_of(
-                measurements[k], own[k], sensor, distance, errors[b, i]
-            )
-            if own.shape[1]:
-                errors[r, i], errors[b, i] = of_range, of_bearing
-            S[r, r] += weights[i] * rr
-            S[b, b] += weights[i] * bb
-            S[b, r] += weights[i] * rb
-    mean = np.empty(m)
-    for j in range(m):
-        mean[j] = _centred(errors[j], weights, j % 2 == 1)
-        A[j, 3::4] = np.sqrt(weights) * errors[j]
-    for j in range(m):
-        for k in range(j + 1):
-            total = _inner(A[j], A[k])
-            if slots[j // 2] == slots[k // 2]:
-                for i in range(count):
-                    xx, xy, yy = covariances[i, slots[j // 2]]
-                    x, y = of_landmark[k, 0, i], of_landmark[k, 1, i]
-                    along = of_landmark[j, 0, i] * (xx * x + xy * y)
-                    total += weights[i] * (along + of_landmark[j, 1, i] * (xy * x + yy * y))
-            S[j, k] += total
-            S[k, j] = S[j, k]
-    return mean, S
-
-
-@compiled
-def _inner(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> float:
-    """Σ aᵢ bᵢ of a multiple of four terms, in four sums that do not wait for each other."""
-    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-    for i in range(0, len(a), 4):
-        s0 += a[i] * b[i]
-        s1 += a[i + 1] * b[i + 1]
-        s2 += a[i + 2] * b[i + 2]
-        s3 += a[i + 3] * b[i + 3]
-    total: float = (s0 + s1) + (s2 + s3)
-    return total
-
-
-@compiled
-def _predict(
-    start: Float[np.ndarray, "3"],
-    motion: Float[np.ndarray, "3"],
-    root: float,
-    means: Float[np.ndarray, "L 2"],
-    L: Float[np.ndarray, "3 3"],
-    slots: Int64[np.ndarray, " n"],
-    measurements: Float[np.ndarray, "n 2"],
-    errors: Float[np.ndarray, " m"],
-    of_motion: Float[np.ndarray, "m 3"],
-    of_landmark: Float[np.ndarray, "m 2"],
-) -> None:
-    """One particle's z − ẑ at start ∘ motion, and the Jacobians Hₓ L √w and Hₗ of ẑ, all in place.
-
-    root: √w of the particle's weight.
-    """
-    s, c = elementary.sin_and_cos(start[2])
-    x = start[0] + c * motion[0] - s * motion[1]
-    y = start[1] + s * motion[0] + c * motion[1]
-    heading = start[2] + motion[2]
-    s, c = elementary.sin_and_cos(heading)
-    l00, l10, l11 = root * L[0, 0], root * L[1, 0], root * L[1, 1]
-    l20, l21, l22 = root * L[2, 0], root * L[2, 1], root * L[2, 2]
-    for k in range(len(slots)):
-        r, b = 2 * k, 2 * k + 1
-        distance, ex, ey = seen((x, y, heading), means[slots[k]])
-        u, v = c * ex + s * ey, c * ey - s * ex
-        errors[r] = measurements[k, 0] - distance
-        errors[b] = wrapped(measurements[k, 1] - elementary.atan2(v, u))
-        of_motion[r, 0] = -u * l00 - v * l10
-        of_motion[r, 1] = -v * l11
-        of_motion[r, 2] = 0.0
-        of_motion[b, 0] = (v * l00 - u * l10) / distance - l20
-        of_motion[b, 1] = -u * l11 / distance - l21
-        of_motion[b, 2] = -l22
-        of_landmark[r, 0], of_landmark[r, 1] = ex, ey
-        of_landmark[b, 0], of_landmark[b, 1] = -ey / distance, ex / distance
-
-
-@compiled
-def _centred(
-    values: Float[np.ndarray, " M"], weights: Float[np.ndarray, " M"], is_angle: bool
-) -> float:
-    """The weighted mean, of angles on the circle; the values become deviations from it."""
-    mean, sine, cosine = 0.0, 0.0, 0.0
-    for i in range(len(values)):
-        if is_angle:
-            s, c = elementary.sin_and_cos(values[i])
-            sine += weights[i] * s
-            cosine += weights[i] * c
-        else:
-            mean += weights[i] * values[i]
-    if is_angle:
-        mean = elementary.atan2(sine, cosine)
-    for i in range(len(values)):
-        values[i] -= mean
-        if is_angle:
-            values[i] = wrapped(values[i])
-    return mean
