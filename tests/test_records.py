@@ -14,8 +14,8 @@ MOST = 7
 """Positional arguments of a call."""
 FOLDERS = ("team", "central", "sim", "tests", "benchmarks", "examples")
 COMPILED = (
-    "_condition_noise_on_measurement", "_predict", "_predictive", "add_sightings", "add_submaps",
-    "agreement", "left_out", "normal_equations", "step", "filter_step",
+    "add_sightings", "add_submaps", "agreement", "predictive_of_known", "left_out",
+    "normal_equations", "step", "filter_step",
 )  # fmt: skip
 """Compiled kernels and the steps of estimators, which share one order: state, motion, sensor, …"""
 COMMANDS = ("_ip", "ip")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from team.config import Bounds, Sensor
-from team.estimation.hybrid_slam.landmark_kernel import condition_on_measurement, place
+from team.estimation.hybrid_slam import blocks
+from team.estimation.hybrid_slam.landmark_kernel import place
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
 from team.estimation.hybrid_slam.window import noise_of
 from team.estimation.models import landmark_jacobian, predicted
@@ -40,11 +41,26 @@ def turn(angle: float) -> np.ndarray:
     return np.array([[c, -s], [s, c]])
 
 
+def seen_from_the_pose(scan) -> tuple[np.ndarray, np.ndarray]:
+    """A block whose particles all stand at POSE, and what was measured there."""
+    block = np.zeros(blocks.OWN)
+    blocks.load_poses(block, POSE[None], 0)
+    blocks.drive(block, np.zeros(3))
+    return block, blocks.measured(scan.ranges, scan.bearings, SENSOR, scan.own)[0]
+
+
+def stored(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    means, covariances = np.empty((1, 1, 2)), np.empty((1, 1, 3))
+    blocks.store_landmark(block, means, covariances, 0, 0)
+    return means[0, 0], covariances[0, 0]
+
+
 def updated(scan) -> tuple[np.ndarray, np.ndarray]:
-    mean, P = MEAN.copy(), packed(SPREAD)
-    z = np.array([scan.ranges[0], scan.bearings[0]])
-    condition_on_measurement(mean, P, tuple(POSE), z, SENSOR, scan.own[0])
-    return mean, P
+    block, row = seen_from_the_pose(scan)
+    blocks.load_landmark(block, MEAN[None, None], packed(SPREAD)[None, None], 0, 0)
+    blocks.predict(block, row)
+    blocks.condition_landmark(block)
+    return stored(block)
 
 
 def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane() -> None:
@@ -76,6 +92,10 @@ def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
     R = turn(POSE[2])
     np.testing.assert_allclose(mean, POSE[:2] + R @ [2.5, 1.5], atol=1e-12)
     np.testing.assert_allclose(full(P), R @ full(CLAIM) @ R.T, atol=1e-12)
+    block, row = seen_from_the_pose(scan)
+    blocks.place(block, row)
+    for one, other in zip(stored(block), (mean, P), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-14)
 
 
 def test_the_sensors_own_covariance_claimed_changes_nothing() -> None:

@@ -57,11 +57,15 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
         8,
         ("estimation/hybrid_slam/test_fastslam.py",),
     ),
+    "team/estimation/hybrid_slam/blocks.py": (
+        8,
+        ("estimation/hybrid_slam/test_fastslam.py", "estimation/test_scans.py"),
+    ),
     "team/estimation/hybrid_slam/landmark_kernel.py": (
         8,
         ("estimation/hybrid_slam/test_fastslam.py", *GENERAL),
     ),
-    "team/estimation/hybrid_slam/innovation.py": (
+    "team/estimation/hybrid_slam/innovation_kernel.py": (
         6,
         ("estimation/hybrid_slam/test_innovation.py",),
     ),

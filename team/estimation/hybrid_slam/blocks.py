@@ -1,4 +1,4 @@
-"""Sixteen particles side by side: what each predicts of a measurement.
+"""Sixteen particles side by side: what each predicts of a landmark, and its update.
 
 A row of a block holds one quantity of sixteen particles, its lanes; what is done to rows is a loop
 over the lanes without a branch, which the compiler turns into vector instructions. A block is one
@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from team.estimation import elementary
-from team.estimation.compiled import compiled
+from team.estimation.compiled import compiled, inlined
 from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam.landmark_kernel import Triple
 from team.estimation.models import NEAREST_M
 
 LANES = 16
+LOG_2_PI = 1.8378770664093453
 Block = Float[np.ndarray, " rows_lanes"]
 Measured = Float[np.ndarray, "n 11"]
 
@@ -30,9 +31,11 @@ Measured = Float[np.ndarray, "n 11"]
     # Of a landmark seen from a pose: the distance, its direction in the map, its direction in the
     # robot, sine and cosine of the bearing's innovation, both innovations and their noise.
     DISTANCE, EX, EY, U, V, SINE_OFF, COSINE_OFF, OF_RANGE, OF_BEARING, RR, RB, BB,
-    # What a kernel has of its own.
+    # What a step adds to the logarithm of the weight.
+    LOG_WEIGHT,
+    # Rows of a kernel's own.
     OWN,
-) = range(0, 23 * LANES, LANES)  # fmt: skip
+) = range(0, 24 * LANES, LANES)  # fmt: skip
 
 (
     READ,
@@ -160,3 +163,82 @@ def _predict_point(block: Block, row: Float[np.ndarray, "11"]) -> None:
         block[OF_RANGE + j], block[OF_BEARING + j] = reach * c - distance, reach * s / distance
         block[RR + j], block[RB + j] = along, both / distance
         block[BB + j] = across / (distance * distance)
+
+
+@compiled
+def place(block: Block, row: Float[np.ndarray, "11"]) -> None:
+    """A landmark at first sight: the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z."""
+    distance, sine, cosine = max(row[READ], NEAREST_M), row[SINE_READ], row[COSINE_READ]
+    along, both, across = row[ALONG], row[BOTH], row[ACROSS]
+    for j in range(LANES):
+        s, c = block[SINE + j], block[COSINE + j]
+        ex, ey = c * cosine - s * sine, s * cosine + c * sine
+        block[MEAN_X + j] = block[X + j] + distance * ex
+        block[MEAN_Y + j] = block[Y + j] + distance * ey
+        block[XX + j] = along * ex * ex + across * ey * ey - 2.0 * both * ex * ey
+        block[XY + j] = (along - across) * ex * ey + both * (ex * ex - ey * ey)
+        block[YY + j] = along * ey * ey + across * ex * ex + 2.0 * both * ex * ey
+
+
+@inlined
+def _landmark_given(
+    covariance: Triple, hx: float, hy: float, variance: float
+) -> tuple[float, float, Triple, float]:
+    """A landmark given one scalar of row h = (hx, hy): its gain, its covariance, and 1/s.
+
+    For 2 × 2, Σ − Σhhᵀ Σ/s = (R Σ + |Σ| h⊥h⊥ᵀ)/s with s = hᵀΣh + R: a sum of positive terms, so
+    the covariance stays positive definite.
+    """
+    xx, xy, yy = covariance
+    wx, wy = xx * hx + xy * hy, xy * hx + yy * hy
+    per = 1.0 / (hx * wx + hy * wy + variance)
+    shrunk, across = variance * per, (xx * yy - xy * xy) * per
+    left = (
+        shrunk * xx + across * hy * hy,
+        shrunk * xy - across * hx * hy,
+        shrunk * yy + across * hx * hx,
+    )
+    return wx * per, wy * per, left, per
+
+
+@compiled
+def condition_landmark(block: Block) -> None:
+    """The EKF update of the landmark by what was predicted of it, and the weight of that.
+
+    The two rows of Hₗ, linearised once, are taken one after the other: the range, then the bearing
+    less its regression on the range, since what is left of its error is independent of the range's.
+    """
+    for j in range(LANES):
+        ex, ey, per = block[EX + j], block[EY + j], 1.0 / block[DISTANCE + j]
+        rr, rb, of_range = block[RR + j], block[RB + j], block[OF_RANGE + j]
+        slope = rb / rr
+        covariance = block[XX + j], block[XY + j], block[YY + j]
+        gx, gy, covariance, per_range = _landmark_given(covariance, ex, ey, rr)
+        dx, dy = gx * of_range, gy * of_range
+        hx, hy = -ey * per - slope * ex, ex * per - slope * ey
+        of_bearing = block[OF_BEARING + j] - slope * of_range - (hx * dx + hy * dy)
+        gx, gy, covariance, per_bearing = _landmark_given(
+            covariance, hx, hy, block[BB + j] - slope * rb
+        )
+        block[MEAN_X + j] += dx + gx * of_bearing
+        block[MEAN_Y + j] += dy + gy * of_bearing
+        block[XX + j], block[XY + j], block[YY + j] = covariance
+        chi2 = of_range * of_range * per_range + of_bearing * of_bearing * per_bearing
+        volume = elementary.log_of_normal(per_range * per_bearing) - 2.0 * LOG_2_PI
+        block[LOG_WEIGHT + j] += 0.5 * (volume - chi2)
+
+
+@compiled
+def store_landmark(
+    block: Block,
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+    slot: int,
+    begin: int,
+) -> None:
+    """The landmark's rows, in place, of the particles from `begin` on."""
+    for j in range(min(LANES, len(means) - begin)):
+        i = begin + j
+        means[i, slot, 0], means[i, slot, 1] = block[MEAN_X + j], block[MEAN_Y + j]
+        covariances[i, slot, 0], covariances[i, slot, 1] = block[XX + j], block[XY + j]
+        covariances[i, slot, 2] = block[YY + j]

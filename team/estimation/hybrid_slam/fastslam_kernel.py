@@ -13,27 +13,20 @@ from team.estimation import elementary
 from team.estimation.compiled import compiled, inlined
 from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam.blocks import (
-    ACROSS,
-    ALONG,
     BB,
-    BOTH,
     COSINE,
-    COSINE_READ,
     DISTANCE,
     EX,
     EY,
     HEADING,
     LANES,
-    MEAN_X,
-    MEAN_Y,
+    LOG_WEIGHT,
     OF_BEARING,
     OF_RANGE,
     OWN,
     RB,
-    READ,
     RR,
     SINE,
-    SINE_READ,
     XX,
     XY,
     YY,
@@ -43,13 +36,15 @@ from team.estimation.hybrid_slam.blocks import (
     V,
     X,
     Y,
+    condition_landmark,
     drive,
     load_landmark,
     load_poses,
+    place,
     predict,
+    store_landmark,
 )
 from team.estimation.hybrid_slam.landmark_kernel import Triple
-from team.estimation.models import NEAREST_M
 
 Ids = UInt32[np.ndarray, " L"]
 Square = tuple[float, float, float, float, float, float, float, float, float]
@@ -59,9 +54,8 @@ Square = tuple[float, float, float, float, float, float, float, float, float]
     AT_X, AT_Y, AT_HEADING, AT_SINE, AT_COSINE,
     # Mean m and root A of the motion's noise, and the normal numbers of its draw.
     M0, M1, M2, A00, A01, A02, A10, A11, A12, A20, A21, A22, N0, N1, N2,
-    LOG_WEIGHT,
     END,
-) = range(OWN, OWN + 22 * LANES, LANES)  # fmt: skip
+) = range(OWN, OWN + 21 * LANES, LANES)  # fmt: skip
 
 
 @compiled
@@ -88,7 +82,6 @@ def slots_of(
     return ids[:count].copy(), slots, first
 
 
-LOG_2_PI = elementary.log(2.0 * math.pi)
 SMALLEST_VARIANCE = 1e-200
 """A variance of motion below this is taken as zero [m², rad²]."""
 
@@ -251,84 +244,6 @@ def _draw(block: Block) -> None:
 
 
 @compiled
-def _place(block: Block, row: Float[np.ndarray, "11"]) -> None:
-    """A landmark at first sight: the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z."""
-    distance, sine, cosine = max(row[READ], NEAREST_M), row[SINE_READ], row[COSINE_READ]
-    along, both, across = row[ALONG], row[BOTH], row[ACROSS]
-    for j in range(LANES):
-        s, c = block[SINE + j], block[COSINE + j]
-        ex, ey = c * cosine - s * sine, s * cosine + c * sine
-        block[MEAN_X + j] = block[X + j] + distance * ex
-        block[MEAN_Y + j] = block[Y + j] + distance * ey
-        block[XX + j] = along * ex * ex + across * ey * ey - 2.0 * both * ex * ey
-        block[XY + j] = (along - across) * ex * ey + both * (ex * ex - ey * ey)
-        block[YY + j] = along * ey * ey + across * ex * ex + 2.0 * both * ex * ey
-
-
-@inlined
-def _landmark_given(
-    covariance: Triple, hx: float, hy: float, variance: float
-) -> tuple[float, float, Triple, float]:
-    """A landmark given one scalar of row h = (hx, hy): its gain, its covariance, and 1/s.
-
-    For 2 × 2, Σ − Σhhᵀ Σ/s = (R Σ + |Σ| h⊥h⊥ᵀ)/s with s = hᵀΣh + R: a sum of positive terms, so
-    the covariance stays positive definite.
-    """
-    xx, xy, yy = covariance
-    wx, wy = xx * hx + xy * hy, xy * hx + yy * hy
-    per = 1.0 / (hx * wx + hy * wy + variance)
-    shrunk, across = variance * per, (xx * yy - xy * xy) * per
-    left = (
-        shrunk * xx + across * hy * hy,
-        shrunk * xy - across * hx * hy,
-        shrunk * yy + across * hx * hx,
-    )
-    return wx * per, wy * per, left, per
-
-
-@compiled
-def _condition_landmark(block: Block) -> None:
-    """The EKF update of the landmark by what was predicted of it, and the weight of that.
-
-    The two rows of Hₗ, linearised once, are taken one after the other: the range, then the bearing
-    less its regression on the range, since what is left of its error is independent of the range's.
-    """
-    for j in range(LANES):
-        ex, ey, per = block[EX + j], block[EY + j], 1.0 / block[DISTANCE + j]
-        rr, rb, of_range = block[RR + j], block[RB + j], block[OF_RANGE + j]
-        slope = rb / rr
-        covariance = block[XX + j], block[XY + j], block[YY + j]
-        gx, gy, covariance, per_range = _landmark_given(covariance, ex, ey, rr)
-        dx, dy = gx * of_range, gy * of_range
-        hx, hy = -ey * per - slope * ex, ex * per - slope * ey
-        of_bearing = block[OF_BEARING + j] - slope * of_range - (hx * dx + hy * dy)
-        gx, gy, covariance, per_bearing = _landmark_given(
-            covariance, hx, hy, block[BB + j] - slope * rb
-        )
-        block[MEAN_X + j] += dx + gx * of_bearing
-        block[MEAN_Y + j] += dy + gy * of_bearing
-        block[XX + j], block[XY + j], block[YY + j] = covariance
-        chi2 = of_range * of_range * per_range + of_bearing * of_bearing * per_bearing
-        volume = elementary.log_of_normal(per_range * per_bearing) - 2.0 * LOG_2_PI
-        block[LOG_WEIGHT + j] += 0.5 * (volume - chi2)
-
-
-@compiled
-def _store_landmark(
-    block: Block,
-    means: Float[np.ndarray, "M L 2"],
-    covariances: Float[np.ndarray, "M L 3"],
-    slot: int,
-    begin: int,
-) -> None:
-    for j in range(min(LANES, len(means) - begin)):
-        i = begin + j
-        means[i, slot, 0], means[i, slot, 1] = block[MEAN_X + j], block[MEAN_Y + j]
-        covariances[i, slot, 0], covariances[i, slot, 1] = block[XX + j], block[XY + j]
-        covariances[i, slot, 2] = block[YY + j]
-
-
-@compiled
 def step(
     start: Float[np.ndarray, "M 3"],
     motion: Float[np.ndarray, "3"],
@@ -371,12 +286,12 @@ def step(
         _move_by_noise(block, L)
         for k in range(len(slots)):
             if first[k]:
-                _place(block, rows[k])
+                place(block, rows[k])
             else:
                 load_landmark(block, means, covariances, slots[k], begin)
                 predict(block, rows[k])
-                _condition_landmark(block)
-            _store_landmark(block, means, covariances, slots[k], begin)
+                condition_landmark(block)
+            store_landmark(block, means, covariances, slots[k], begin)
         for j in range(min(LANES, len(start) - begin)):
             i = begin + j
             poses[i, 0], poses[i, 1], poses[i, 2] = block[X + j], block[Y + j], block[HEADING + j]

@@ -1,4 +1,4 @@
-"""One landmark of one particle: its first sight, and its EKF update at a known pose.
+"""One landmark seen from one pose: distance and direction, innovation, first sight.
 
 A landmark is a mean (x, y) [m] and a covariance (xx, xy, yy) [m²], both written in place. A sensor
 is (σ_range², σ_range_per_m², σ_bearing²); the noise of a range is that of the predicted range.
@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled, inlined
-from team.estimation.geometry import wrapped
 from team.estimation.models import NEAREST_M
 
 Triple = tuple[float, float, float]
@@ -63,68 +62,6 @@ def innovation_of(
         both / distance,
         across / (distance * distance),
     )
-
-
-@inlined
-def _condition_on_scalar(
-    mean: Float[np.ndarray, "2"],
-    covariance: Float[np.ndarray, "3"],
-    hx: float,
-    hy: float,
-    innovation: float,
-    variance: float,
-) -> tuple[float, float]:
-    """A landmark given one scalar measurement of row h = (hx, hy), in place; (innovation²/s, s).
-
-    For 2 × 2, Σ − Σhhᵀ Σ/s = (R Σ + |Σ| h⊥h⊥ᵀ)/s with s = hᵀΣh + R: a sum of positive terms, so
-    the covariance stays positive definite.
-    """
-    xx, xy, yy = covariance[0], covariance[1], covariance[2]
-    wx, wy = xx * hx + xy * hy, xy * hx + yy * hy
-    total: float = hx * wx + hy * wy + variance
-    shrunk, across = variance / total, (xx * yy - xy * xy) / total
-    mean[0] += wx / total * innovation
-    mean[1] += wy / total * innovation
-    covariance[0] = shrunk * xx + across * hy * hy
-    covariance[1] = shrunk * xy - across * hx * hy
-    covariance[2] = shrunk * yy + across * hx * hx
-    return innovation * innovation / total, total
-
-
-@inlined
-def condition_on_measurement(
-    mean: Float[np.ndarray, "2"],
-    covariance: Float[np.ndarray, "3"],
-    pose: Triple,
-    measurement: Float[np.ndarray, "2"],
-    sensor: Triple,
-    own: Float[np.ndarray, " own"],
-) -> tuple[float, float]:
-    """The EKF update of one landmark at a known pose, in place.
-
-    Returns χ² and V with log p(z | pose, landmark) = −½ (χ² + log V).
-
-    The two rows of Hₗ, linearised once, are taken one after the other: the range, then the bearing
-    less its regression on the range, since what is left of its error is independent of the range's.
-    """
-    distance, ex, ey = seen(pose, mean)
-    before_x, before_y = mean[0], mean[1]
-    of_range, of_bearing, rr, rb, bb = innovation_of(
-        measurement,
-        own,
-        sensor,
-        distance,
-        wrapped(measurement[1] + pose[2] - elementary.atan2(ey, ex)),
-    )
-    slope = rb / rr
-    chi2_range, s_range = _condition_on_scalar(mean, covariance, ex, ey, of_range, rr)
-    hx, hy = -ey / distance - slope * ex, ex / distance - slope * ey
-    of_bearing -= slope * of_range
-    of_bearing -= hx * (mean[0] - before_x) + hy * (mean[1] - before_y)
-    chi2_bearing, s_bearing = _condition_on_scalar(
-        mean, covariance, hx, hy, of_bearing, bb - slope * rb
-    )
-    return chi2_range + chi2_bearing, (2.0 * math.pi * s_range) * (2.0 * math.pi * s_bearing)
 
 
 @compiled

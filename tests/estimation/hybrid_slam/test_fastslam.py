@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam import fastslam, fastslam_kernel
+from team.estimation.hybrid_slam.blocks import measured
 from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor
 from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment, increment_of
+from team.estimation.scans import unclaimed
 
 quick = settings(deadline=None, max_examples=60)
 SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.001, bearing_sigma=0.002)
@@ -313,3 +315,27 @@ def test_motion_without_a_covariance_is_refused_by_name(covariance):
             Increment(np.zeros(3), covariance),
             np.random.default_rng(0),
         )
+
+
+def test_a_particle_s_step_depends_neither_on_its_place_nor_on_the_others():
+    """Blocks of 16: 37 particles in two orders, and one of them alone."""
+    rng = np.random.default_rng(3)
+    starts, normals = rng.normal(0.0, 0.1, (37, 3)), rng.normal(0.0, 1.0, (37, 3))
+    means = np.array([[4.0, 1.0], [2.0, -3.0]]) + rng.normal(0.0, 0.1, (37, 2, 2))
+    spread = np.tile([0.05, 0.01, 0.04], (37, 2, 1))
+    slots, first = np.array([0, 1, 1], np.int64), np.array([False, True, False])
+    rows = measured(
+        np.array([4.1, 3.5, 3.6]), np.array([0.2, -1.0, -0.9]), (0.01, 0.0, 1e-3), unclaimed(3)
+    )
+
+    def stepped(order):
+        after = np.empty((len(order), 3)), np.zeros(len(order)), means[order], spread[order]
+        factor = semidefinite_factor(MOTION.covariance)
+        chosen = starts[order], MOTION.mean, factor, normals[order]
+        fastslam_kernel.step(*chosen, 1, slots, first, rows, True, *after)
+        return after
+
+    whole = stepped(np.arange(37))
+    for order in (rng.permutation(37), np.array([36]), np.arange(20, 37)):
+        for each, reference in zip(stepped(order), whole, strict=True):
+            np.testing.assert_array_equal(each, reference[order])
