@@ -4,6 +4,7 @@ p(path, landmarks | z) = p(path | z) Π p(landmark | path, z): the first factor 
 particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,8 +15,8 @@ from team.config import Sensor
 from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam import fastslam_kernel
 from team.estimation.hybrid_slam.blocks import measured
+from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of, step
 from team.estimation.models import Increment, variances
 from team.estimation.scans import Own, unclaimed
 
@@ -168,34 +169,72 @@ def filter_step(
     own: Own | None = None,
 ) -> tuple[Particles, float]:
     """As `propagated_and_updated` without resampling; returns also the log evidence."""
-    count, known = len(particles.poses), len(particles.ids)
-    L = fastslam_kernel.semidefinite_factor(increment.covariance)
-    if not np.isfinite(L).all():
-        raise NotACovarianceError("the motion", "not positive semi-definite")
-    ids_after, slots, first = fastslam_kernel.slots_of(particles.ids, ids)
-    means = np.empty((count, len(ids_after), 2))
-    covariances = np.empty((count, len(ids_after), 3))
-    means[:, :known] = particles.means
-    covariances[:, :known] = particles.covariances
-    poses = np.empty((count, 3))
-    log_weights = particles.log_weights.copy()
-    fastslam_kernel.step(
+    poses, log_weights, ids_after, means, covariances, log_evidence = _stepped(
         particles.poses,
+        particles.log_weights,
+        particles.ids,
+        particles.means,
+        particles.covariances,
         increment.mean,
-        L,
-        generator.standard_normal((count, 3)),
-        known,
-        slots,
-        first,
-        measured(ranges, bearings, variances(sensor), unclaimed(len(ids)) if own is None else own),
+        increment.covariance,
+        generator.standard_normal((len(particles.poses), 3)),
+        ids,
+        ranges,
+        bearings,
+        variances(sensor),
+        unclaimed(len(ids)) if own is None else own,
         proposal == "fastslam2",
-        poses,
-        log_weights,
-        means,
-        covariances,
     )
-    log_weights, log_evidence = normalised(log_weights)
+    if not len(poses):
+        raise NotACovarianceError("the motion", "not positive semi-definite")
     return Particles(poses, log_weights, ids_after, means, covariances), log_evidence
+
+
+@compiled
+def _stepped(
+    start: Float[np.ndarray, "M 3"],
+    log_weights: Float[np.ndarray, " M"],
+    known: UInt32[np.ndarray, " K"],
+    means: Float[np.ndarray, "M K 2"],
+    covariances: Float[np.ndarray, "M K 3"],
+    motion: Float[np.ndarray, "3"],
+    motion_covariance: Float[np.ndarray, "3 3"],
+    normals: Float[np.ndarray, "M 3"],
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    sensor: tuple[float, float, float],
+    own: Own,
+    improved: bool,
+) -> tuple[
+    Float[np.ndarray, "M 3"],
+    Float[np.ndarray, " M"],
+    UInt32[np.ndarray, " L"],
+    Float[np.ndarray, "M L 2"],
+    Float[np.ndarray, "M L 3"],
+    float,
+]:
+    """The fields of the particles after a step, and its log evidence.
+
+    No poses, where the motion's covariance is not positive semi-definite.
+    """
+    L = semidefinite_factor(motion_covariance)
+    if not np.isfinite(L).all():
+        return start[:0], log_weights, known, means, covariances, math.nan
+    after, slots, first = slots_of(known, ids)
+    # The kernel writes into these.
+    poses, weights = np.empty_like(start), log_weights.copy()
+    placed = np.empty((len(start), len(after), 2))
+    spread = np.empty((len(start), len(after), 3))
+    placed[:, : len(known)] = means
+    spread[:, : len(known)] = covariances
+    rows = measured(ranges, bearings, sensor, own)
+    step(
+        start, motion, L, normals, len(known), slots, first, rows, improved, poses, weights,
+        placed, spread,
+    )  # fmt: skip
+    weights, log_evidence = normalised(weights)
+    return poses, weights, after, placed, spread, log_evidence
 
 
 def propagated(
