@@ -20,6 +20,7 @@ from team.estimation.scans import (
     together,
     unclaimed,
 )
+from tests.estimation.hybrid_slam import one_landmark
 
 POSE = np.array([0.5, -1.0, 0.7])
 MEAN, SPREAD = np.array([3.0, 2.0]), np.array([[0.3, 0.1], [0.1, 0.2]])
@@ -42,25 +43,11 @@ def turn(angle: float) -> np.ndarray:
 
 
 def seen_from_the_pose(scan) -> tuple[np.ndarray, np.ndarray]:
-    """A block whose particles all stand at POSE, and what was measured there."""
-    block = np.zeros(blocks.OWN)
-    blocks.load_poses(block, POSE[None], 0)
-    blocks.drive(block, np.zeros(3))
-    return block, blocks.measured(scan.ranges, scan.bearings, SENSOR, scan.own)[0]
-
-
-def stored(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    means, covariances = np.empty((1, 1, 2)), np.empty((1, 1, 3))
-    blocks.store_landmark(block, means, covariances, 0, 0)
-    return means[0, 0], covariances[0, 0]
+    return one_landmark.at(POSE, scan.ranges, scan.bearings, SENSOR, scan.own)
 
 
 def updated(scan) -> tuple[np.ndarray, np.ndarray]:
-    block, row = seen_from_the_pose(scan)
-    blocks.load_landmark(block, MEAN[None, None], packed(SPREAD)[None, None], 0, 0)
-    blocks.predict(block, row)
-    blocks.condition_landmark(block)
-    return stored(block)
+    return one_landmark.updated(MEAN, packed(SPREAD), *seen_from_the_pose(scan))[:2]
 
 
 def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane() -> None:
@@ -94,7 +81,7 @@ def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
     np.testing.assert_allclose(full(P), R @ full(CLAIM) @ R.T, atol=1e-12)
     block, row = seen_from_the_pose(scan)
     blocks.place(block, row)
-    for one, other in zip(stored(block), (mean, P), strict=True):
+    for one, other in zip(one_landmark.stored(block), (mean, P), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-14)
 
 

@@ -59,7 +59,7 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "team/estimation/hybrid_slam/blocks.py": (
         8,
-        ("estimation/hybrid_slam/test_fastslam.py", "estimation/test_scans.py"),
+        ("estimation/hybrid_slam/test_fastslam.py", "estimation/test_scans.py", *GENERAL),
     ),
     "team/estimation/hybrid_slam/landmark_kernel.py": (
         8,

@@ -7,8 +7,8 @@ import pytest
 
 from team.estimation.geometry import compose, exponential, tangent, wrapped
 from team.estimation.hybrid_slam.consensus_kernel import _prediction
-from team.estimation.hybrid_slam.landmark_kernel import condition_on_measurement
 from team.estimation.models import landmark_jacobian, predicted
+from tests.estimation.hybrid_slam import one_landmark
 
 SENSOR = (0.04, 0.001, 0.003)
 POSE = (1.5, -0.7, 0.9)
@@ -40,9 +40,9 @@ def kalman(e: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def updated(z: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    mean, packed = MEAN.copy(), COVARIANCE[[0, 0, 1], [0, 1, 1]]
-    squared, volume = condition_on_measurement(mean, packed, POSE, z, SENSOR, own)
-    return mean, packed[[[0, 1], [1, 2]]], -0.5 * (squared + math.log(volume))
+    seen = one_landmark.at(POSE, z[:1], z[1:], SENSOR, own[None])
+    mean, packed, likelihood = one_landmark.updated(MEAN, COVARIANCE[[0, 0, 1], [0, 1, 1]], *seen)
+    return mean, packed[[[0, 1], [1, 2]]], likelihood
 
 
 @pytest.mark.parametrize("kind", ["none", "refused", "range and bearing"])
