@@ -169,7 +169,7 @@ def filter_step(
     own: Own | None = None,
 ) -> tuple[Particles, float]:
     """As `propagated_and_updated` without resampling; returns also the log evidence."""
-    poses, log_weights, ids_after, means, covariances, log_evidence = _stepped(
+    poses, log_weights, ids_after, means, covariances, log_evidence = _filter_step(
         particles.poses,
         particles.log_weights,
         particles.ids,
@@ -191,7 +191,7 @@ def filter_step(
 
 
 @compiled
-def _stepped(
+def _filter_step(
     start: Float[np.ndarray, "M 3"],
     log_weights: Float[np.ndarray, " M"],
     known: UInt32[np.ndarray, " K"],
