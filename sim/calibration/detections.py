@@ -127,16 +127,16 @@ def looks_of(found: Clusters) -> WindowLooks:
             continue
         at = seen_from(np.broadcast_to(pose, (len(landmarks), 3)), landmarks)
         other = (own[None] != np.arange(len(landmarks))[:, None]) & real[own]
-        looked = known & other.any(axis=1)
+        in_view = known & other.any(axis=1)
         for measured, place in (
             (ranges[rows], np.hypot(at[:, 0], at[:, 1])),
             (bearings[rows], np.arctan2(at[:, 1], at[:, 0])),
         ):
-            looked &= np.where(other, measured, np.inf).min(axis=1) <= place
-            looked &= place <= np.where(other, measured, -np.inf).max(axis=1)
-        trials += looked
+            in_view &= np.where(other, measured, np.inf).min(axis=1) <= place
+            in_view &= place <= np.where(other, measured, -np.inf).max(axis=1)
+        trials += in_view
         detected = np.isin(np.arange(len(landmarks)), own)
-        again += looked & detected
+        again += in_view & detected
         known |= detected
     view = view_of(scans)
     return WindowLooks(
