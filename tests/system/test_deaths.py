@@ -103,7 +103,7 @@ async def test_a_recorder_that_is_killed_goes_on_and_what_it_had_reads_and_can_b
     whole = open_log(team.folder / "whole.mcap")
     assert whole.complete
     assert list(whole.samples()) == kept
-    assert whole.metadata == cut.metadata
+    assert whole.metadata == {**cut.metadata, "repaired": cut.path.name}
 
 
 async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map_is_provisional(
