@@ -1,4 +1,4 @@
-"""What a live robot's topics have sent, until its driver takes it; and what never came.
+"""Buffers the messages of a live robot's topics for its driver, and counts those that were lost.
 
 rmw_zenoh attaches to each publication its publisher's counter and name, in one of two forms:
 
@@ -37,7 +37,7 @@ def number_of(attachment: bytes) -> tuple[bytes, int] | None:
 
 @dataclass
 class Lost:
-    """Messages that were published and never came, by topic; numbered: of how many it is known."""
+    """Number of lost messages by topic; numbered: number of messages with a known counter."""
 
     count: Counter[str] = field(default_factory=Counter)
     numbered: Counter[str] = field(default_factory=Counter)
@@ -59,7 +59,7 @@ class Lost:
 
 
 class Arrived(NamedTuple):
-    """One message, and when it came by this machine's monotonic clock [s]."""
+    """One message, and its time of arrival by this machine's monotonic clock [s]."""
 
     kind: str
     payload: bytes
@@ -68,7 +68,7 @@ class Arrived(NamedTuple):
 
 @dataclass
 class Backlog:
-    """Messages that came and are not decoded yet, by topic in the order of arrival."""
+    """Messages that are not decoded yet, by topic in the order of arrival."""
 
     waiting: dict[str, deque[Arrived]] = field(default_factory=dict)
     dropped: Counter[str] = field(default_factory=Counter)
@@ -91,6 +91,6 @@ class Backlog:
 
     @property
     def oldest_s(self) -> float:
-        """How long the oldest message has waited [s]; 0 where none does."""
+        """Waiting time of the oldest message [s]; 0 without messages."""
         arrived = [queue[0].at_s for queue in self.waiting.values() if queue]
         return time.monotonic() - min(arrived) if arrived else 0.0

@@ -26,7 +26,7 @@ class Topic(NamedTuple):
 
 
 class RawMessage(NamedTuple):
-    """One message as it lies in the bag."""
+    """One message of a bag, not decoded."""
 
     topic: str
     kind: str
@@ -67,7 +67,7 @@ _FAULTS = (AnyReaderError, OSError, ValueError, KeyError, AssertionError)
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the name says that it is one, or what is in a folder."""
+    """True for a file with the suffix of a bag, and for a folder that holds one."""
     return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file() or bool(_parts(path))
 
 

@@ -1,4 +1,4 @@
-"""From (type, CDR bytes) to what a message says, as frozen values; a pure function.
+"""Decodes a ROS 2 message (type, CDR bytes) into a frozen record; a pure function.
 
 What can not be decoded, or has numbers that are not finite, raises `DamagedError`.
 """
@@ -19,7 +19,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 class DamagedError(ValueError):
-    """Bytes that are not such a message, or one whose numbers can not be."""
+    """Bytes that are not a message of this type, or a message with impossible numbers."""
 
 
 class OdometryRecord(NamedTuple):
@@ -64,7 +64,7 @@ class Transform(NamedTuple):
 
 
 class Tag(NamedTuple):
-    """One detection: what it is called, where it is; covariance: of x, y, z, row by row."""
+    """One detected tag: its name and its position; covariance: of (x, y, z), row by row."""
 
     name: str
     position: Vector
@@ -72,7 +72,7 @@ class Tag(NamedTuple):
 
 
 class TagsRecord(NamedTuple):
-    """What a detector saw at one time, in `frame`."""
+    """The tags that a detector saw at one time, in `frame`."""
 
     stamp_ns: int
     frame: str
@@ -93,7 +93,7 @@ FAULTS = (SerdeError, ValueError, IndexError, KeyError, OverflowError, MemoryErr
 
 
 def decode(kind: str, data: bytes | memoryview, store: Typestore | None = None) -> Record:
-    """What a message of this type (`nav_msgs/msg/Odometry`) says; raises DamagedError.
+    """The record of a message of this type (`nav_msgs/msg/Odometry`); raises DamagedError.
 
     store: the types' definitions, if they are not ours. A type that READERS lacks is a KeyError.
     """

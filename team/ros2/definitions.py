@@ -1,4 +1,4 @@
-"""The types of ROS 2 messages that are understood: those of a distribution, and of detectors."""
+"""Definitions of the ROS 2 message types that are read: a distribution's, and detectors'."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Where a sensor sits on its robot: static transforms, and detections in the plane."""
+"""A sensor's mount on its robot from static transforms, and detections in the plane."""
 
 from dataclasses import dataclass, field
 from math import atan2
@@ -13,7 +13,7 @@ DEEPEST = 32
 
 
 def rotation_matrix(q: Quaternion) -> Float[np.ndarray, "3 3"]:
-    """Of a quaternion (x, y, z, w) of any length above 0."""
+    """The rotation matrix of a quaternion (x, y, z, w) of any length above 0."""
     x, y, z, w = np.array(q) / np.linalg.norm(q)
     return np.array(
         [
@@ -41,14 +41,14 @@ class Mount:
     plane: Float[np.ndarray, "2 3"]
 
     def point(self, position: Vector) -> tuple[float, float]:
-        """(ahead, left) of a position in the sensor's frame."""
+        """Coordinates (ahead, left) in the plane of a position in the sensor's frame."""
         if self.plane is BODY:
             return position[0], position[1]
         ahead, left = self.plane @ np.array(position)
         return float(ahead), float(left)
 
     def covariance(self, block: tuple[float, ...]) -> tuple[float, float, float]:
-        """(xx, xy, yy) in the plane of a covariance of x, y, z."""
+        """Covariance (xx, xy, yy) in the plane from that of (x, y, z)."""
         c = self.plane @ np.array(block).reshape(3, 3) @ self.plane.T
         return float(c[0, 0]), float(c[0, 1]), float(c[1, 1])
 
@@ -66,7 +66,7 @@ class Frames:
     parents: dict[str, Transform] = field(default_factory=dict)
 
     def take(self, transform: Transform) -> None:
-        """Remember one."""
+        """Add a static transform."""
         self.parents[transform.child] = transform
 
     def base_from(
@@ -86,7 +86,7 @@ class Frames:
         return None
 
     def mount(self, frame: str, base: str) -> Mount | None:
-        """How the sensor of this frame sits on the base; a frame whose z is level is a camera's."""
+        """Mount of the sensor with this frame; a frame whose z axis is level is a camera's."""
         found = self.base_from(frame, base)
         if found is None:
             return None

@@ -1,4 +1,4 @@
-"""Under which Zenoh keys ROS 2 topics come: rmw_zenoh's, and zenoh-bridge-ros2dds'.
+"""The Zenoh keys of ROS 2 topics: those of rmw_zenoh and of zenoh-bridge-ros2dds.
 
 rmw_zenoh   <domain>/<topic>/<pkg>::msg::dds_::<Type>_/<hash of the type>
 bridge      <topic>, and a liveliness token @/<id>/@ros2_lv/MP/<topic>/<type>/<QoS>, with § for /
@@ -13,13 +13,13 @@ SLASH = "§"
 
 
 def expressions(topics: Iterable[str], domain: int) -> list[str]:
-    """What to subscribe to, for either way."""
+    """Key expressions to subscribe to, of both kinds."""
     names = [topic.strip("/") for topic in topics]
     return [*names, *(f"{domain}/{name}/*/*" for name in names)]
 
 
 def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
-    """Topic and type of a key of rmw_zenoh's; None for any other."""
+    """Topic and type from a key of rmw_zenoh; None for any other key."""
     parts = key.split("/")
     if len(parts) < 4 or parts[0] != str(domain):
         return None
@@ -28,7 +28,7 @@ def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
 
 
 def of_token(key: str) -> tuple[str, str] | None:
-    """Topic and type that a bridge's token tells; None for any other key."""
+    """Topic and type from the key of a bridge's liveliness token; None for any other key."""
     parts = key.split("/")
     if len(parts) < 6 or parts[2:4] != ["@ros2_lv", "MP"]:
         return None

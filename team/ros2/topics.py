@@ -1,4 +1,4 @@
-"""Which topics are a robot's odometry, detections and truth: a table of a TOML file."""
+"""The topics of each robot's odometry, detections and truth, from a table of a TOML file."""
 
 import tomllib
 from pathlib import Path

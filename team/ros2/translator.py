@@ -1,4 +1,4 @@
-"""What a robot's messages say → its measurements; the same for a bag and for a live robot."""
+"""Translates a robot's ROS 2 messages into its measurements, of a bag and live alike."""
 
 import re
 from collections import Counter
@@ -21,7 +21,7 @@ TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")
 
 
 class Pose(NamedTuple):
-    """Odometry (or truth, if so) that adds up to this pose (x, y, θ)."""
+    """Odometry as its accumulated pose (x, y, θ); truth: a true pose."""
 
     stamp_ns: int
     x: float
@@ -31,7 +31,7 @@ class Pose(NamedTuple):
 
 
 class Speeds(NamedTuple):
-    """Odometry whose speeds hold until the next."""
+    """Odometry as speeds that hold until the next message."""
 
     stamp_ns: int
     forward: float
@@ -54,9 +54,9 @@ Measured = Pose | Speeds | Seen
 
 
 class Translator:
-    """One robot's messages in order of arrival; `dropped` counts what is left out, by reason.
+    """Takes one robot's messages in order of arrival; `dropped` counts those left out, by reason.
 
-    mounts: the sensors by frame, once something was seen in them.
+    mounts: the sensors' mounts by frame, each from its first detection on.
     """
 
     def __init__(self, topics: RobotTopics, frames: Frames | None = None) -> None:
