@@ -5,6 +5,8 @@ from math import degrees
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from central.desk.drawing import GREY, robot_colours
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.pictures.run import new_figure
@@ -34,24 +36,28 @@ def compare_figures(runs: Mapping[str, Evaluation]) -> dict[str, Any]:
 
 
 def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Map error, map NEES and path errors of every run; False where none has truth."""
-    truthful = {n: r for n, r in runs.items() if r.map is not None and r.map.errors is not None}
-    if not truthful:
+    """Map error, map NEES and path errors of every run; False where none has truth.
+
+    A run without true landmarks has its paths' errors only.
+    """
+    errors = [None if run.map is None else run.map.errors for run in runs.values()]
+    paths = [_aligned(each) for run in runs.values() for each in run.robots.values()]
+    if not any(errors) and np.isnan(paths).all():
         return False
     figure, (axes,) = new_figure(max(9.0, 2.5 + 1.2 * len(runs)), 4.2, 1, 3)
-    names = list(truthful)
+    names = list(runs)
     at = range(len(names))
-    errors = [run.map.errors for run in truthful.values() if run.map and run.map.errors]
-    axes[0].bar(at, [e.aligned_rmse_m or 0.0 for e in errors], color=GREY)
+    axes[0].bar(at, [(e and e.aligned_rmse_m) or 0.0 for e in errors], color=GREY)
     axes[0].set_title("landmark RMSE, aligned [m]", fontsize=10)
-    axes[1].plot(at, [e.nees_per_dof for e in errors], "o", color=GREY)
+    axes[1].plot(at, [e.nees_per_dof if e else np.nan for e in errors], "o", color=GREY)
     for k, error in enumerate(errors):
-        axes[1].plot([k, k], error.band, color=GREY, linewidth=6.0, alpha=0.25)
+        if error is not None:
+            axes[1].plot([k, k], error.band, color=GREY, linewidth=6.0, alpha=0.25)
     axes[1].axhline(1.0, color=GREY, linewidth=0.7)
     axes[1].set_title("map NEES per dof, 95 % band", fontsize=10)
-    colours = robot_colours({name for run in truthful.values() for name in run.robots})
+    colours = robot_colours({name for run in runs.values() for name in run.robots})
     for robot, colour in colours.items():
-        paths = [_aligned(run.robots.get(robot)) for run in truthful.values()]
+        paths = [_aligned(run.robots.get(robot)) for run in runs.values()]
         axes[2].plot(at, paths, "o-", color=colour, linewidth=0.7, label=robot)
     axes[2].set_title("path RMSE, aligned [m]", fontsize=10)
     axes[2].legend(frameon=False, fontsize=8)

@@ -84,16 +84,20 @@ class MapResult:
     gospa: Gospa | None = None
 
 
+TeamMotion = tuple[Float[np.ndarray, "3"], str]
+"""A rigid motion from the map to the truth, and what it aligns best."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RobotResult:
     """One robot: its measurements, their dispositions, and its poses against the truth.
 
     smoothed: the final map's poses at the ends of the submaps. online: the poses that the robot
     published, given the team's map (`online_channel`: "team/pose"), or by its own measurements
-    alone where it never had that. aligned_rmse_m: of the smoothed positions after the rigid motion
-    that aligns the map (`alignment`: "map"), or else their own ("trajectory");
-    online_aligned_rmse_m: of the online ones after the map's. own_map: of the robot's last own map,
-    as it lies.
+    alone where it never had that. aligned_rmse_m, online_aligned_rmse_m: of the smoothed and of the
+    online positions after the rigid motion that aligns the map (`alignment`: "map"), or where no
+    true landmark is known the smoothed paths of all robots ("paths"), or where there is no map the
+    robot's own ("trajectory"). own_map: of the robot's last own map, as it lies.
     """
 
     consumption: Consumption
@@ -159,12 +163,14 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     label_of = {} if association is None else association.label_of
     fused = _map_result(log, ids, positions, label_of)
     uplink = None if scenario is None else _uplink(scenario)
+    logs = {robot: robot_log(log, robot) for robot in log.robots}
+    motion = _team_motion(fused, logs.values())
     robots = {
         robot: _robot_result(
-            robot_log(log, robot),
+            logs[robot],
             consumption(log, robot),
             _bytes(log, uplink, robot),
-            fused,
+            motion,
             _own_map(log, robot, ids, positions),
         )
         for robot in log.robots
@@ -454,13 +460,13 @@ def _robot_result(
     log: RobotLog,
     used: Consumption,
     uplink_bytes: int | None,
-    fused: MapResult | None,
+    team_motion: TeamMotion | None,
     own_map: MapErrors | None,
 ) -> RobotResult:
     smoothed = pose_errors(log.smoothed, log.smoothed_covariances, log.truth)
     ends_known = smoothed is not None and smoothed.stamps_ns[-1] == log.smoothed.stamps_ns[-1]
-    aligned, alignment = _aligned(log, fused)
-    map_motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
+    motion, alignment = team_motion or (_motion([log]), "trajectory")
+    aligned = None if motion is None else _moved_rmse(motion, log.smoothed, log.truth)
     return RobotResult(
         consumption=used,
         uplink_bytes=uplink_bytes,
@@ -474,10 +480,10 @@ def _robot_result(
         if smoothed is not None and ends_known
         else None,
         aligned_rmse_m=aligned,
-        alignment=alignment,
+        alignment=None if aligned is None else alignment,
         online_aligned_rmse_m=None
-        if map_motion is None
-        else _moved_rmse(map_motion, log.online, log.truth),
+        if team_motion is None
+        else _moved_rmse(team_motion[0], log.online, log.truth),
         own_map=own_map,
     )
 
@@ -490,16 +496,21 @@ def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> floa
     return distance_rmse(moved(motion, path.poses[known, :2]), true_poses[known, :2])
 
 
-def _aligned(log: RobotLog, fused: MapResult | None) -> tuple[float | None, str | None]:
-    """RMSE of the smoothed positions after a rigid motion, and which."""
-    truth, known = interpolated(log.truth, log.smoothed.stamps_ns)
-    if not known.any():
-        return None, None
-    places, true_places = log.smoothed.poses[known, :2], truth[known, :2]
-    motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
-    name = "map"
-    if motion is None:
-        motion, name = rigid_alignment(true_places, places), "trajectory"
-    if motion is None:
-        return None, None
-    return distance_rmse(moved(motion, places), true_places), name
+def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotion | None:
+    """What moves the team's map onto the truth, and by what; None where there is no map."""
+    if fused is None:
+        return None
+    if fused.errors is not None and fused.errors.truth_from_map is not None:
+        return fused.errors.truth_from_map, "map"
+    motion = _motion(logs)
+    return None if motion is None else (motion, "paths")
+
+
+def _motion(logs: Iterable[RobotLog]) -> Float[np.ndarray, "3"] | None:
+    """The rigid motion that aligns smoothed positions with true ones, where these are known."""
+    true_places, places = [np.empty((0, 2))], [np.empty((0, 2))]
+    for log in logs:
+        truth, known = interpolated(log.truth, log.smoothed.stamps_ns)
+        true_places.append(truth[known, :2])
+        places.append(log.smoothed.poses[known, :2])
+    return rigid_alignment(np.concatenate(true_places), np.concatenate(places))

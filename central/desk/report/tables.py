@@ -195,7 +195,10 @@ PATH_HEADINGS = (
     "robot", "path\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
     "online\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
 )  # fmt: skip
-PATH_NOTE = "position RMSE, smoothed and online; aligned: moved as the map is"
+PATH_NOTE = (
+    "position RMSE, smoothed and online; aligned: moved as the map is, or as all paths together "
+    "where no true landmark is known"
+)
 
 
 def path_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple[str, ...]:

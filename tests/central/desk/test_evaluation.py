@@ -298,6 +298,14 @@ def test_a_log_without_truth_has_no_errors_but_the_rest() -> None:
         assert robot[name] is None
 
 
+def test_where_no_true_landmark_is_known_all_paths_are_moved_together() -> None:
+    log = joined_log(scenario(robots=2), 0.3)
+    run = evaluate([each for each in log if not each.key.endswith(ch.TRUTH_LANDMARKS.template)])
+    for robot in run.robots.values():
+        assert robot.alignment == "paths"
+        assert robot.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_log_that_was_cut_before_the_final_map_is_evaluated() -> None:
     figures = to_json(evaluate(world_log(scenario())[:30]))
     assert figures["final_map_digest"] is None
