@@ -97,11 +97,13 @@ def test_what_was_published_before_close_reaches_a_reader_that_is_slow(endpoint:
         payload = number.to_bytes(4, "little") + bytes(100_000)
         source.publish_raw(Sample("source/alpha/odometry", payload, 0, 0, 0))
 
+    def reaches() -> bool:
+        publish(0)
+        return bool(arrived)
+
     with client(endpoint, 5.0, None) as reader, ZenohBus("t", endpoint) as source:
         reader.declare_subscriber("team/t/source/**", Callback(read, indirect=False))
-        while not arrived:  # until the router knows the subscription
-            publish(0)
-            time.sleep(0.05)
+        wait_until(reaches)
         for number in range(1, 400):
             publish(number)
         source.close()

@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path as Folder
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from central.desk.compare import compare_picture
 from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
 from central.desk.evaluation.evaluation import evaluate, to_json
 from central.desk.side_by_side import comparison_rows
@@ -298,12 +300,13 @@ def test_a_log_without_truth_has_no_errors_but_the_rest() -> None:
         assert robot[name] is None
 
 
-def test_where_no_true_landmark_is_known_all_paths_are_moved_together() -> None:
+def test_where_no_true_landmark_is_known_all_paths_are_moved_together(tmp_path: Folder) -> None:
     log = joined_log(scenario(robots=2), 0.3)
     run = evaluate([each for each in log if not each.key.endswith(ch.TRUTH_LANDMARKS.template)])
     for robot in run.robots.values():
         assert robot.alignment == "paths"
         assert robot.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert compare_picture({"run": run}, tmp_path / "paths.png"), "it has its paths' errors"
 
 
 def test_a_log_that_was_cut_before_the_final_map_is_evaluated() -> None:
