@@ -111,8 +111,9 @@ class Peer:
                 found = ch.channel_of(sample.key)
                 if self.peer.proofs is not None and found is not None:
                     channel, name = found
-                    publisher = OPERATOR if channel is ch.ORDER_SIGNATURE else name
-                    self.peer.proofs.hear(message, publisher)
+                    operators = channel is ch.ORDER_SIGNATURE
+                    if operators or channel.publisher(name) in self.peer.known:
+                        self.peer.proofs.hear(message, OPERATOR if operators else name)
                 return []
             case m.SetSummary():
                 return self.counted(self.peer.hear(message))
@@ -132,7 +133,7 @@ class Peer:
 
     def _meet(self, token: m.Liveliness) -> None:
         """Note that a node has come, which may lack members, or gone."""
-        if token.node == self.name or not (token.node.startswith("robot/") or token.node == CENTRE):
+        if token.node == self.name or token.node not in self.peer.known:
             return
         (self.others.add if token.alive else self.others.discard)(token.node)
         if token.alive:

@@ -38,9 +38,20 @@ def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
 
 @dataclass
 class _Seat:
+    """listens, overhears: names of the channels that its node subscribes to under its name (a centre
+    under any), and under every name.
+    """
+
     node: PeerRobot | PeerCentre
     boundary: Boundary
     reached: set[str] = field(default_factory=set)
+    listens: frozenset[str] = frozenset()
+    overhears: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        self.overhears = frozenset(each.name for each in self.node.overhears)
+        listens = self.node.listens if isinstance(self.node, PeerRobot) else self.node.overhears
+        self.listens = frozenset(each.name for each in listens)
 
 
 class PeerTeam:
@@ -165,8 +176,7 @@ class PeerTeam:
             if found[0].delivery == "latest" and found[0].template.startswith("world/"):
                 self._latest[sample.key] = found[0], sample
             for robot, seat in list(self.seats.items()):
-                listens = _listened(seat.node)
-                mine = found[0] in listens and (robot == CENTRE or found[1] in ("", robot))
+                mine = found[0].name in seat.listens and (robot == CENTRE or found[1] in ("", robot))
                 if mine:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
@@ -175,7 +185,7 @@ class PeerTeam:
         streams.
         """
         for channel, sample in self._latest.values():
-            if channel in _listened(seat.node):
+            if channel.name in seat.listens:
                 self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _to_world(self, out: Outgoing) -> None:
@@ -202,7 +212,7 @@ class PeerTeam:
             if out.channel is ch.CONCLUDED:
                 self.complete_ns[robot] = self.now_ns
             for other, its in self.seats.items():
-                if other != robot and out.channel in its.node.overhears:
+                if other != robot and out.channel.name in its.overhears:
                     self._send(robot, other, sample)
 
     def _send(self, sender: str, to: str, sample: Sample) -> None:
@@ -255,11 +265,6 @@ class PeerTeam:
     def _taken(self) -> list[Sample]:
         taken, self._log = self._log, []
         return taken
-
-
-def _listened(node: PeerRobot | PeerCentre) -> tuple[ch.Channel, ...]:
-    """The channels that a robot subscribes to under its name, or a centre under any."""
-    return node.listens if isinstance(node, PeerRobot) else node.overhears
 
 
 def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:

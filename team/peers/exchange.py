@@ -4,8 +4,15 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
+from team.door import MOST_LIVES
 from team.peers.members import Member, Stream
-from team.peers.replica import MOST_SEQUENCES, Replica, intervals
+from team.peers.replica import (
+    MOST_INTERVALS,
+    MOST_SEQUENCES,
+    MOST_STREAMS,
+    Replica,
+    intervals,
+)
 from team.wire import messages as m
 
 MOST_REQUESTED = 64
@@ -34,7 +41,7 @@ def request_for(
     found: list[m.Requested] = []
     asked = 0
     for each in summary.holdings:
-        if each.robot not in replica.robots:
+        if each.robot not in replica.robots or each.incarnation > MOST_LIVES:
             continue
         stream = each.robot, each.incarnation
         share = replica.share_of(stream)
@@ -74,6 +81,15 @@ def request_for(
         node="",
         requested=tuple(found[:MOST_REQUESTED]),
         statements=statements,
+    )
+
+
+def oversized(replica: Replica, summary: m.SetSummary) -> bool:
+    """Whether a summary names more than any peer of this team can have."""
+    return (
+        len(summary.holdings) > MOST_STREAMS * len(replica.robots)
+        or len(summary.statements) > len(replica.robots)
+        or any(len(each.sequences) > 2 * MOST_INTERVALS for each in summary.holdings)
     )
 
 
@@ -127,7 +143,7 @@ def answered(
 
 
 def _asked(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
-    for robot in request.statements:
+    for robot in dict.fromkeys(request.statements):
         found = replica.statements.get(robot, {})
         yield from (found[name] for name in sorted(found))
     for each in request.requested[:MOST_REQUESTED]:

@@ -21,6 +21,8 @@ CHANNELS = (*STREAMED, *STATED)
 """The channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20
 """Most bytes of one member; a submap of a thousand landmarks has two million."""
+LARGEST_SIGNATURE = 8192
+"""Most bytes of a member's signature; an operator's has its certificate in front."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,9 @@ class Member:
 
 def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
     """Decode and check a member. Raises WireError or ValueError."""
-    if len(payload) > LARGEST_MEMBER:
-        raise ValueError(f"too large: {len(payload)} bytes, {LARGEST_MEMBER} at most")
+    for size, most in ((len(payload), LARGEST_MEMBER), (len(signature), LARGEST_SIGNATURE)):
+        if size > most:
+            raise ValueError(f"too large: {size} bytes, {most} at most")
     channel, _, message = opened(Sample(key, payload, 0, 0, -1))
     if channel not in CHANNELS:
         raise ValueError(f"wrong field: {key[:80]!r} is no key of a set's members")

@@ -6,11 +6,11 @@ travel over third robots. They are passed to the fold in an order that it accept
 the initial pose, then the submaps without a gap.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from team.peers.exchange import answered, named, request_for
+from team.peers.exchange import answered, named, oversized, request_for
 from team.peers.members import CHANNELS, Member, Stream, member_of
 from team.peers.proofs import Proofs
 from team.peers.replica import SHARE, RefusedError, Replica
@@ -29,7 +29,9 @@ PATIENCE_S = 3.0
 """A request without an answer goes to another node after this time [s]."""
 FRESH_S = 25.0
 """A summary older than this [s] does not show that its node is in reach."""
-
+MOST_OPEN = 16_384
+"""A node that owes so many members is not asked for more until they arrive or the requests
+expire."""
 
 GIVEN_BYTES = 8 * 2**20
 """Most bytes of members given to one node within a second; to all nodes together GIVEN_TO_ALL."""
@@ -67,9 +69,10 @@ class NodeTraffic:
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    proofs: checks members that come over third nodes; None: there are no keys, and every node is
-    believed. unsaved: new members since it was last cleared. carried: traffic by node. refused: how
-    many members were not kept; last_refused: why.
+    known: the nodes that may have a set: the team's robots and a centre. proofs: checks members
+    that come over third nodes; None: there are no keys, and every node is believed. unsaved: new
+    members since it was last cleared. carried: traffic by node. refused: how many members were not
+    kept; last_refused: why.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -87,9 +90,10 @@ class PeerNode:
         self._answer_s: float | None = None
         self._summaries: dict[str, tuple[float, m.SetSummary]] = {}
         self._asked: dict[tuple[Stream, int], tuple[float, str]] = {}
+        self._open: Counter[str] = Counter()
         self._failures: dict[str, int] = {}
         self._given = Given()
-        self._known = frozenset({*map(ch.robot_node, robots), "central"})
+        self.known = frozenset({*map(ch.robot_node, robots), "central"})
         self._fed: dict[Stream, int] = {}
         self._new_messages: list[m.Message] = []
         self.rebuild = False
@@ -103,16 +107,17 @@ class PeerNode:
 
     def take(self, member: Member, carrier: str) -> bool:
         """Take a member that came from a node; returns whether it is new."""
-        over = self.carried[carrier]
-        over.bytes += member.size
         try:
             outcome = self.replica.add(member)
         except RefusedError as error:
             self._refuse(f"{member.key}: {error}")
             return False
+        over = self.carried[carrier]
+        over.bytes += member.size
         if outcome == "known":
             return False
         over.members += 1
+        self._note_arrival(member.message)
         self.unsaved.append(member)
         self.stamp_ns = max(self.stamp_ns, member.message.stamp_ns)
         if not isinstance(member.message, m.InitialPose | m.Submap | m.SightingFactor):
@@ -131,7 +136,10 @@ class PeerNode:
 
     def take_carried(self, carried: m.Members) -> list[Member]:
         """Take the members that another node carries; returns the new ones."""
-        new_messages = []
+        new_messages: list[Member] = []
+        if carried.node not in self.known:
+            self._refuse(f"members from {carried.node[:80]}, not in this team")
+            return new_messages
         for key, payload, signature in zip(
             carried.keys, carried.payloads, carried.signatures, strict=True
         ):
@@ -184,8 +192,11 @@ class PeerNode:
         """
         if summary.node == self.node:
             return []
-        if summary.node not in self._known:
+        if summary.node not in self.known:
             self._refuse(f"a summary of {summary.node[:80]}, not in this team")
+            return []
+        if oversized(self.replica, summary):
+            self._refuse(f"a summary of {summary.node} with more than a team can have")
             return []
         self._summaries[summary.node] = self._now_s, summary
         if self._announced_digest is not None and summary.digest != self._announced_digest:
@@ -217,9 +228,27 @@ class PeerNode:
             out.append(Outgoing(ch.SET_SUMMARY, self.node, summary))
         return out
 
+    def _note_arrival(self, message: m.Message) -> None:
+        """Forget the request of what has arrived."""
+        match message:
+            case m.InitialPose():
+                self._close(((message.robot, message.incarnation), -1))
+            case m.Submap() | m.SightingFactor():
+                stream = message.robot, message.incarnation
+                if message.sequence in self.replica.share_of(stream).complete:
+                    self._close((stream, message.sequence))
+            case _:
+                pass
+
+    def _close(self, name: tuple[Stream, int]) -> None:
+        asked = self._asked.pop(name, None)
+        if asked is not None:
+            self._open[asked[1]] -= 1
+
     def _forget_questions(self) -> None:
         """Let requests expire; nodes that did not give what they have are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
+        self._open.subtract(node for _, node in over.values())
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
             self._failures[node] = self._failures.get(node, 0) + 1
         self._asked = {name: of for name, of in self._asked.items() if name not in over}
@@ -233,11 +262,16 @@ class PeerNode:
         return [] if received is None else self._ask(received[1])
 
     def _ask(self, summary: m.SetSummary) -> list[Outgoing]:
+        if self._open[summary.node] >= MOST_OPEN:
+            return []
         request = request_for(self.replica, summary, self._asked)
         if request is None:
             return []
         until = self._now_s + PATIENCE_S, summary.node
-        self._asked |= dict.fromkeys(named(request), until)
+        for name in named(request):
+            self._close(name)
+            self._asked[name] = until
+            self._open[summary.node] += 1
         asked = m.MembersRequest(
             stamp_ns=request.stamp_ns,
             node=self.node,
@@ -250,6 +284,9 @@ class PeerNode:
         """The answer to a `MembersRequest`; raises WireError."""
         query = decoded(request, m.MembersRequest)
         asker = query.node
+        if asker not in self.known:
+            self._refuse(f"a request of {asker[:80]}, not in this team")
+            return []
         if not self._given.allows(asker, self._now_s):
             self._refuse(f"{asker[:80]} asks for more than {GIVEN_BYTES} bytes a second")
             return []

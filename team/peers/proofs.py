@@ -14,6 +14,10 @@ from team.wire import messages as m
 
 MOST_SIGNATURES = 250_000
 """Most signatures kept of one node; a robot has one for each of its members."""
+LARGEST_OF_ROBOT = 80
+"""Most bytes of a robot's signature: ECDSA over P-256 has 72 at most."""
+MOST_OF_OPERATOR = 10_000
+"""Most signatures kept of operators; each has a certificate in front."""
 OPERATOR = "operator"
 ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
 """The messages of operators that are members."""
@@ -61,10 +65,13 @@ class Proofs:
         """Keep a signature that a robot or an operator publishes on its own key, of its own
         members only.
         """
-        signatures = self._signatures.setdefault(publisher, {})
-        if len(signatures) < MOST_SIGNATURES and (
-            publisher == OPERATOR or publisher == signature.robot
+        operators = publisher == OPERATOR
+        if not operators and (
+            publisher != signature.robot or len(signature.signature) > LARGEST_OF_ROBOT
         ):
+            return
+        signatures = self._signatures.setdefault(publisher, {})
+        if len(signatures) < (MOST_OF_OPERATOR if operators else MOST_SIGNATURES):
             signatures[signature.member] = signature.signature
 
     def of(self, member: Member) -> bytes:

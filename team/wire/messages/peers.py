@@ -52,6 +52,10 @@ class SetSummary(Message, frozen=True, kw_only=True, tag="set_summary/1"):
                 raise ValueError("out of bounds: sequences are no intervals")
             if any(a + 1 >= b for a, b in zip(ends[1::2], ends[2::2], strict=False)):
                 raise ValueError("not ascending: sequences")
+        streams = [(each.robot, each.incarnation) for each in self.holdings]
+        robots = [each.robot for each in self.statements]
+        if streams != sorted(set(streams)) or robots != sorted(set(robots)):
+            raise ValueError("not ascending: holdings and statements")
 
 
 class Requested(msgspec.Struct, frozen=True, kw_only=True, array_like=True):

@@ -1,0 +1,168 @@
+"""What a hostile or broken peer sends can neither fill a robot nor keep it busy."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from central.config import CentralConfig
+from central.peers.centre import PeerCentre
+from team.door import MOST_LIVES
+from team.peers.exchange import MOST_ASKED
+from team.peers.members import LARGEST_SIGNATURE
+from team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
+from team.peers.proofs import LARGEST_OF_ROBOT, Proofs
+from team.peers.replica import MOST_INTERVALS, MOST_STREAMS
+from team.peers.store import Store
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import WireError, decoded, encoded
+from tests.peers.teams import member, parcel, start
+
+ROBOTS = ("r1", "r2", "r3")
+LIAR = "robot/r3"
+
+
+def node_of() -> PeerNode:
+    return PeerNode("robot/r1", ROBOTS)
+
+
+def claim(robot: str = "r2", incarnation: int = 1, last: int = 10**6) -> m.Holding:
+    return m.Holding(
+        robot=robot, incarnation=incarnation, start=True, sequences=(0, last), digest=bytes(8)
+    )
+
+
+def summary_of(*holdings: m.Holding, serial: int = 0, node: str = LIAR) -> m.SetSummary:
+    return m.SetSummary(
+        stamp_ns=0,
+        node=node,
+        serial=serial,
+        digest=bytes(8),
+        holdings=holdings,
+        statements=(),
+    )
+
+
+def members_of(*keys: str, payload: bytes = b"x", signature: bytes = b"", node: str = LIAR):
+    n = len(keys)
+    return m.Members(
+        stamp_ns=0, node=node, keys=keys, payloads=(payload,) * n, signatures=(signature,) * n
+    )
+
+
+def asked_in(out: list) -> int:
+    """How many submaps are asked for in some messages."""
+    requests = [each.message for each in out if each.channel is ch.MEMBERS]
+    return sum(w.last - w.first + 1 for each in requests for w in each.requested)
+
+
+def test_a_node_that_gives_nothing_is_not_asked_for_more_and_more() -> None:
+    node = node_of()
+    asked = 0
+    for serial in range(100):
+        asked += asked_in(node.hear(summary_of(claim(), claim("r3"), serial=serial)))
+        asked += asked_in(node.more_of(LIAR))
+    assert MOST_OPEN <= asked <= MOST_OPEN + MOST_ASKED
+    node.tick(PATIENCE_S + 1.0)
+    assert asked_in(node.hear(summary_of(claim(), claim("r3")))) > 0
+
+
+def test_what_has_arrived_is_not_counted_as_owed() -> None:
+    node, honest = node_of(), PeerNode("robot/r2", ROBOTS)
+    for each in (start("r2"), *(one for k in range(40) for one in parcel("r2", k, ["r3"]))):
+        honest.take(each, "robot/r2")
+    (out,) = node.hear(honest.replica.summary("robot/r2", 0, 0))
+    assert asked_in([out]) == 40
+    for reply in honest.answer(encoded(out.message)):
+        node.take_carried(decoded(reply, m.Members))
+    owed = sum(of[1] == "robot/r2" for of in node._asked.values())
+    assert node._open["robot/r2"] == owed == 1  # the stream's own mark
+
+
+def test_a_summary_names_each_stream_once_and_no_more_than_a_team_can_have() -> None:
+    for twice in (summary_of(claim(), claim()), summary_of(claim("r3"), claim("r2"))):
+        with pytest.raises(WireError, match="not ascending"):
+            decoded(encoded(twice), m.SetSummary)
+    gaps = tuple(each for k in range(MOST_INTERVALS + 1) for each in (4 * k, 4 * k + 1))
+    lives = (claim(robot, k) for robot in ROBOTS for k in range(MOST_STREAMS + 1))
+    words = tuple(m.Statements(robot=f"x{k}", count=1, digest=bytes(8)) for k in range(9))
+    large = (
+        summary_of(msgspec.structs.replace(claim(), sequences=gaps)),
+        summary_of(*lives),
+        msgspec.structs.replace(summary_of(), statements=words),
+    )
+    node = node_of()
+    for each in large:
+        assert node.hear(decoded(encoded(each), m.SetSummary)) == []
+        assert "more than a team can have" in node.last_refused
+    assert node.tick(2.0)[0].channel is ch.SET_SUMMARY
+    assert asked_in(node.hear(summary_of(claim(incarnation=MOST_LIVES + 1)))) == 0
+
+
+def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted() -> None:
+    node = node_of()
+    for each in (start("r2"), *parcel("r2", 0)):
+        node.take(each, "robot/r2")
+    for k in range(50):
+        stranger = f"robot/x{k}"
+        pose = start(f"x{k}")
+        node.take_carried(members_of(pose.key, payload=pose.payload, node=stranger))
+        node.take(pose, stranger)
+        want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=0)
+        request = m.MembersRequest(stamp_ns=0, node=stranger, requested=(want,))
+        assert node.answer(encoded(request)) == []
+    assert set(node.carried) == {"robot/r2"}
+    assert "not in this team" in node.last_refused
+    centre = PeerCentre(CentralConfig(), ROBOTS)
+    for name in ("robot/x1", "robot/r2", "recorder"):
+        centre.handle(m.Liveliness(stamp_ns=0, node=name, alive=True), 0)
+    assert centre.others == {"robot/r2"}
+
+
+def test_a_large_signature_is_refused_and_does_not_cut_the_file(tmp_path: Path) -> None:
+    node = node_of()
+    poses = [start(robot) for robot in ROBOTS]
+    huge = bytes(5 * 2**20)
+    for pose, signature in zip(poses, (b"", huge, b""), strict=True):
+        node.take_carried(members_of(pose.key, payload=pose.payload, signature=signature))
+    assert f"{len(huge)} bytes, {LARGEST_SIGNATURE} at most" in node.last_refused
+    store = Store(tmp_path / "r1.set")
+    store.append(node.unsaved)
+    store.close()
+    again = Store(tmp_path / "r1.set")
+    again.close()
+    assert [each.key for each in again.members] == [poses[0].key, poses[2].key]
+
+
+class _Signs:
+    certificate = b"c"
+
+    def sign(self, named: bytes) -> bytes:
+        return named
+
+    def refusal(self, node: str, certificate: bytes) -> str | None:
+        return None
+
+    def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
+        return True
+
+
+def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one() -> None:
+    proofs = Proofs("r1", _Signs())
+    pose = start("r3")
+    for size, kept in ((LARGEST_OF_ROBOT + 1, b""), (72, bytes(72))):
+        signature = m.Signature(stamp_ns=0, robot="r3", member=pose.hash, signature=bytes(size))
+        proofs.hear(signature, "r3")
+        assert proofs.of(member(ch.START, pose.message)) == kept
+
+
+def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> None:
+    node = node_of()
+    last = m.Done(
+        stamp_ns=0, robot="r2", incarnation=1, measurements=1, steps=0, submaps=1, ledger=()
+    )
+    node.take(member(ch.ROBOT_DONE, last), "robot/r2")
+    request = m.MembersRequest(stamp_ns=0, node=LIAR, requested=(), statements=("r2",) * 10_000)
+    (reply,) = node.answer(encoded(request))
+    assert len(decoded(reply, m.Members).keys) == 1
