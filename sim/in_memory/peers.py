@@ -176,7 +176,9 @@ class PeerTeam:
             if found[0].delivery == "latest" and found[0].template.startswith("world/"):
                 self._latest[sample.key] = found[0], sample
             for robot, seat in list(self.seats.items()):
-                mine = found[0].name in seat.listens and (robot == CENTRE or found[1] in ("", robot))
+                mine = found[0].name in seat.listens and (
+                    robot == CENTRE or found[1] in ("", robot)
+                )
                 if mine:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
