@@ -38,8 +38,8 @@ def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
 
 @dataclass
 class _Seat:
-    """listens, overhears: names of the channels that its node subscribes to under its name (a centre
-    under any), and under every name.
+    """listens, overhears: names of the channels that its node subscribes to under its own name (a
+    centre under any), and under every name.
     """
 
     node: PeerRobot | PeerCentre
