@@ -255,7 +255,7 @@ def _motion_figures(data: Sequence[Reference], scenario: Scenario) -> tuple[Figu
     given = scenario.robots[0].motion
     if not data:
         raise CalibrationError("no robot has both odometry and a known path")
-    if all(each.intervals.covariances is not None for each in data):
+    if all(each.intervals.claimed.all() for each in data):
         return jackknifed(claims.odometry_factor, data, claims.UNITS)
 
     slow_below = given.slow_below if motion.creep(data, given.slow_below) else 0.0

@@ -43,6 +43,8 @@ def _spans(data: Reference) -> list[float]:
     intervals = data.intervals
     if intervals.increments is None or intervals.covariances is None or not len(intervals.end_ns):
         return []
+    if not intervals.claimed.all():
+        return []
     edges = np.append(intervals.end_ns[0] - intervals.duration_ns[0], intervals.end_ns)
     poses, known = poses_at(data.path, edges, data.gap_ns)
     found, start, sum_ = [], 0, Increment.identity()

@@ -78,14 +78,14 @@ def sensor_poses(
 
 def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
     """Odometry of any form as mean speeds; increments give the speeds of their arc."""
+    speeds = np.column_stack([intervals.forward, intervals.yaw_rate])
+    if intervals.steered:
+        speeds = np.array([steered(motion, *pair) for pair in speeds.tolist()]).reshape(-1, 2)
     if intervals.increments is not None:
-        twists = np.array([moved(each, None).twist for each in intervals.increments]).reshape(-1, 3)
-        rates = twists / (intervals.duration_ns * 1e-9)[:, np.newaxis]
-        return replace(intervals, forward=rates[:, 0], yaw_rate=rates[:, 2])
-    if not intervals.steered:
-        return intervals
-    pairs = zip(intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
-    speeds = np.array([steered(motion, *pair) for pair in pairs]).reshape(-1, 2)
+        told = intervals.as_motions
+        twists = [moved(each, None).twist for each in intervals.increments[told]]
+        rates = np.array(twists).reshape(-1, 3) / (intervals.duration_ns[told, np.newaxis] * 1e-9)
+        speeds[told] = rates[:, [0, 2]]
     return replace(intervals, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)
 
 

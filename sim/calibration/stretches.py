@@ -29,10 +29,10 @@ def _moving(stream: RobotStream) -> int:
     if not len(driven.end_ns):
         return 0
     begin_ns = int(driven.end_ns[0] - driven.duration_ns[0])
-    if driven.increments is None:
-        ways = np.abs(driven.forward) * driven.duration_ns * 1e-9
-    else:
-        ways = np.hypot(driven.increments[:, 0], driven.increments[:, 1])
+    ways = np.abs(driven.forward) * driven.duration_ns * 1e-9
+    if driven.increments is not None:
+        lengths = np.hypot(driven.increments[:, 0], driven.increments[:, 1])
+        ways = np.where(driven.as_motions, lengths, ways)
     seconds = np.append(0.0, (driven.end_ns - begin_ns) * 1e-9)
     edges = SPAN_S * np.arange(int(seconds[-1] / SPAN_S) + 1)
     logged = np.diff(np.interp(edges, seconds, np.append(0.0, np.cumsum(ways))))

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from math import isfinite
+from math import isfinite, nan
 from typing import TypeVar
 
 import numpy as np
@@ -50,6 +50,14 @@ class CsvTable:
         """The columns' finite numbers; raises DatasetError."""
         taken = [np.array(self._parsed(column, _number)) for column in columns]
         return np.column_stack(taken).astype(np.float64) if taken else np.zeros((len(self), 0))
+
+    def known_numbers(self, *columns: str) -> Float[np.ndarray, "rows columns"]:
+        """The columns' finite numbers, NaN in empty cells; raises DatasetError."""
+        taken = [
+            np.array(self._parsed(column, lambda text: _number(text) if text else nan))
+            for column in columns
+        ]
+        return np.column_stack(taken).astype(np.float64)
 
     def stamps(self, column: str, unit_s: Decimal = Decimal(1)) -> Int64[np.ndarray, " rows"]:
         """Times in nanoseconds, exactly as in the text; raises DatasetError."""
@@ -149,6 +157,14 @@ def read_table(file: File, name: str, known: Sequence[str] | None = None) -> Csv
     by_column = zip(*cells, strict=True) if cells else ([] for _ in header)
     columns = {column: list(each) for column, each in zip(header, by_column, strict=True)}
     return CsvTable(name, columns, lines)
+
+
+def cells_of(numbers: Float[np.ndarray, "R C"]) -> Sequence[Sequence[object]]:
+    """The rows; NaN is an empty cell."""
+    rows: list[list[object]] = numbers.tolist()
+    if not np.isnan(numbers).any():
+        return rows
+    return [["" if value != value else value for value in row] for row in rows]
 
 
 def _header(rows: Iterable[list[str]], name: str) -> list[str]:

@@ -1,6 +1,7 @@
 """Detections without identities in a robot's folder of a data set.
 
-r1/detections.csv   t_s,range_m,bearing_rad, with c_rr,c_rb,c_bb and diameter_m if there are any
+r1/detections.csv   t_s,range_m,bearing_rad, with c_rr,c_rb,c_bb and diameter_m in the scans that
+                    have them
 r1/labels.csv       landmark: row by row of detections.csv, -1 for clutter; for scoring (optional)
 """
 
@@ -10,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import UInt32
 
-from sim.datasets.csv_table import CsvTable, read_table
-from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
+from sim.datasets.csv_table import CsvTable, cells_of, read_table
+from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE, covariances_of
 from sim.datasets.tables import File
 from sim.datasets.utias_rows import on_circle
 from sim.world.identities import in_order
@@ -46,9 +47,9 @@ def detections_of(place: File, robot: str) -> Detections | None:
         ids=_labels(_read(place, FILES[1], robot, LABELS), len(stamps)),
         ranges=ranges.copy(),
         bearings=on_circle(bearings),
-        covariances=table.numbers(*POLAR_COVARIANCE) if claims else None,
+        covariances=covariances_of(table, POLAR_COVARIANCE) if claims else None,
         hidden=np.ones(len(first), np.bool_),
-        signatures=table.numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
+        signatures=table.known_numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
     )
 
 
@@ -62,7 +63,7 @@ def together(named: Detections, unnamed: Detections | None) -> Detections:
 
 def rows_of(
     seen: Detections,
-) -> tuple[Sequence[str], Iterable[tuple[int, Sequence[float]]], Sequence[int]]:
+) -> tuple[Sequence[str], Iterable[tuple[int, Sequence[object]]], Sequence[int]]:
     """Columns of detections.csv, its rows (stamp [ns], numbers), and the labels."""
     numbers = np.column_stack((seen.ranges, seen.bearings))
     columns = ["t_s", *POLAR]
@@ -74,7 +75,7 @@ def rows_of(
         columns.append("diameter_m")
     stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets)).tolist()
     labels = [-1 if label == NO_LABEL else label for label in seen.ids.tolist()]
-    return columns, zip(stamps, numbers.tolist(), strict=True), labels
+    return columns, zip(stamps, cells_of(numbers), strict=True), labels
 
 
 def split(seen: Detections) -> tuple[Detections, Detections | None]:
@@ -94,11 +95,16 @@ def _where(seen: Detections, chosen: np.ndarray) -> Detections:
         ids=seen.ids[rows],
         ranges=seen.ranges[rows],
         bearings=seen.bearings[rows],
-        points=None if seen.points is None else seen.points[rows],
-        covariances=None if seen.covariances is None else seen.covariances[rows],
+        points=_any(seen.points, rows),
+        covariances=_any(seen.covariances, rows),
         hidden=None if seen.hidden is None else seen.hidden[chosen],
-        signatures=None if seen.signatures is None else seen.signatures[rows],
+        signatures=_any(seen.signatures, rows),
     )
+
+
+def _any(values: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
+    """The chosen rows; None where all of them are NaN."""
+    return None if values is None or np.isnan(values[rows]).all() else values[rows]
 
 
 def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTable | None:

@@ -1,7 +1,7 @@
 """A robot's odometry.csv in any of its forms → intervals in order of time."""
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 
 from sim.datasets.csv_table import CsvTable
 from sim.datasets.folder_tables import (
@@ -12,6 +12,7 @@ from sim.datasets.folder_tables import (
     SPEEDS,
     STEERED,
     Rows,
+    numbers_in,
     pose_covariances,
 )
 from sim.datasets.utias_rows import on_circle
@@ -19,7 +20,8 @@ from sim.world.streams import Intervals, moved
 from team.config import Bounds
 from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
-FORMS = (SPEEDS, POSES, INCREMENTS, STEERED)
+FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)
+MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))
 LONG_GAP_NS = 2_000_000_000
 WHIRLING_RAD_S = 2.0 * np.pi
 """A median yaw rate above this [rad/s] is probably not in radians."""
@@ -38,19 +40,21 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     column duration_s they are the means over the time that ends at t_s. Poses are of t_s; an
     increment ends at t_s and begins at the row before. A car's wheel speed and steering hold as
     speeds do. A covariance is of the motion that its row tells (a pose's: of the motion since the
-    row before), of an error in the frame of its end; speeds that have one become increments.
+    row before), of an error in the frame of its end; speeds that have one become increments. With a
+    column duration_s, rows of speeds and rows of increments may be in one table.
     """
     if table is None:
         none = np.empty(0, np.int64)
         return Intervals(none, none, np.empty(0), np.empty(0)), []
     rows = Rows(table, "odometry row")
-    form = _form(table)
+    forms = _forms(table)
+    form = forms[0]
     rows.drop(
         np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
         "another row has the same time, so it lasts no time",
     )
     stamps = rows.stamps_ns + offset_ns
-    numbers = rows.table.numbers(*form)
+    numbers = numbers_in(rows.table, form, forms)
     duration = np.diff(stamps)
     used = slice(None)
     if form == POSES:
@@ -66,11 +70,18 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
         seconds = duration.max() * 1e-9
         rows.notes.append(f"odometry has a gap of {seconds:.1f} s: one interval lasts as long")
     claims = _claimed(rows, form, used)
-    if form == SPEEDS and claims is not None:
-        steps = arcs(steps, duration)
-    if form in (SPEEDS, STEERED) and claims is None:
+    if form in (SPEEDS, STEERED):
         forward, yaw_rate = steps.T.copy() if len(steps) else np.zeros((2, 0))
-        intervals = Intervals(ends, duration, forward, yaw_rate, steered=form == STEERED)
+        motions = numbers_in(rows.table, INCREMENTS, forms)[used]
+        if form == SPEEDS and claims is not None:
+            arced = ~np.isnan(claims[:, 0, 0]) & np.isnan(motions[:, 0])
+            motions[arced] = arcs(steps[arced], duration[arced])
+        as_motions = ~np.isnan(motions[:, 0])
+        forward[as_motions], yaw_rate[as_motions] = 0.0, 0.0
+        told = motions if as_motions.any() else None
+        intervals = Intervals(ends, duration, forward, yaw_rate, form == STEERED, told, claims)
+        if len(forms) > 1:
+            _judge_speeds(rows, INCREMENTS, motions, duration)
     else:
         intervals = moved(ends, duration, steps, claims)
     _judge_pace(rows, duration)
@@ -114,15 +125,29 @@ def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return None
     matrices = pose_covariances(table)
-    if form == STEERED:
-        raise table.fault(
+    given = ~np.isnan(matrices[:, 0, 0])
+    of_motions = given if form != STEERED else _filled(table, INCREMENTS)
+    for row in np.flatnonzero(given & ~of_motions)[:1].tolist():
+        raise table.error(
+            row,
+            "c_xx",
             f"covariances come with {','.join(SPEEDS)} or {','.join(POSES)} or "
-            f"{','.join(INCREMENTS)}; a car's noise stands in the scenario"
+            f"{','.join(INCREMENTS)}; a car's noise stands in the scenario",
         )
-    covariances = matrices[used]
-    for row in np.flatnonzero(np.linalg.eigvalsh(covariances)[:, 0] <= 0.0)[:1].tolist():
+    least = np.linalg.eigvalsh(np.where(given[:, np.newaxis, np.newaxis], matrices, np.eye(3)))
+    for row in np.flatnonzero(least[used, 0] <= 0.0)[:1].tolist():
         raise table.error(row + (used.start or 0), "c_xx", NOT_A_COVARIANCE)
-    return covariances
+    without = np.zeros(len(table), np.bool_)
+    without[used] = ~given[used]
+    rows.note(without, "without a covariance, as others have: the scenario's noise holds for it")
+    return matrices[used]
+
+
+def _filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, " rows"]:
+    """Which rows have these columns filled."""
+    if not table.has(*columns):
+        return np.zeros(len(table), np.bool_)
+    return np.asarray(~np.isnan(table.known_numbers(*columns)).any(axis=1))
 
 
 def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
@@ -186,10 +211,11 @@ def _judge_speeds(
     )
 
 
-def _form(table: CsvTable) -> tuple[str, ...]:
-    found = [form for form in FORMS if table.has(*form)]
-    if len(found) == 1:
-        return found[0]
+def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
+    """The form of its rows; speeds, and increments in other rows, where it has both."""
+    found = tuple(form for form in FORMS if table.has(*form))
+    if len(found) == 1 or (found in MIXED and table.has("duration_s")):
+        return found
     forms = " or ".join(",".join(form) for form in FORMS)
     what = "more than one form of odometry" if found else "no odometry"
     raise table.fault(f"{what} in its columns; give t_s with one of {forms}")

@@ -113,7 +113,7 @@ class Scans:
         )
 
     def grouped(self) -> Detections:
-        """One message per stamp."""
+        """One message per stamp and form."""
         return grouped(
             self.stamps_ns, self.ids, self.ranges, self.bearings, self.points, self.covariances
         )
@@ -158,7 +158,7 @@ def measurements_of(
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
         aa, ab, bb = found.covariances.T
-        found = keep((aa > 0.0) & (aa * bb > ab * ab), NOT_A_COVARIANCE)
+        found = keep(np.isnan(aa) | ((aa > 0.0) & (aa * bb > ab * ab)), NOT_A_COVARIANCE)
     single = first_of_each(found.stamps_ns, found.ids, np.ones(len(found.ids), np.bool_))
     found = keep(single, f"a second one of the same {column} at the same time")
     if driven is not None:
@@ -191,50 +191,91 @@ def _cells(table: CsvTable) -> list[tuple[str, ...]]:
 
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
     """Ranges and bearings or points, with the detector's covariances if they are allowed."""
-    table, stamps = rows.table, rows.stamps_ns
-    if table.has(*POLAR) and table.has(*POINTS):
-        raise table.fault(
-            f"two forms of measurements; give {','.join(POLAR)} or {','.join(POINTS)}, not both"
-        )
-    if table.has(*POLAR):
-        ranges, bearings = table.numbers(*POLAR).T
-        for row in np.flatnonzero(np.abs(bearings) > MOST_RAD)[:1].tolist():
-            raise table.error(
-                row,
-                "bearing_rad",
-                f"{bearings[row]:g} is more than a whole turn; bearings are in radians: of degrees "
-                "a map of columns makes them (scale = 0.017453292519943295)",
-            )
-        claimed = _own(table, POLAR_COVARIANCE) if claims else None
-        return Scans(stamps, ids, ranges.copy(), on_circle(bearings), None, claimed)
-    if not table.has(*POINTS):
+    table = rows.table
+    forms = [form for form in (POLAR, POINTS) if table.has(*form)]
+    if not forms:
         raise table.fault(
             f"no measurement in its columns; give {','.join(POLAR)} or {','.join(POINTS)}"
         )
-    points = table.numbers(*POINTS)
-    x, y = points.T
-    ranges, bearings = np.hypot(x, y), on_circle(np.arctan2(y, x))
-    claimed = _own(table, POINT_COVARIANCE) if claims else None
-    return Scans(stamps, ids, ranges, bearings, points if claims else None, claimed)
+    polar, points = (numbers_in(table, form, forms) for form in (POLAR, POINTS))
+    ranges, bearings = polar.T.copy()
+    for row in np.flatnonzero(np.abs(bearings) > MOST_RAD)[:1].tolist():
+        raise table.error(
+            row,
+            "bearing_rad",
+            f"{bearings[row]:g} is more than a whole turn; bearings are in radians: of degrees "
+            "a map of columns makes them (scale = 0.017453292519943295)",
+        )
+    bearings, as_points = on_circle(bearings), ~np.isnan(points[:, 0])
+    x, y = points[as_points].T
+    ranges[as_points], bearings[as_points] = np.hypot(x, y), on_circle(np.arctan2(y, x))
+    claimed = _own(rows, forms, as_points) if claims else None
+    kept = points if claims and as_points.any() else None
+    return Scans(rows.stamps_ns, ids, ranges, bearings, kept, claimed)
 
 
-def _own(table: CsvTable, columns: tuple[str, ...]) -> Float[np.ndarray, "R 3"] | None:
-    other = {*POLAR_COVARIANCE, *POINT_COVARIANCE} - {*columns}
-    wrong = [column for column in other if table.has(column)]
-    if wrong or any(table.has(c) for c in columns) != table.has(*columns):
-        raise table.fault(f"a covariance here has the columns {','.join(columns)}, all three")
-    return covariances_of(table, columns) if table.has(*columns) else None
+def _own(
+    rows: Rows, forms: Sequence[tuple[str, ...]], as_points: Bool[np.ndarray, " R"]
+) -> Float[np.ndarray, "R 3"] | None:
+    """The covariances of ranges and bearings and of points, NaN in rows that have none."""
+    table, claimed = rows.table, np.full((len(rows.table), 3), np.nan)
+    allowed = [POLAR_COVARIANCE if form == POLAR else POINT_COVARIANCE for form in forms]
+    there = {c for c in (*POLAR_COVARIANCE, *POINT_COVARIANCE) if table.has(c)}
+    whole = [columns for columns in allowed if table.has(*columns)]
+    if there != {column for columns in whole for column in columns}:
+        names = " or ".join(",".join(columns) for columns in allowed)
+        raise table.fault(f"a covariance here has the columns {names}, all three")
+    if not whole:
+        return None
+    for columns in whole:
+        given = covariances_of(table, columns)
+        own = as_points if columns == POINT_COVARIANCE else ~as_points
+        for row in np.flatnonzero(~np.isnan(given[:, 0]) & ~own)[:1].tolist():
+            raise table.error(row, columns[0], "a covariance of the form that is not in this row")
+        claimed[own] = given[own]
+    unclaimed = np.isnan(claimed[:, 0])
+    rows.note(unclaimed, "without a covariance, as others have: the sensor's noise holds for it")
+    return claimed
+
+
+def numbers_in(
+    table: CsvTable, form: tuple[str, ...], forms: Sequence[tuple[str, ...]]
+) -> Float[np.ndarray, "R _"]:
+    """The numbers of one form of the table's, NaN in the rows that are of another.
+
+    Raises DatasetError for a row that is not of exactly one form.
+    """
+    if form not in forms:
+        return np.full((len(table), len(form)), np.nan)
+    if len(forms) == 1:
+        return table.numbers(*form)
+    cells = {each: zip(*(table.columns[c] for c in each), strict=True) for each in forms}
+    filled = np.array([[any(row) for row in cells[each]] for each in forms]).reshape(len(forms), -1)
+    for row in np.flatnonzero(filled.sum(axis=0) != 1)[:1].tolist():
+        what = "in two forms" if filled[:, row].any() else "in no form"
+        names = " or ".join(",".join(each) for each in forms)
+        raise table.error(row, forms[0][0], f"{what}; a row has {names}, its other cells are empty")
+    numbers = table.known_numbers(*form)
+    mine = filled[list(forms).index(form)]
+    for row in np.flatnonzero(mine & np.isnan(numbers).any(axis=1))[:1].tolist():
+        column = form[int(np.isnan(numbers[row]).argmax())]
+        raise table.error(row, column, "empty; correct it, or take the row out")
+    return numbers
 
 
 def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray, "R _"]:
-    """Each row's packed covariance; raises DatasetError, and names a row that has none."""
-    for column in columns:
-        cells = table.columns[column]
-        if "" in cells:
-            raise table.error(
-                cells.index(""), column, "no covariance here; give them in all rows or in none"
-            )
-    return table.numbers(*columns)
+    """Each row's packed covariance, NaN in a row that has none; raises DatasetError where a row
+    has a part of one.
+    """
+    numbers = table.known_numbers(*columns)
+    empty = np.isnan(numbers)
+    for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1].tolist():
+        raise table.error(
+            row,
+            columns[int(empty[row].argmax())],
+            f"no number here; a covariance has all of {','.join(columns)}, or none in this row",
+        )
+    return numbers
 
 
 def truth_of(

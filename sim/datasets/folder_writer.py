@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sim.datasets.csv_table import cells_of
 from sim.datasets.detections_table import rows_of, split
 from sim.datasets.folder_tables import (
     INCREMENTS,
@@ -67,19 +68,24 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
 
 def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
     """Columns and rows, by the odometry's own clock: a row at the beginning of each interval and
-    one at the end of the last; of increments one at the end of each.
+    one at the end of the last; of increments, or of both, one at the end of each.
     """
     intervals = stream.intervals
     ends_ns = intervals.end_ns - stream.clock_offset_ns
     if intervals.increments is not None:
         columns = ["t_s", "duration_s", *INCREMENTS]
         numbers = intervals.increments
+        if not intervals.as_motions.all():
+            columns += STEERED if intervals.steered else SPEEDS
+            speeds = np.column_stack([intervals.forward, intervals.yaw_rate])
+            speeds[intervals.as_motions] = np.nan
+            numbers = np.hstack((numbers, speeds))
         if intervals.covariances is not None:
             columns += POSE_COVARIANCE
             packed = intervals.covariances[:, [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
             numbers = np.hstack((numbers, packed))
         times = zip(ends_ns.tolist(), intervals.duration_ns.tolist(), strict=True)
-        measured = zip(times, numbers.tolist(), strict=True)
+        measured = zip(times, cells_of(numbers), strict=True)
         return columns, [(seconds(end), seconds(length), *row) for (end, length), row in measured]
     begins = (ends_ns - intervals.duration_ns).tolist()
     pairs = zip(begins, intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
@@ -92,24 +98,38 @@ def _measured(
     seen: Detections, name: str, names: Sequence[object]
 ) -> tuple[Sequence[str], Iterable[Row]]:
     """Columns and rows, message by message; an empty message is a time alone."""
-    columns = ["t_s", name, *(POLAR if seen.points is None else POINTS)]
-    numbers = np.column_stack((seen.ranges, seen.bearings)) if seen.points is None else seen.points
-    if seen.covariances is not None:
-        columns += POLAR_COVARIANCE if seen.points is None else POINT_COVARIANCE
-        numbers = np.hstack((numbers, seen.covariances))
-    return columns, _measured_rows(seen, names, numbers.tolist())
+    columns, parts = ["t_s", name], []
+    polar = np.column_stack((seen.ranges, seen.bearings))
+    points = np.full_like(polar, np.nan) if seen.points is None else seen.points
+    as_points = ~np.isnan(points[:, 0])
+    polar[as_points] = np.nan
+    for form, own, among in (
+        ((POLAR, POLAR_COVARIANCE), polar, ~as_points),
+        ((POINTS, POINT_COVARIANCE), points, as_points),
+    ):
+        if among.any() or (seen.points is None) == (form[0] == POLAR):
+            columns += form[0]
+            parts.append(own)
+            if seen.covariances is not None:
+                columns += form[1]
+                parts.append(np.where(among[:, np.newaxis], seen.covariances, np.nan))
+    numbers = cells_of(np.hstack(parts))
+    return columns, _measured_rows(seen, names, numbers, len(columns) - 1)
 
 
 def _measured_rows(
-    seen: Detections, names: Sequence[object], numbers: Sequence[Sequence[float]]
+    seen: Detections,
+    names: Sequence[object],
+    numbers: Sequence[Sequence[object]],
+    width: int,
 ) -> Iterable[Row]:
-    width = 2 if seen.covariances is None else 5
+    """The rows of each message; width: of the cells behind the time."""
     offsets = seen.offsets.tolist()
     for message, stamp_ns in enumerate(seen.stamps_ns.tolist()):
         time = seconds(stamp_ns)
         first, last = offsets[message : message + 2]
         if first == last:
-            yield (time, *[""] * (width + 1))
+            yield (time, *[""] * width)
         for i in range(first, last):
             yield (time, names[i], *numbers[i])
 

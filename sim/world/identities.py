@@ -111,7 +111,10 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
 
 
 def in_order(parts: list[Detections]) -> Detections:
-    """The messages of all parts by time; at equal times those with identities first."""
+    """The messages of all parts by time; at equal times those with identities first.
+
+    What only some parts have, as points or covariances, is NaN in the others' rows.
+    """
     if len(parts) == 1:
         return parts[0]
     stamps = np.concatenate([part.stamps_ns for part in parts])
@@ -123,9 +126,17 @@ def in_order(parts: list[Detections]) -> Detections:
     def joined(values: list[Float[np.ndarray, "..."]]) -> Float[np.ndarray, "..."]:
         return np.concatenate(values)
 
-    def optional(name: str) -> Float[np.ndarray, "..."] | None:
+    def optional(name: str, width: int) -> Float[np.ndarray, "..."] | None:
         values = [getattr(piece, name) for piece in chosen]
-        return None if any(value is None for value in values) else joined(values)
+        if all(value is None for value in values):
+            return None
+        shapes = [(count, width) if width > 1 else (count,) for count in counts]
+        return joined(
+            [
+                np.full(shape, np.nan) if value is None else value
+                for value, shape in zip(values, shapes, strict=True)
+            ]
+        )
 
     return Detections(
         stamps_ns=np.concatenate([piece.stamps_ns for piece in chosen]),
@@ -133,8 +144,8 @@ def in_order(parts: list[Detections]) -> Detections:
         ids=np.concatenate([piece.ids for piece in chosen]),
         ranges=joined([piece.ranges for piece in chosen]),
         bearings=joined([piece.bearings for piece in chosen]),
-        points=None,
-        covariances=optional("covariances"),
+        points=optional("points", 2),
+        covariances=optional("covariances", 3),
         hidden=np.concatenate([piece.hidden for piece in chosen if piece.hidden is not None]),
-        signatures=None,
+        signatures=optional("signatures", 1),
     )

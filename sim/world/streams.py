@@ -39,7 +39,8 @@ class Intervals:
     Interval k ends where interval k + 1 begins. steered: of a car, whose forward is the speed of
     the wheel [m/s] and yaw_rate the steering angle [rad]. increments: odometry that measures
     motions instead, each the pose (x, y, theta) of its end in the frame of its start; forward and
-    yaw_rate are then zero. covariances: of the increments, in the frame of the end.
+    yaw_rate are then zero. covariances: of the increments, in the frame of the end. An increment of
+    NaN: that interval has speeds; a covariance of NaN: that motion has none.
     """
 
     end_ns: Int64[np.ndarray, " I"]
@@ -49,6 +50,20 @@ class Intervals:
     steered: bool = False
     increments: Float[np.ndarray, "I 3"] | None = None
     covariances: Float[np.ndarray, "I 3 3"] | None = None
+
+    @property
+    def as_motions(self) -> Bool[np.ndarray, " I"]:
+        """Which of them measure a motion."""
+        if self.increments is None:
+            return np.zeros(len(self.end_ns), np.bool_)
+        return np.asarray(~np.isnan(self.increments[:, 0]))
+
+    @property
+    def claimed(self) -> Bool[np.ndarray, " I"]:
+        """Which of them have a covariance of their own."""
+        if self.covariances is None:
+            return np.zeros(len(self.end_ns), np.bool_)
+        return np.asarray(~np.isnan(self.covariances[:, 0, 0]))
 
     def where(self, chosen: Bool[np.ndarray, " I"]) -> "Intervals":
         """The chosen intervals."""
@@ -69,7 +84,9 @@ class Detections:
 
     ids are landmark identities, or indices into a tuple of teammates. points: the sensor measures
     these (x, y) in its frame [m], and ranges and bearings are computed from them. covariances: that
-    each measurement carries, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points. hidden:
+    each measurement carries, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points. A point
+    of NaN: that one was measured as range and bearing; a covariance of NaN: it has none; the rows
+    of a message are alike. hidden:
     messages that are published without identities (None: none); their ids are for scoring, NO_LABEL
     of clutter. signatures: a number for each that is alike for the same landmark, of hidden ones
     only.
@@ -178,14 +195,15 @@ class RobotStream:
         """The odometry interval with this measurement counter."""
         row = self._row(counter, ODOMETRY)
         intervals = self.intervals
+        increment = _known(intervals.increments, row)
         return OdometryMeasurement(
             int(intervals.end_ns[row]),
             int(intervals.duration_ns[row]),
             float(intervals.forward[row]),
             float(intervals.yaw_rate[row]),
-            intervals.steered,
-            None if intervals.increments is None else intervals.increments[row],
-            None if intervals.covariances is None else intervals.covariances[row],
+            intervals.steered and increment is None,
+            increment,
+            _known(intervals.covariances, row),
         )
 
     def observations(self, counter: int) -> ObservationMeasurement:
@@ -198,10 +216,10 @@ class RobotStream:
             ids=seen.ids[at],
             ranges=seen.ranges[at],
             bearings=seen.bearings[at],
-            points=None if seen.points is None else seen.points[at],
-            covariances=None if seen.covariances is None else seen.covariances[at],
+            points=_alike(seen.points, at),
+            covariances=_alike(seen.covariances, at),
             hidden=seen.hidden is not None and bool(seen.hidden[row]),
-            signatures=None if seen.signatures is None else seen.signatures[at],
+            signatures=_alike(seen.signatures, at),
         )
 
     def sightings(self, counter: int) -> SightingMeasurement:
@@ -220,6 +238,16 @@ class RobotStream:
                 f"{KIND_NAMES[kind]}"
             )
         return int(self.rows[counter])
+
+
+def _known(values: np.ndarray | None, row: int) -> np.ndarray | None:
+    """A row of the array; None where there is no array, or the row is NaN."""
+    return None if values is None or np.isnan(values[row].flat[0]) else values[row]
+
+
+def _alike(values: np.ndarray | None, rows: slice) -> np.ndarray | None:
+    """The rows of one message; None where there is no array, or they are NaN."""
+    return None if values is None or np.isnan(values[rows]).any() else values[rows]
 
 
 @dataclass(frozen=True)
@@ -331,8 +359,21 @@ def grouped(
     points: Float[np.ndarray, "R 2"] | None = None,
     covariances: Float[np.ndarray, "R 3"] | None = None,
 ) -> Detections:
-    """Measurements in order of time → one message per stamp."""
-    first = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[:1] - 1))
+    """Measurements in order of time → one message per stamp, and per form."""
+    bare = np.zeros(len(stamps_ns), np.bool_)
+    polar = bare if points is None else np.isnan(points[:, 0])
+    unclaimed = bare if covariances is None else np.isnan(covariances[:, 0])
+    form = 2 * polar.astype(np.int64) + unclaimed
+    if form.any() and not form.all():
+        order = np.lexsort((form, stamps_ns))
+        stamps_ns, ids, ranges, bearings = (
+            each[order] for each in (stamps_ns, ids, ranges, bearings)
+        )
+        points = None if points is None else points[order]
+        covariances = None if covariances is None else covariances[order]
+        form = form[order]
+    changes = np.diff(stamps_ns, prepend=stamps_ns[:1] - 1) | np.diff(form, prepend=form[:1])
+    first = np.flatnonzero(changes)
     offsets = np.append(first, len(stamps_ns)).astype(np.int64)
     return Detections(stamps_ns[first], offsets, ids, ranges, bearings, points, covariances)
 

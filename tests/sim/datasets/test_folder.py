@@ -340,7 +340,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
         (
             "observations",
             "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,1,0,1\n2,1,1,1,1,,\n",
-            "line 3, column c_xy: no covariance here; give them in all rows or in none",
+            "line 3, column c_xy: no number here; a covariance has all of c_xx,c_xy,c_yy, or none",
         ),
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
     ],
