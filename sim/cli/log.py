@@ -14,7 +14,9 @@ from sim.cli.options import (
     LogArgument,
     counted,
     fail,
+    one_line,
     refuse_existing,
+    tell_holes,
     warn_of_holes,
 )
 from sim.cli.recorded import repair
@@ -32,6 +34,7 @@ ChannelNames = Annotated[
     str | None, typer.Option(help="Channels, as odometry,submap; all without.", metavar="NAMES")
 ]
 
+NOT_FINISHED = "not finished by its recorder"
 app = typer.Typer(name="log", help="Logs: info, check, repair, cut, merge, export.")
 app.command()(repair)
 
@@ -60,17 +63,19 @@ def info(
     from rich.console import Console
     from rich.text import Text
 
+    from team.recording.check import holes
     from team.recording.reader import open_log
     from team.recording.summary import summarised
 
     opened = open_log(log)
+    lacks = holes(opened)
     summary = summarised(opened)
     span = summary.span_ns()
     console = Console()
     messages, size = (sum(getattr(k, name) for k in summary.keys) for name in ("messages", "bytes"))
-    state = "complete" if opened.complete else "not finished by its recorder"
+    state = "complete" if not lacks else "not whole" if opened.complete else NOT_FINISHED
     typer.echo(
-        f"{log}\nteam {_line(opened.team)}, {state}: {messages} messages, {size} payload bytes"
+        f"{log}\nteam {one_line(opened.team)}, {state}: {messages} messages, {size} payload bytes"
     )
     if span is not None:
         first, last = (ns * 1e-9 for ns in span)
@@ -79,14 +84,14 @@ def info(
         )
         console.print(_key_table(summary.keys, span[0], by_key=keys))
     for name, value in opened.metadata.items():
-        console.print(Text(_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
-    for damage in summary.damaged:
-        typer.echo(f"damaged: {_line(damage)}", err=True)
+        console.print(Text(one_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
+    tell_holes(log, lacks)
     if json_file is not None:
         figures = {
             "log": str(log),
             "team": opened.team,
             "complete": opened.complete,
+            "lacks": [str(each) for each in lacks],
             "span_ns": span,
             "keys": [{**asdict(each), "rate_hz": each.rate_hz} for each in summary.keys],
             "metadata": opened.metadata,
@@ -106,7 +111,7 @@ def check(log: LogArgument) -> None:
 
     findings = checked(open_log(log))
     for finding in findings:
-        typer.echo(_line(str(finding)))
+        typer.echo(one_line(str(finding)))
     if findings:
         raise typer.Exit(FAILED)
     typer.echo(f"{log}: nothing wrong")
@@ -227,11 +232,6 @@ def _channels(names: str | None) -> "list[Channel] | None":
     return [known[name] for name in dict.fromkeys(given)]
 
 
-def _line(text: str) -> str:
-    """A text of an untrusted file as one line without control characters for a terminal."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
-
-
 def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> "Table":
     """Messages, bytes, rate of one key, first and last time [s after start_ns], by key or channel.
 
@@ -251,7 +251,7 @@ def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> 
         running = [each.rate_hz for each in of if each.first_ns >= start_ns]
         rates = [rate for rate in running if rate is not None]
         table.add_row(
-            Text(_line(name)),
+            Text(one_line(name)),
             str(len(of)),
             str(sum(each.messages for each in of)),
             str(sum(each.bytes for each in of)),

@@ -3,6 +3,7 @@
 import logging
 import math
 import re
+from collections.abc import Sequence
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
@@ -17,6 +18,7 @@ from team.config import Estimator, FusionRule
 if TYPE_CHECKING:
     from team.keys.credentials import Credentials
     from team.keys.signing import Signer
+    from team.recording.check import Finding
     from team.recording.reader import Log
     from team.wire.zenoh.bus import ZenohBus
 
@@ -171,12 +173,21 @@ def warn_of_holes(log: "Log") -> None:
     """Warn on stderr of what a log lacks, since results made of it lack it, too."""
     from team.recording.check import holes
 
-    found = holes(log)
+    tell_holes(log.path, holes(log))
+
+
+def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
+    """Warn on stderr of these findings in a log."""
     for finding in found[:MOST_HOLES]:
-        typer.echo(f"warning: {log.path} is not whole, {finding}", err=True)
+        typer.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:
         more = counted(len(found) - MOST_HOLES, "more finding")
-        typer.echo(f"warning: {more}: `teamslam log check {log.path}` names all", err=True)
+        typer.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
+
+
+def one_line(text: str) -> str:
+    """A text of an untrusted file as one line without control characters for a terminal."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
 
 
 def counted(count: int, what: str) -> str:

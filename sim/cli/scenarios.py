@@ -51,19 +51,21 @@ def simulate(
 ) -> None:
     """Write a scenario's world as a data set, with a scenario that runs it.
 
-    In the UTIAS format; with hidden identities as CSV tables, detections and their labels apart.
+    In the UTIAS format; as CSV tables where that does not have the measurements: motions,
+    points, covariances, detections without identities (their labels are in a file of their own).
     """
     from sim.datasets.folder_writer import write_folder
-    from sim.datasets.utias_writer import write_utias
+    from sim.datasets.utias_writer import beyond_utias, write_utias
     from sim.scenarios.source import streams_of
     from sim.scenarios.toml import data_set_scenario, folder_scenario
 
     if output.exists() and any(output.iterdir()):
         fail(f"{output} is not empty: give a new folder", WRONG_USE)
     resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, identities=identities)
-    hidden = getattr(resolved.world, "identities", "known") == "hidden"
-    (write_folder if hidden else write_utias)(streams_of(resolved), output)
+    streams = streams_of(resolved)
+    tables = bool(beyond_utias(streams))
+    (write_folder if tables else write_utias)(streams, output)
     beside = output / "scenario.toml"
-    text = folder_scenario(resolved) if hidden else data_set_scenario(resolved)
+    text = folder_scenario(resolved) if tables else data_set_scenario(resolved)
     beside.write_text(text, encoding="utf-8")
     typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")

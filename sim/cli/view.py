@@ -140,7 +140,7 @@ def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
         if path is not None:
             refuse_existing(path)
     if export is not None:
-        typer.echo(f"{export}: {export_views(log, export)} messages")
+        typer.echo(f"{export}: {export_views(log, export)}")
     if layout is not None:
         owners = {ROBOT_CONFIG.owner(sample.key) for sample in log.samples((ROBOT_CONFIG,))}
         layout.write_text(layout_of(log.team, [name for name in owners if name]), "utf-8")

@@ -43,6 +43,22 @@ def write_utias(streams: WorldStreams, directory: Path | str) -> None:
         _write_robot(folder, stream, number, shift)
 
 
+def beyond_utias(streams: WorldStreams) -> list[str]:
+    """The forms of these measurements that the format does not have."""
+    intervals = [stream.intervals for stream in streams.streams]
+    seen = [stream.landmark_detections for stream in streams.streams]
+    found = {
+        "odometry as motions": any(each.increments is not None for each in intervals),
+        "a car's wheel speed and steering": any(each.steered for each in intervals),
+        "detections without identities": any(
+            each.hidden is not None and each.hidden.any() for each in seen
+        ),
+        "landmarks as points": any(each.points is not None for each in seen),
+        "covariances of landmarks": any(each.covariances is not None for each in seen),
+    }
+    return [form for form, there in found.items() if there]
+
+
 def landmark_shift(streams: WorldStreams) -> int:
     """The number that `write_utias` adds to the landmarks' ids."""
     last_robot = max(ROBOTS, len(streams.streams))

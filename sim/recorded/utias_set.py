@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from sim.datasets.utias_writer import write_utias
+from sim.datasets.utias_writer import beyond_utias, write_utias
 from sim.recorded.streams import recorded_streams
 from team.driver.source import FIRST_INCARNATION
 from team.recording.reader import Log, LogError
@@ -37,6 +37,12 @@ def export_utias(log: Log, folder: Path) -> list[str]:
     except ValueError as error:
         remedy = "the format needs measurements without gaps: `teamslam log cut` to a part without"
         raise LogError(log.path, str(error), remedy) from None
+    lost = beyond_utias(world)
+    if lost:
+        what = f"it has {', '.join(lost)}, which the format does not have"
+        raise LogError(
+            log.path, what, f"`teamslam import {log.path} -o FOLDER` writes tables of it"
+        )
     write_utias(world, folder)
     return [stream.robot for stream in world.streams]
 

@@ -4,6 +4,7 @@ order.
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
 from central.desk.view.node import ViewerNode
@@ -58,14 +59,39 @@ def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
                 yield from viewing.take(each, for_viewer(each))
 
 
-def export_views(log: Log, out: Path) -> int:
-    """Write a log with its views to a new log `out`; returns the number of its messages.
+class Drawn(NamedTuple):
+    """Number of the log's own messages, of its views drawn now, and of those drawn in the run."""
+
+    own: int
+    views: int
+    before: int
+
+    def __str__(self) -> str:
+        text = f"{self.own + self.views} messages, {self.views} of them views"
+        if self.before and self.before != self.views:
+            text += (
+                f" ({self.before} in the log: a viewer of the run draws nothing of what comes "
+                "before it has joined and after it has left)"
+            )
+        return text
+
+
+def export_views(log: Log, out: Path) -> Drawn:
+    """Write a log with its views to a new log `out`, all of them drawn again.
 
     Raises `LogError` for a damaged log, `RecorderError` when `out` exists.
     """
-    count = 0
+    written, drawn, before = 0, 0, 0
     with Recorder(out, log.team, log.metadata) as recorder:
-        for sample in with_views(log.samples()):
+
+        def counted(samples: Iterable[Sample]) -> Iterator[Sample]:
+            nonlocal before
+            for sample in samples:
+                before += ch.VIEW.owner(sample.key) is not None
+                yield sample
+
+        for sample in with_views(counted(log.samples())):
             recorder.write([sample])
-            count += 1
-    return count
+            written += 1
+            drawn += ch.VIEW.owner(sample.key) is not None
+    return Drawn(written - drawn, drawn, before)

@@ -84,6 +84,18 @@ def test_the_log_with_views_is_sound_and_has_the_teams_bytes_unchanged(exported,
     assert [(s.key, s.payload) for s in kept] == [(s.key, s.payload) for s in samples]
 
 
+def test_views_that_a_viewer_has_missed_are_drawn_and_counted(exported, tmp_path):
+    every = list(open_log(exported).samples())
+    lines = [s for s in every if s.key == "view/log"]
+    with Recorder(tmp_path / "log.mcap", "thesis", {}) as recorder:
+        recorder.write([s for s in every if s not in lines[:2]])
+    drawn = export_views(open_log(tmp_path / "log.mcap"), tmp_path / "again.mcap")
+    assert (drawn.own + drawn.views, drawn.before) == (len(every), drawn.views - 2)
+    assert str(drawn).startswith(
+        f"{len(every)} messages, {drawn.views} of them views ({drawn.before} in the log: a viewer"
+    )
+
+
 def test_the_last_scene_has_the_final_map(read, samples):
     final = final_map(samples)
     names, means = translate.landmarks_of(final)

@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -16,7 +17,10 @@ from sim.datasets.utias_writer import write_utias
 from team.recording.check import NO_FINAL
 from team.recording.reader import LogError, open_log
 from team.recording.recorder import Recorder
-from team.wire.bus import Sample
+from team.wire.arrays import from_floats
+from team.wire.bus import Sample, opened
+from team.wire.codec import encoded
+from team.wire.messages import Increment
 from tests.sim.logs import scenario, streams, world_log
 from tests.support import ROOT
 
@@ -91,6 +95,9 @@ def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path
         recorder.write([s for s in published() if s.counter != 3])
     status, out, _ = run("check", lost)
     assert status == 1
+    info = run("info", lost)
+    assert "team small, not whole: " in info[1]
+    assert "is not whole, source/r1: 2 measurements of incarnation 1 missing: 7–8" in info[2]
     stream = "source/r1: 2 measurements of incarnation 1 missing: 7–8"
     assert {stream, "truth/r1: 1 message missing: 3"} <= set(out.splitlines())
     assert all(" missing: " in line for line in out.splitlines())
@@ -153,6 +160,17 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
     assert status == 2
     assert "gap.mcap: r1: odometry intervals are not contiguous in time: one ends" in err
     assert "the format needs measurements without gaps" in err
+    moving = tmp_path / "moving.mcap"
+    step = from_floats(np.array([1.0, 0.0, 0.1]))
+    with Recorder(moving, "small", {}) as recorder:
+        start, first = (next(s for s in own if opened(s)[2].number == k) for k in (0, 1))
+        name = {"stamp_ns": first.stamp_ns, "robot": "r1", "incarnation": 1, "number": 1}
+        told = Increment(**name, duration_ns=10**9, increment=step)
+        recorder.write([start, replace(first, key="source/r1/odometry", payload=encoded(told))])
+    status, _, err = run("export", moving, "--format", "utias", "-o", tmp_path / "m")
+    assert status == 2
+    assert "moving.mcap: it has odometry as motions, which the format does not have" in err
+    assert f"`teamslam import {moving} -o FOLDER`" in err
 
 
 @pytest.mark.parametrize(

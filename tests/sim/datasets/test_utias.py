@@ -195,6 +195,20 @@ def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(
         assert len(before.landmark_detections.ids) == len(after.landmark_detections.ids)
 
 
+def test_a_simulated_set_that_the_format_can_not_have_is_tables(tmp_path: Path) -> None:
+    general = tmp_path / "general.toml"
+    general.write_text(
+        'base = "waypoints"\n[world]\nodometry = "increments"\nlandmark_form = "points"\n'
+    )
+    done = CliRunner().invoke(app, ["simulate", str(general), "-o", str(tmp_path / "set")])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "set" / "r1" / "odometry.csv").read_text().startswith("t_s,duration_s,dx_m")
+    found = streams_of(load(tmp_path / "set" / "scenario.toml")).streams
+    for before, after in zip(streams_of(load(str(general))).streams, found, strict=True):
+        assert np.array_equal(before.intervals.increments, after.intervals.increments)
+        assert np.array_equal(before.landmark_detections.points, after.landmark_detections.points)
+
+
 def test_the_start_pose_is_the_truth_with_the_given_sigmas(folder: Path) -> None:
     start = read(folder, start_sigma_m=0.05, start_sigma_rad=0.03).streams[0].start
     assert np.allclose(start.covariance, np.diag([0.0025, 0.0025, 0.0009]))
