@@ -23,6 +23,8 @@ from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)
 MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))
 LONG_GAP_NS = 2_000_000_000
+JUMP_NS = 86_400 * 10**9
+"""A longer step between two rows is a jump of the clock."""
 WHIRLING_RAD_S = 2.0 * np.pi
 """A median yaw rate above this [rad/s] is probably not in radians."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0
@@ -53,6 +55,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
         np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
         "another row has the same time, so it lasts no time",
     )
+    _drop_other_clocks(rows)
     stamps = rows.stamps_ns + offset_ns
     numbers = numbers_in(rows.table, form, forms)
     duration = np.diff(stamps)
@@ -87,6 +90,23 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     _judge_pace(rows, duration)
     _judge_speeds(rows, form, steps, duration)
     return intervals, rows.notes
+
+
+def _drop_other_clocks(rows: Rows) -> None:
+    """Keep the longest stretch of rows between jumps of the clock, as where it is first set."""
+    jumps = np.flatnonzero(np.diff(rows.stamps_ns) > JUMP_NS) + 1
+    if not len(jumps):
+        return
+    edges = np.concatenate([[0], jumps, [len(rows.stamps_ns)]])
+    longest = int(np.diff(edges).argmax())
+    kept = np.zeros(len(rows.stamps_ns), np.bool_)
+    kept[edges[longest] : edges[longest + 1]] = True
+    days = float(np.diff(rows.stamps_ns).max()) * 1e-9 / 86_400.0
+    rows.drop(
+        ~kept,
+        f"by another clock than most rows: it jumps by {days:,.0f} days at most, as where a clock "
+        "is set",
+    )
 
 
 def _without_resets(

@@ -13,7 +13,8 @@ from sim.datasets.folder_tables import POSES
 from sim.datasets.folder_writer import write_folder
 from sim.datasets.kinds import kind_of
 from sim.datasets.tables import DatasetError
-from sim.importing.bag import imported_bag, proposed_topics
+from sim.importing.bag import imported_bag
+from sim.importing.bag_topics import proposed_topics
 from sim.importing.columns import load_map
 from sim.importing.files import imported_files, trajectory
 from sim.importing.tables import RobotTables

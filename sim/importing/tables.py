@@ -23,9 +23,9 @@ class RobotTables:
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def add(self, table: str, columns: Sequence[str], row: Row) -> None:
-        """Append a row; columns that only some rows have are left out at the end."""
+        """Append a row; columns that only some rows have are empty in the others."""
         known = self.columns.setdefault(table, columns)
-        if len(columns) < len(known):
+        if len(columns) > len(known):
             self.columns[table] = columns
         self.rows.setdefault(table, []).append(row)
 
@@ -75,5 +75,5 @@ class RobotTables:
 
 
 def _fitted(row: Row, width: int) -> Row:
-    """The row's first `width` cells, filled up with empty ones where the row is a time alone."""
-    return [*row, *[""] * width][:width]
+    """The row, filled up with empty cells."""
+    return [*row, *[""] * (width - len(row))]

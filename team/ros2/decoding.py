@@ -64,11 +64,15 @@ class Transform(NamedTuple):
 
 
 class Tag(NamedTuple):
-    """One detected tag: its name and its position; covariance: of (x, y, z), row by row."""
+    """One detected tag: its name and its position; covariance: of (x, y, z), row by row.
+
+    kind: the class that the detector has given it, where that is not its name.
+    """
 
     name: str
     position: Vector
     covariance: tuple[float, ...] | None
+    kind: str = ""
 
 
 class TagsRecord(NamedTuple):
@@ -188,8 +192,9 @@ def _vision(message: Any) -> TagsRecord:
         if best is None:
             tags.append(_tag(each.id, each.bbox.center))
         else:
-            name = each.id or best.hypothesis.class_id
-            tags.append(_tag(name, best.pose.pose, best.pose.covariance))
+            kind = str(best.hypothesis.class_id)
+            tag = _tag(each.id or kind, best.pose.pose, best.pose.covariance)
+            tags.append(tag._replace(kind=kind if kind != tag.name else ""))
     return _tags(message, tags)
 
 

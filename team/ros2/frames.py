@@ -33,19 +33,39 @@ def heading(q: Quaternion) -> float:
     return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
+Place = tuple[float, float, float]
+"""A pose (x, y, yaw) on the base."""
+
+
 @dataclass(frozen=True)
 class Mount:
-    """A sensor's pose (x, y, yaw) on the base, and its frame → its plane: ahead and left, 2 × 3."""
+    """A sensor's frame → the plane of the robot's sensor: ahead and left, 2 × 3, then a shift.
 
-    pose: tuple[float, float, float]
+    pose: of the robot's sensor on the base; place: where this sensor is, which is the same unless
+    the robot has another sensor that was seen before (`seen_from`).
+    """
+
+    pose: Place
     plane: Float[np.ndarray, "2 3"]
+    place: Place
+    shift: tuple[float, float] = (0.0, 0.0)
 
     def point(self, position: Vector) -> tuple[float, float]:
         """Coordinates (ahead, left) in the plane of a position in the sensor's frame."""
-        if self.plane is BODY:
+        if self.plane is BODY and self.shift == (0.0, 0.0):
             return position[0], position[1]
         ahead, left = self.plane @ np.array(position)
-        return float(ahead), float(left)
+        return float(ahead) + self.shift[0], float(left) + self.shift[1]
+
+    def seen_from(self, first: "Mount") -> "Mount":
+        """The same sensor, whose points are given from the place of another one."""
+        if self.place == first.pose:
+            return self
+        (x, y, yaw), (ox, oy, other) = self.place, first.pose
+        c, s = np.cos(other), np.sin(other)
+        shift = float(c * (x - ox) + s * (y - oy)), float(c * (y - oy) - s * (x - ox))
+        c, s = np.cos(yaw - other), np.sin(yaw - other)
+        return Mount(first.pose, np.array([[c, -s], [s, c]]) @ self.plane, self.place, shift)
 
     def covariance(self, block: tuple[float, ...]) -> tuple[float, float, float]:
         """Covariance (xx, xy, yy) in the plane from that of (x, y, z)."""
@@ -72,18 +92,33 @@ class Frames:
     def base_from(
         self, frame: str, base: str
     ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
-        """Rotation and translation from a frame to the base; None where no chain leads there."""
-        rotation, moved = np.eye(3), np.zeros(3)
-        for _ in range(DEEPEST):
-            if frame == base:
+        """Rotation and translation from a frame to the base; None where no chain leads there.
+
+        The chain goes up to the base, or to an ancestor that both have: base_from_frame =
+        ancestor_from_base⁻¹ ancestor_from_frame.
+        """
+        ours, theirs = self._ancestors(frame), self._ancestors(base)
+        for ancestor, (rotation, moved) in ours.items():
+            if ancestor == base:
                 return rotation, moved
-            if frame not in self.parents:
-                return None
+            if ancestor in theirs:
+                turn, at = theirs[ancestor]
+                return turn.T @ rotation, turn.T @ (moved - at)
+        return None
+
+    def _ancestors(
+        self, frame: str
+    ) -> dict[str, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
+        """The frame and its ancestors, each with the rotation and translation from the frame."""
+        rotation, moved = np.eye(3), np.zeros(3)
+        found = {frame: (rotation, moved)}
+        while frame in self.parents and len(found) < DEEPEST:
             step = self.parents[frame]
             turn = rotation_matrix(step.rotation)
             rotation, moved = turn @ rotation, turn @ moved + np.array(step.position)
             frame = step.parent
-        return None
+            found[frame] = rotation, moved
+        return found
 
     def mount(self, frame: str, base: str) -> Mount | None:
         """Mount of the sensor with this frame; a frame whose z axis is level is a camera's."""
@@ -97,4 +132,5 @@ class Frames:
         c, s = np.cos(yaw), np.sin(yaw)
         plane = np.array([[c, s], [-s, c]]) @ rotation[:2]
         exact = np.abs(plane - BODY).max() < 1e-12
-        return Mount((float(moved[0]), float(moved[1]), yaw), BODY if exact else plane)
+        place = float(moved[0]), float(moved[1]), yaw
+        return Mount(place, BODY if exact else plane, place)

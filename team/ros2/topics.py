@@ -22,7 +22,8 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry_frame → base_frame. detections: messages of a detector, or tf2_msgs/TFMessage whose
     child frames are tags. truth: nav_msgs/Odometry or a pose, for the evaluation.
     teammates: the tags that robots carry, by the tag's number; landmarks: numbers of tags that are
-    called otherwise. mount: the sensor's pose (x, y, yaw) on the base and
+    called otherwise; names: whether the id (the class where it is empty) or the class names a
+    detection of vision_msgs. mount: the sensor's pose (x, y, yaw) on the base and
     optical: whether its frame is a camera's (z ahead, x right); both are of tf_static if absent.
     types: of topics that come over a bridge which does not tell them.
     """
@@ -36,6 +37,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     teammates: dict[str, RobotName] = {}
     landmarks: dict[str, Annotated[int, Meta(ge=0, lt=2**31)]] = {}
     types: dict[str, str] = {}
+    names: Literal["id", "class"] = "id"
     mount: tuple[float, float, float] | None = None
     optical: bool | None = None
 

@@ -9,6 +9,7 @@ from team.ros2.decoding import (
     PoseRecord,
     Record,
     SpeedRecord,
+    Tag,
     TagsRecord,
     Transform,
     TransformsRecord,
@@ -65,6 +66,7 @@ class Translator:
         self.dropped: Counter[str] = Counter()
         self.mounts: dict[str, Mount] = {}
         self.said: list[str] = []
+        self._two_names = False
 
     def take(self, topic: str, record: Record) -> list[Measured]:
         """The measurements of one message of a topic."""
@@ -107,7 +109,7 @@ class Translator:
     def _detections(self, record: Record) -> list[Measured]:
         match record:
             case TagsRecord():
-                tags = [(tag.name, tag.position, tag.covariance) for tag in record.tags]
+                tags = [(self._name(tag), tag.position, tag.covariance) for tag in record.tags]
                 return self._seen(record.stamp_ns, record.frame, tags)
             case TransformsRecord():
                 found = []
@@ -149,6 +151,18 @@ class Translator:
             found.append(Seen(stamp_ns, names, tuple(point for _, point in teammates)))
         return found
 
+    def _name(self, tag: Tag) -> str:
+        """The name that the file of topics asks for."""
+        if not tag.kind or self.topics.names == "class":
+            return tag.kind or tag.name
+        if not self._two_names and self._number(tag.name) != self._number(tag.kind) is not None:
+            self._two_names = True
+            self.said.append(
+                f"a detection has the id {tag.name} and the class {tag.kind}: its id is taken for "
+                'the landmark; give names = "class" if that is the tag\'s number'
+            )
+        return tag.name
+
     def _number(self, name: str) -> int | None:
         if name in self.topics.landmarks:
             return self.topics.landmarks[name]
@@ -164,7 +178,8 @@ class Translator:
         )  # fmt: skip
         if found is None:
             optical = "optical" in frame if topics.optical is None else topics.optical
-            found = Mount(topics.mount or (0.0, 0.0, 0.0), OPTICAL if optical else BODY)
+            place = topics.mount or (0.0, 0.0, 0.0)
+            found = Mount(place, OPTICAL if optical else BODY, place)
             if topics.mount is None and frame != topics.base_frame:
                 axes = "z ahead" if optical else "x ahead"
                 self.said.append(
@@ -172,6 +187,9 @@ class Translator:
                     f"{topics.base_frame}: the sensor is taken to be at the base with {axes}; "
                     "give `mount` (and `optical`) if it is not"
                 )
+        for first in self.mounts.values():
+            found = found.seen_from(first)
+            break
         self.mounts[frame] = found
         return found
 

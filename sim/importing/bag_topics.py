@@ -1,0 +1,226 @@
+"""Proposes which topics of a ROS 2 bag are what, by their names, types and frames."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from sim.datasets.tables import DatasetError
+from team.ros2.bags import Bag, Topic, opened_bag
+from team.ros2.decoding import READERS, DamagedError, OdometryRecord, TransformsRecord, decode
+from team.ros2.topics import RobotTopics, Topics
+from team.ros2.translator import TAG
+
+ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+STATIC = "tf_static"
+TRUTH_WORDS = ("truth", "gt", "mocap", "vicon", "vrpn", "optitrack")
+FUSED_WORDS = (
+    "filtered", "fused", "ekf", "ukf", "global", "map", "amcl", "gps", "slam", "localization",
+    "kiss", "visual", "vio", "lidar", "icp",
+)  # fmt: skip
+"""Words in the names of odometry that is not the wheels' alone."""
+WHEEL_WORDS = ("wheel", "wheels", "encoder", "encoders", "raw", "controller", "drive")
+PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
+"""Words in the first part of a topic that name a part of a robot, and no robot."""
+SAMPLED_MESSAGES = 2000
+"""Number of messages of /tf that are searched for tags."""
+
+
+class UndecidedError(DatasetError):
+    """The names and types of a bag's topics do not decide which are used; the text says what to
+    type.
+    """
+
+
+class Proposal(NamedTuple):
+    """The topics of each robot; others: further topics that may be its odometry; warnings: what is
+    ambiguous.
+    """
+
+    robots: dict[str, RobotTopics]
+    others: dict[str, list[str]]
+    warnings: list[str]
+
+
+def proposed_topics(path: Path) -> str:
+    """A bag's topics, and a proposal for the file that assigns them; raises BagError."""
+    with opened_bag(path) as bag:
+        return _question(path, bag, _proposed(bag, None))
+
+
+def decided(bag: Bag, path: Path, robot: str | None) -> Topics:
+    """The topics of each robot by their names and types; raises UndecidedError where they do not
+    decide.
+    """
+    found = _proposed(bag, robot)
+    if found.warnings:
+        raise UndecidedError(_question(path, bag, found))
+    return Topics(robots=found.robots)
+
+
+def _question(path: Path, bag: Bag, found: Proposal) -> str:
+    return (
+        f"{path}: which topics are what?\n{listing(bag.topics)}\n"
+        + "".join(f"{doubt}\n" for doubt in found.warnings)
+        + "Write it into a file, as topics.toml, beginning with this:\n\n"
+        + as_toml(found)
+        + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml\n"
+    )
+
+
+def _proposed(bag: Bag, robot: str | None) -> Proposal:
+    """The topics of each robot as their names, types and frames propose them."""
+    found = bag.topics
+    tagged = _tags_in(bag)
+    bases = {topic.name: _base_in(bag, topic) for topic in found if topic.kind in ODOMETRY}
+    robots: dict[str, RobotTopics] = {}
+    others: dict[str, list[str]] = {}
+    warnings: list[str] = []
+    for space in _spaces(found, tagged, bases):
+        alone = space is None
+        odometry, detections, truth = _candidates(found, tagged, space)
+        name = _robot_name(_only_space(found) if space is None else space, robot if alone else None)
+        if len(odometry) != 1:
+            warnings.append(
+                f"{name}: {len(odometry)} topics may be its odometry" + _choice(odometry)
+            )
+        if not detections:
+            warnings.append(f"{name}: no topic with detections of landmarks")
+        if len(truth) > 1:
+            warnings.append(f"{name}: {len(truth)} topics may be its truth")
+        others[name] = odometry[1:]
+        robots[name] = RobotTopics(
+            odometry=odometry[0] if odometry else "/odom",
+            detections=tuple(detections),
+            truth=truth[0] if truth else "",
+            base_frame=(bases[odometry[0]] if odometry else "") or "base_link",
+        )
+    if not robots:
+        warnings.append("no topic with odometry")
+        robots[robot or "r1"] = RobotTopics(odometry="/odom", detections=("/detections",))
+    return Proposal(robots, others, warnings)
+
+
+def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> list[str] | list[None]:
+    """The namespaces that are robots; None: all topics are one robot's.
+
+    Several namespaces with odometry are one robot's where none has both odometry and detections,
+    and all odometry is of one frame.
+    """
+    spaces = sorted({_namespace(name) for name in bases})
+    if len(spaces) < 2:
+        return [None] if spaces else []
+    whole = [space for space in spaces if all(_candidates(topics, tagged, space)[:2])]
+    return [None] if not whole and len(set(bases.values())) == 1 else spaces
+
+
+def _only_space(topics: list[Topic]) -> str:
+    """The namespace of a single robot's odometry; empty where there are several."""
+    spaces = {_namespace(topic.name) for topic in topics if topic.kind in ODOMETRY}
+    return spaces.pop() if len(spaces) == 1 else ""
+
+
+def _base_in(bag: Bag, topic: Topic) -> str:
+    """The frame whose pose an odometry topic has, by its first sound message."""
+    for raw in bag.messages([topic.name]):
+        try:
+            record = decode(raw.kind, raw.data, bag.store)
+        except DamagedError:
+            continue
+        return record.child.lstrip("/") if isinstance(record, OdometryRecord) else ""
+    return ""
+
+
+def _choice(odometry: list[str]) -> str:
+    """Which of several odometry topics is proposed, and why."""
+    if len(odometry) < 2:
+        return ""
+    return (
+        f", and one is used: {odometry[0]} is proposed. It should be the wheels' own: one that is "
+        "fused with landmarks, GPS or a map (the frame `map`) would count them twice, and jumps"
+    )
+
+
+def _candidates(
+    topics: list[Topic], tagged: set[str], space: str | None
+) -> tuple[list[str], list[str], list[str]]:
+    """The candidates for odometry, the likeliest first, detections and truth in one namespace;
+    None: in all.
+    """
+    here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
+    true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
+    odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
+    odometry.sort(key=lambda name: (_has(name, FUSED_WORDS), not _has(name, WHEEL_WORDS), name))
+    other = (*ODOMETRY, *POSES, TRANSFORMS, "geometry_msgs/msg/TransformStamped")
+    detections = [t.name for t in here if t.kind in READERS and t.kind not in other]
+    detections += [t.name for t in here if t.name in tagged]
+    return odometry, detections, true
+
+
+def _is_truth(topic: Topic) -> bool:
+    return _has(topic.name, TRUTH_WORDS)
+
+
+def _has(name: str, words: tuple[str, ...]) -> bool:
+    """Whether a name has one of these words between its / and _."""
+    parts = name.lower().replace("/", "_").replace("-", "_").split("_")
+    return any(word in parts for word in words)
+
+
+def _namespace(topic: str) -> str:
+    """The first part of /r1/odom; empty for /odom, /odometry/filtered and /wheel/odom."""
+    parts = topic.strip("/").split("/")
+    part = len(parts) > 1 and (parts[0].startswith("odom") or _has(parts[0], PART_WORDS))
+    return parts[0] if len(parts) > 1 and not part else ""
+
+
+def _robot_name(space: str, robot: str | None) -> str:
+    cleaned = "".join(c if c.isalnum() else "_" for c in space.lower())[:32]
+    usable = cleaned and cleaned[0].isalpha() and cleaned.isascii()
+    return robot or (cleaned if usable else "r1")
+
+
+def _tags_in(bag: Bag) -> set[str]:
+    """The topics of transforms that contain tags."""
+    found = set()
+    for topic in bag.topics:
+        if topic.kind != TRANSFORMS or topic.name.rpartition("/")[2] == STATIC:
+            continue
+        for number, raw in enumerate(bag.messages([topic.name])):
+            if number == SAMPLED_MESSAGES:
+                break
+            try:
+                record = decode(raw.kind, raw.data, bag.store)
+            except DamagedError:
+                continue
+            assert isinstance(record, TransformsRecord)
+            if any(TAG.match(transform.child) for transform in record.transforms):
+                found.add(topic.name)
+                break
+    return found
+
+
+def listing(topics: list[Topic]) -> str:
+    """A bag's topics, one a line, with a remark where a topic can not be used."""
+    lines = []
+    for topic in topics:
+        used = "" if topic.kind in READERS else "   (not read here)"
+        lines.append(f"  {topic.name}   {topic.kind}   {topic.messages} messages{used}")
+    return "\n".join(lines)
+
+
+def as_toml(found: Proposal) -> str:
+    """The file that assigns topics to robots, in TOML."""
+    lines = []
+    for name, topics in found.robots.items():
+        either = "".join(f'   # or "{other}"' for other in found.others.get(name, ()))
+        detections = ", ".join(f'"{topic}"' for topic in topics.detections)
+        lines += [
+            f"[robots.{name}]",
+            f'odometry = "{topics.odometry}"{either}',
+            'use = "pose"           # or "twist": speeds that hold until the next message',
+            f"detections = [{detections}]",
+        ]
+        lines += [f'truth = "{topics.truth}"'] if topics.truth else []
+        lines += [f'base_frame = "{topics.base_frame}"', ""]
+    return "\n".join(lines)
