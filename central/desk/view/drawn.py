@@ -1,5 +1,6 @@
 """The drawable part of a team's messages: landmarks and thinned paths."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -7,6 +8,7 @@ from jaxtyping import Float, UInt32
 
 from team import translate
 from team.wire import messages as m
+from team.wire.arrays import floats
 
 PATH_POINTS = 1_000
 """Most points of one path; a longer one keeps every second."""
@@ -26,6 +28,29 @@ def landmarks_of(message: m.MapEstimate | m.FusedMap) -> Landmarks:
     names, means = translate.landmarks_of(message)
     blocks = translate.landmark_blocks_of(message)[:, (0, 0, 1), (0, 1, 1)]
     return Landmarks(names, means, blocks)
+
+
+def around(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
+    """The particles' positions (ahead [m], left [m]) as seen from their mean pose.
+
+    A cloud lies along the robot's own poses, which have drifted from the team's frame; so it is
+    drawn around the robot, wherever that is.
+    """
+    poses = floats(cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
+    weights = floats(cloud.weights, "weights").astype(np.float64)
+    if not weights.sum() > 0.0:
+        return np.zeros((len(poses), 2))
+    x, y = np.average(poses[:, :2], axis=0, weights=weights)
+    c, s = (np.average(f(poses[:, 2]), weights=weights) for f in (np.cos, np.sin))
+    heading = np.arctan2(s, c)
+    return placed(poses[:, :2] - (x, y), (0.0, 0.0, -float(heading)))
+
+
+def placed(points: Float[np.ndarray, "P 2"], pose: Sequence[float]) -> Float[np.ndarray, "P 2"]:
+    """Points that are seen from a pose (x, y, theta), in the frame of that."""
+    x, y, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    return np.asarray(points @ np.array([[c, s], [-s, c]]) + (x, y))
 
 
 @dataclass

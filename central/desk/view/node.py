@@ -18,7 +18,7 @@ from central.desk.evaluation.errors import PoseErrors
 from central.desk.evaluation.events import Event, EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.view import foxglove_scene as fox
-from central.desk.view.drawn import Landmarks, Track, landmarks_of
+from central.desk.view.drawn import Landmarks, Track, around, landmarks_of, placed
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire import views
@@ -310,10 +310,10 @@ class ViewerNode:
     def _clouds(self, now_ns: int) -> list[Shown]:
         out = []
         for name, robot in self._in_order():
-            if robot.cloud is not None:
-                points = floats(robot.cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
+            if robot.cloud is not None and robot.estimate is not None:
+                points = placed(around(robot.cloud), robot.pose().tolist())
                 weights = floats(robot.cloud.weights, "weights").astype(np.float64)
-                payload = fox.cloud(now_ns, points[:, :2], weights, "weight")
+                payload = fox.cloud(now_ns, points, weights, "weight")
                 out.append(Shown(views.PARTICLES.key(name), now_ns, payload))
                 robot.cloud = None
         return out

@@ -21,7 +21,7 @@ import numpy as np
 from central.desk.drawing import ROBOT_COLOURS
 from central.desk.evaluation.events import EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
-from central.desk.view.drawn import landmarks_of
+from central.desk.view.drawn import around, landmarks_of
 from central.desk.view.landmark_sets import sets_of
 from central.desk.view.node import FORGET_NS
 from team.wire import channels as ch
@@ -149,9 +149,8 @@ class PageFrames:
                 places = self._truth.positions.ravel().tolist()
                 self._say("truth_map", ids=self._truth.ids.tolist(), xy=places)
             case m.ParticleCloud():
-                points = floats(message.poses, "poses").reshape(-1, 3)[:, :2]
-                t = self._t(message.stamp_ns)
-                self._say("cloud", r=message.robot, t=t, v=_base64(points.astype("<f4")))
+                t, seen = self._t(message.stamp_ns), around(message)
+                self._say("cloud", r=message.robot, t=t, v=_base64(seen.astype("<f4")))
             case m.Trajectory():
                 times = [self._t(at) for at in stamps(message.stamps, "stamps").tolist()]
                 poses = floats(message.poses, "poses").tolist()

@@ -50,7 +50,10 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
 
 
 class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):
-    """A thinned particle cloud in the team's frame, for viewers: P × 3 poses and P weights."""
+    """A thinned particle cloud, for viewers: P × 3 poses and P weights.
+
+    In the frame of the robot's own poses (`robot/{robot}/pose`), not in that of the team's map.
+    """
 
     robot: Name
     poses: Floats

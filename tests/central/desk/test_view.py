@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from central.desk.drawing import ellipses, in_order
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
-from central.desk.view.drawn import PATH_POINTS, Track, landmarks_of
+from central.desk.view.drawn import PATH_POINTS, Track, around, landmarks_of, placed
 from central.desk.view.export import export_views, with_views
 from central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
 from sim.in_memory.team import final_map, run_team
@@ -337,3 +337,24 @@ def test_the_teams_pose_goes_before_the_robots_own():
     out = node.handle(ch.OWN_POSE, pose(2, 9.0)) + node.handle(ch.TEAM_POSE, pose(2, 8.0))
     figures = [json.loads(s.payload) for s in out if s.key == "view/robot/r1"]
     assert figures[-1]["x_m"] == 8.0
+
+
+def test_a_cloud_is_drawn_around_the_robot_wherever_its_own_frame_has_drifted():
+    rng = np.random.default_rng(1)
+    poses = np.column_stack([rng.normal(0.0, [0.3, 0.1], (50, 2)), rng.normal(3.1, 0.05, 50)])
+    weights = rng.uniform(0.5, 1.0, 50)
+    drift = np.array([40.0, -7.0, 2.0])
+    c, s = np.cos(drift[2]), np.sin(drift[2])
+    drifted = poses @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + drift
+
+    def cloud(of: np.ndarray) -> m.ParticleCloud:
+        packed = (from_floats(of.ravel()), from_floats(weights))
+        return m.ParticleCloud(stamp_ns=0, robot="r1", poses=packed[0], weights=packed[1])
+
+    seen = around(cloud(poses))
+    np.testing.assert_allclose(np.average(seen, axis=0, weights=weights), 0.0, atol=1e-12)
+    np.testing.assert_allclose(around(cloud(drifted)), seen, atol=1e-12)
+    heading = float(np.arctan2(*(np.average(f(poses[:, 2]), weights=weights)
+                                 for f in (np.sin, np.cos))))  # fmt: skip
+    mean = np.average(poses[:, :2], axis=0, weights=weights)
+    np.testing.assert_allclose(placed(seen, (*mean, heading)), poses[:, :2], atol=1e-12)

@@ -323,12 +323,15 @@ export class MapView {
     for (const robot of this.store.robots.values()) {
       const i = upTo(robot.cloudTimes, time) - 1;
       if (i < 0 || time - robot.cloudTimes[i] > 30) continue;
-      const points = robot.clouds[i];
+      const points = robot.clouds[i], at = robot.pose.at(time);
+      if (at < 0) continue;
+      const place = between(robot.pose, at, time), c = Math.cos(place[2]), s = Math.sin(place[2]);
       g.fillStyle = robot.colour;
       g.globalAlpha = 0.5;
       g.beginPath();
       for (let k = 0; k < points.length; k += 2) {
-        const [x, y] = this.screen(points[k], points[k + 1]);
+        const ahead = points[k], left = points[k + 1];
+        const [x, y] = this.screen(place[0] + c * ahead - s * left, place[1] + s * ahead + c * left);
         g.rect(x - r, y - r, 2 * r, 2 * r);
       }
       g.fill();
