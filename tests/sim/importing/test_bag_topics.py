@@ -1,0 +1,130 @@
+"""Bags of other labs: which topics are a robot's, where its sensors sit, a clock that is set."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim.datasets.tables import DatasetError
+from tests.ros2 import messages as ros
+from tests.sim.importing.test_import import ODOMETRY, OPTICAL, TAGS, S, read, run
+
+TF = "tf2_msgs/msg/TFMessage"
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+BACK = (0.0, 0.0, 1.0, 0.0)
+
+
+def odometry(topic: str, child: str, speed: float = 1.0) -> list[ros.Message]:
+    """Three poses along x."""
+    told: list[ros.Message] = []
+    for k in range(3):
+        message = ros.odometry(k * S, ros.pose(speed * k), speed)
+        message.child_frame_id = child
+        told.append((k * S, topic, ODOMETRY, message))
+    return told
+
+
+def seen(topic: str, frame: str, *tags: tuple[str, Any]) -> list[ros.Message]:
+    return [(S, topic, TAGS, ros.detections(S, frame, tags))]
+
+
+def static(topic: str, *frames: tuple[str, str, Any, Any]) -> list[ros.Message]:
+    return [(0, topic, TF, ros.transforms(*((0, *frame) for frame in frames)))]
+
+
+@pytest.mark.parametrize("space", ["", "/anna"])
+def test_of_two_odometries_the_wheels_are_proposed_and_the_user_decides(
+    tmp_path: Path, space: str
+) -> None:
+    wheels, fused = f"{space}/wheel/odometry", f"{space}/odometry/filtered"
+    messages = [*odometry(fused, "base_footprint", 2.0), *odometry(wheels, "base_footprint")]
+    bag = ros.write_bag(tmp_path / "bag", [*messages, *seen(f"{space}/tags", "base_footprint")])
+    result = run(bag, "-o", tmp_path / "set")
+    assert isinstance(result.exception, DatasetError)
+    said = str(result.exception)
+    robot = space.strip("/") or "r1"
+    assert f"{robot}: 2 topics may be its odometry, and one is used: {wheels} is proposed" in said
+    assert f'odometry = "{wheels}"   # or "{fused}"' in said
+    assert 'base_frame = "base_footprint"' in said
+    assert said.count("[robots.") == 1
+    topics = tmp_path / "topics.toml"
+    for topic, speed in ((wheels, 1.0), (fused, 2.0)):
+        text = said[said.index("[robots.") : said.index("\nand type")]
+        topics.write_text(text.replace(f'"{wheels}"   # or "{fused}"', f'"{topic}"'))
+        assert run(bag, "-o", tmp_path / f"{speed}", "--ros2", topics).exit_code == 0
+        (stream,) = read(tmp_path / f"{speed}").streams
+        assert stream.intervals.increments is not None
+        assert stream.intervals.increments[:, 0].tolist() == [speed, speed]
+
+
+def test_each_camera_sees_from_its_own_place_and_frames_may_hang_below_either_base(
+    tmp_path: Path,
+) -> None:
+    frames = [
+        ("base_link", "base_footprint", ros.vector(0.1), LEVEL),  # the odometry's frame is a leaf
+        ("base_link", "front", ros.vector(0.3, 0.1), LEVEL),
+        ("front", "front_optical", ros.vector(), OPTICAL),
+        ("base_link", "rear", ros.vector(-0.2), BACK),
+        ("rear", "rear_optical", ros.vector(), OPTICAL),
+    ]
+    # From base_footprint, 0.1 m ahead of base_link, tags 1 and 2 are at (2, 1) and (-3, 1).
+    messages = [
+        *static("/tf_static", *frames),
+        *odometry("/odom", "base_footprint"),
+        *seen("/front/tags", "front_optical", ("1", ros.pose(-0.9, 0.0, 1.8))),
+        *seen("/rear/tags", "rear_optical", ("2", ros.pose(1.0, 0.0, 2.7))),
+    ]
+    result = run(ros.write_bag(tmp_path / "bag", messages), "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    assert "r1: 2 sensors (front_optical, rear_optical) at several places" in result.output
+    mount = (tmp_path / "set" / "scenario.toml").read_text()
+    assert "mount" in mount
+    (stream,) = read(tmp_path / "set").streams
+    points = stream.landmark_detections.points
+    assert points is not None
+    at = dict(zip(stream.landmark_detections.ids.tolist(), points, strict=True))
+    np.testing.assert_allclose(at[1] + (0.2, 0.1), (2.0, 1.0), atol=1e-12)
+    np.testing.assert_allclose(at[2] + (0.2, 0.1), (-3.0, 1.0), atol=1e-12)
+
+
+def test_robots_whose_frames_are_called_alike_keep_their_own_cameras(tmp_path: Path) -> None:
+    messages: list[ros.Message] = []
+    for robot, ahead in (("ann", 0.2), ("bob", 0.7)):
+        camera = ("base_link", "camera", ros.vector(ahead), LEVEL)
+        messages += static(f"/{robot}/tf_static", camera)
+        messages += odometry(f"/{robot}/odom", "base_link")
+        messages += seen(f"/{robot}/tags", "camera", ("1", ros.pose(2.0)))
+    bag = ros.write_bag(tmp_path / "bag", messages)
+    assert run(bag, "-o", tmp_path / "set").exit_code == 0
+    text = (tmp_path / "set" / "scenario.toml").read_text()
+    assert [f"{ahead}," in text for ahead in (0.2, 0.7)] == [True, True]
+
+
+def test_a_detection_with_two_names_is_told_and_either_may_count(tmp_path: Path) -> None:
+    (tag,) = seen("/tags", "base_link", ("tag36h11:12", ros.pose(2.0)))
+    tag[3].detections[0].id = "3"
+    bag = ros.write_bag(tmp_path / "bag", [*odometry("/odom", "base_link"), tag])
+    result = run(bag, "-o", tmp_path / "a")
+    assert "has the id 3 and the class tag36h11:12: its id is taken" in result.output
+    (tmp_path / "topics.toml").write_text(
+        '[robots.r1]\nodometry = "/odom"\ndetections = ["/tags"]\nnames = "class"\n'
+    )
+    assert run(bag, "-o", tmp_path / "b", "--ros2", tmp_path / "topics.toml").exit_code == 0
+    found = [read(tmp_path / each).streams[0].landmark_detections.ids.tolist() for each in "ab"]
+    assert found == [[3], [12]]
+
+
+def test_what_was_stamped_before_the_clock_was_set_is_dropped_and_counted(tmp_path: Path) -> None:
+    year = 55 * 365 * 86_400 * S
+    messages = []
+    for k in range(6):
+        at = (k + 1) * S + (year if k > 1 else 0)
+        messages.append((k * S, "/odom", ODOMETRY, ros.odometry(at, ros.pose(float(k)))))
+    tags = ros.detections(year + 4 * S, "base_link", [("1", ros.pose(2.0))])
+    bag = ros.write_bag(tmp_path / "bag", [*messages, (7 * S, "/tags", TAGS, tags)])
+    result = run(bag, "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    assert "r1: 2 odometry rows dropped: by another clock than most rows: it jumps" in result.output
+    (stream,) = read(tmp_path / "set").streams
+    assert stream.intervals.duration_ns.tolist() == [S, S, S]
