@@ -154,13 +154,17 @@ def order_of(robot: str) -> Member:
 
 
 def central_map(scenario: Scenario, samples: list[Sample], order: Member | None) -> bytes:
-    """The final map of a central run; with an order, of the same set with it."""
+    """The final map of a central run; with an order, of the same set with it: the streams' end
+    comes last, since a centre does not wait for what a withdrawn robot has not sent yet.
+    """
     if order is None:
         return encoded(final_map(samples))
     node = CentralNode(scenario.central, [each.id for each in scenario.robots])
-    for sample in [Sample(order.key, order.payload, 0, 0, 0), *samples]:
+    ends = [sample for sample in samples if sample.key == ch.END.key()]
+    inputs = [sample for sample in samples if sample.key != ch.END.key()]
+    for sample in [Sample(order.key, order.payload, 0, 0, 0), *inputs, *ends]:
         found = ch.channel_of(sample.key)
-        if found is not None and (found[0] in CHANNELS or found[0] in (ch.END,)):
+        if found is not None and (found[0] in CHANNELS or found[0] is ch.END):
             node.handle(opened(sample)[2], 0)
     assert node.final is not None
     return encoded(node.final)

@@ -3,7 +3,8 @@ messages.
 
 So its maps are the centre's, byte for byte, wherever the set is the same. The fold begins anew
 where a folded member changes (a robot has contradicted itself), or where the set grows after the
-final map.
+final map. For a changed member it does so when there is time, or once the set is complete, so that
+a robot that contradicts itself again and again does not keep its peers from their own work.
 """
 
 import hashlib
@@ -73,7 +74,10 @@ class PeerFold:
             return []
         if isinstance(message, m.End):
             note(message, self._ends)  # the robots' `Done` messages may confirm it
-        return [*self._give(message), *self.grow()]
+        out: list[Outgoing] = []
+        if isinstance(message, m.End | m.TeamEnd) and self._peer.rebuild:
+            out += self._again()  # the final map may follow
+        return [*out, *self._give(message), *self.grow()]
 
     def _stored(self, message: m.Message) -> bool:
         """Store a message for a fold that begins anew, unless it has a later one; returns whether
@@ -126,15 +130,24 @@ class PeerFold:
                 return []
             self._waits = False
         out = self._end_by_others()
-        again = self._peer.rebuild
-        new_messages = [] if again else list(self._peer.new_messages())
-        if self.centre.finished and not again:
-            again = any(not isinstance(each, m.Concluded) for each in new_messages)
-        if again:
-            self._peer.again()
-            new_messages = list(self._peer.new_messages())
-            self._begin()
-        for message in new_messages:
+        if self._peer.rebuild and (self.centre.finished or self._whole):
+            return out + self._again()
+        for message in list(self._peer.new_messages()):
+            if self.centre.finished and not isinstance(message, m.Concluded):
+                return out + self._again()
+            out += self._give(message)
+        if self._peer.rebuild and self.centre.finished:
+            out += self._again()
+        return out
+
+    def _again(self) -> list[Outgoing]:
+        """Fold the whole set from the beginning: as `Done` is given last, all of it is in the final
+        map.
+        """
+        self._peer.again()
+        self._begin()
+        out: list[Outgoing] = []
+        for message in list(self._peer.new_messages()):
             out += self._give(message)
         return out
 
@@ -143,13 +156,17 @@ class PeerFold:
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False
-        out = [*self.grow(), *self.centre.refresh()]
+        out = [*self._renewed(), *self.grow(), *self.centre.refresh()]
         self._waits = waits and self.final is None
         return out
 
     def refresh(self) -> list[Outgoing]:
         """A map of everything that is here, if the last one lacks something."""
-        return [] if self._waits else self.centre.refresh()
+        return [] if self._waits else [*self._renewed(), *self.centre.refresh()]
+
+    def _renewed(self) -> list[Outgoing]:
+        """Begin the fold anew if a folded member has changed."""
+        return self._again() if self._peer.rebuild else []
 
     def _give(self, message: m.Message) -> list[Outgoing]:
         before = self.centre.finished

@@ -161,7 +161,13 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """The messages that a fold can take now and has not yet been given, in order."""
+        """The messages that a fold can take now and has not yet been given, in order: operators'
+        orders first, since it may end with the last member of a stream, and `Done` last.
+        """
+        statements, self._new_messages = self._new_messages, []
+        statements.sort(key=_turn)
+        orders = sum(_turn(each) < 0 for each in statements)
+        yield from statements[:orders]
         for stream, share in sorted(self.replica.streams.items()):
             fed = self._fed.get(stream, -1)
             if share.start is None or fed >= share.count:
@@ -171,8 +177,7 @@ class PeerNode:
             for sequence in range(max(fed, 0), share.count):
                 yield from (member.message for member in share.parcel(sequence))
             self._fed[stream] = share.count
-        messages, self._new_messages = self._new_messages, []
-        yield from messages
+        yield from statements[orders:]
 
     def again(self) -> None:
         """Give everything to the fold again, which begins anew."""
@@ -303,3 +308,14 @@ class PeerNode:
         """For each node with a summary, whether its set equals this one."""
         digest = self.replica.digest
         return {n: s.digest == digest for n, (_, s) in sorted(self._summaries.items())}
+
+
+def _turn(message: m.Message) -> int:
+    """Where a statement is given to a fold: before the streams (negative) or after them."""
+    match message:
+        case m.Withdrawal() | m.Verdict():
+            return -1
+        case m.GivenUp():
+            return 1
+        case _:
+            return 2

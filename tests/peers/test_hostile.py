@@ -6,7 +6,9 @@ import msgspec
 import pytest
 
 from central.config import CentralConfig
+from central.node import CentralNode
 from central.peers.centre import PeerCentre
+from central.peers.fold import PeerFold
 from team.door import MOST_LIVES
 from team.peers.exchange import MOST_ASKED
 from team.peers.members import LARGEST_SIGNATURE
@@ -166,3 +168,48 @@ def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> Non
     request = m.MembersRequest(stamp_ns=0, node=LIAR, requested=(), statements=("r2",) * 10_000)
     (reply,) = node.answer(encoded(request))
     assert len(decoded(reply, m.Members).keys) == 1
+
+
+def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold_as_often() -> None:
+    team = ("r2",)
+    node = PeerNode("robot/r1", team)
+    begun: list[CentralNode] = []
+
+    def make(config: CentralConfig, robots: tuple[str, ...]) -> CentralNode:
+        begun.append(CentralNode(config, robots))
+        return begun[-1]
+
+    fold = PeerFold(CentralConfig(), team, node, make=make)
+    for each in (start("r2"), *parcel("r2", 0)):
+        node.take(each, "robot/r2")
+        fold.grow()
+    own = parcel("r2", 0)[-1].message
+    for gated in range(1, 400):
+        node.take(member(ch.SUBMAP, msgspec.structs.replace(own, gated=gated)), "robot/r2")
+        fold.grow()
+    assert node.replica.replacements >= 3
+    assert len(begun) == 1
+    fold.refresh()
+    assert len(begun) == 2
+    fold.refresh()
+    assert len(begun) == 2, "it is begun anew for a change only"
+    last = m.Done(
+        stamp_ns=10**6, robot="r2", incarnation=1, measurements=10, steps=0, submaps=1, ledger=()
+    )
+    node.take(member(ch.ROBOT_DONE, last), "robot/r2")
+    smallest = min(
+        (member(ch.SUBMAP, msgspec.structs.replace(own, gated=k)) for k in range(400, 4000)),
+        key=lambda each: each.hash,
+    )
+    assert node.take(smallest, "robot/r2")
+    end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r2", incarnation=1, measurements=10),))
+    fold.note(end)
+    assert len(begun) == 3
+    final = fold.final
+    assert final is not None
+    fresh = PeerFold(CentralConfig(), team, clean := PeerNode("robot/r1", team))
+    for each in node.replica.members():
+        clean.take(each, "robot/r2")
+    fresh.note(end)
+    assert fresh.final is not None
+    assert encoded(fresh.final) == encoded(final), "the final map is that of the set as it is"
