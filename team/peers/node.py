@@ -162,7 +162,7 @@ class PeerNode:
 
     def new_messages(self) -> Iterator[m.Message]:
         """The messages that a fold can take now and has not yet been given, in order: operators'
-        orders first, since it may end with the last member of a stream, and `Done` last.
+        orders first, since it may end with the last member of a stream, and what ends it last.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=_turn)
@@ -315,7 +315,7 @@ def _turn(message: m.Message) -> int:
     match message:
         case m.Withdrawal() | m.Verdict():
             return -1
-        case m.GivenUp():
-            return 1
-        case _:
+        case m.GivenUp():  # whose stream has ended all the same is not lost
             return 2
+        case _:
+            return 1

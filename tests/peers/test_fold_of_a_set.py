@@ -2,6 +2,8 @@
 
 import random
 
+import pytest
+
 from central.config import CentralConfig
 from central.peers.fold import PeerFold
 from team.peers.members import Member
@@ -16,7 +18,9 @@ END = m.End(
     stamp_ns=0,
     streams=tuple(m.StreamEnd(robot=r, incarnation=1, measurements=20) for r in ROBOTS),
 )
-ORDER = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="broken")
+ORDER = member(ch.ORDER, m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="broken"))
+_GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="not seen")
+GIVEN_UP = Member(ch.GIVEN_UP.key("robot/r2"), encoded(_GIVEN_UP), _GIVEN_UP)
 
 
 def folded(batches: list[list[Member]], ends_after: int) -> m.FusedMap:
@@ -33,21 +37,30 @@ def folded(batches: list[list[Member]], ends_after: int) -> m.FusedMap:
     return fold.final
 
 
-def test_an_order_that_comes_with_the_last_of_a_stream_is_in_the_final_map() -> None:
-    """The withdrawn robot is the last by name: its `Done` stood before the order."""
+@pytest.mark.parametrize(
+    ("extra", "withdrawn"),
+    [([ORDER], ("r2",)), ([GIVEN_UP], ()), ([ORDER, GIVEN_UP], ("r2",))],
+    ids=["withdrawn", "given up and back", "both"],
+)
+def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(
+    extra: list[Member], withdrawn: tuple[str, ...]
+) -> None:
+    """The robot is the last by name: its `Done` stood before the order, and behind that it was
+    given up.
+    """
     members = [
         each
         for robot in ROBOTS
         for each in (start(robot), *parcel(robot, 0), *parcel(robot, 1), done(robot, 2))
     ]
-    members.append(member(ch.ORDER, ORDER))
+    members += extra
     rng = random.Random(1)
     found = set()
-    for _ in range(25):
+    for _ in range(12):
         order = rng.sample(members, len(members))
         cuts = sorted(rng.sample(range(len(members) + 1), rng.randrange(4)))
         batches = [order[a:b] for a, b in zip([0, *cuts], [*cuts, len(order)], strict=True)]
         final = folded(batches, rng.randrange(len(batches) + 1))
-        assert final.withdrawn == ("r2",)
+        assert (final.withdrawn, final.lost) == (withdrawn, ())
         found.add(encoded(final))
     assert len(found) == 1
