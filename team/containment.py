@@ -24,6 +24,10 @@ from team.wire.codec import WireError, decoded, encoded
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000
 """Most attempts of a node to continue behind one message, where it raises again and again."""
+MOST_LOGGED = 100
+"""Refused messages, and faults, that are logged one by one; then one of so many, so that whoever
+sends them without end does not fill the log.
+"""
 LONGEST_TEXT = 1000
 """Characters of an exception's text, or of a key, that are kept."""
 _OURS = ("team.", "central.", "sim.")
@@ -135,7 +139,10 @@ class Boundary:
         """Count and log a message that is refused."""
         self.refused += 1
         self.last_refused = f"{_cut(sample.key, 80)}: {_cut(why, 200)}"
-        _LOG.warning("%s: dropped %s", self.name, self.last_refused)
+        if _is_logged(self.refused):
+            _LOG.warning("%s: dropped %s", self.name, self.last_refused)
+        if self.refused == MOST_LOGGED:
+            _LOG.warning("%s: from now on one of %d is logged", self.name, MOST_LOGGED)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
         """Count and log a fault; returns its message. Raises KeyboardInterrupt again."""
@@ -147,7 +154,8 @@ class Boundary:
         key = _cut(sample.key, LONGEST_TEXT)
         what = f"{tag} " if tag else ""
         self.last = f"{what}{_cut(key, 80)}: {type(error).__name__} at {place}: {_cut(text, 200)}"
-        _LOG.error("set aside: %s", self.last)
+        if _is_logged(self.faults):
+            _LOG.error("set aside: %s", self.last)
         _LOG.debug("%s", "".join(traceback.format_exception(error)))
         digest = _name(sample)[1]
         stamp_ns = min(max(sample.stamp_ns, -(2**62)), 2**62 - 1)
@@ -216,6 +224,10 @@ def _is_interrupt(error: BaseException | None) -> bool:
 
 def _cut(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 1]}…"
+
+
+def _is_logged(count: int) -> bool:
+    return count <= MOST_LOGGED or count % MOST_LOGGED == 0
 
 
 def _name(sample: Sample) -> tuple[str, bytes]:

@@ -294,3 +294,13 @@ def test_an_interrupt_within_a_compiled_kernel_ends_the_run_and_is_no_fault() ->
     with pytest.raises(KeyboardInterrupt):
         boundary.give(Interrupted(), submap(0))
     assert boundary.faults == 0
+
+
+def test_who_is_refused_without_end_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    boundary = Boundary("robot/r1")
+    for k in range(10_000):
+        boundary.refuse(Sample("robot/r2/submap", b"", 0, 0, k), "of r9, not in this team")
+    assert boundary.refused == 10_000
+    assert 100 < len(caplog.records) < 300
+    assert "one of 100 is logged" in caplog.text
+    assert "10000 dropped" in boundary.warnings[0]
