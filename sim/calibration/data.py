@@ -82,10 +82,10 @@ def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
     if intervals.steered:
         speeds = np.array([steered(motion, *pair) for pair in speeds.tolist()]).reshape(-1, 2)
     if intervals.increments is not None:
-        told = intervals.as_motions
-        twists = [moved(each, None).twist for each in intervals.increments[told]]
-        rates = np.array(twists).reshape(-1, 3) / (intervals.duration_ns[told, np.newaxis] * 1e-9)
-        speeds[told] = rates[:, [0, 2]]
+        moving = intervals.as_motions
+        twists = [moved(each, None).twist for each in intervals.increments[moving]]
+        rates = np.array(twists).reshape(-1, 3) / (intervals.duration_ns[moving, np.newaxis] * 1e-9)
+        speeds[moving] = rates[:, [0, 2]]
     return replace(intervals, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)
 
 

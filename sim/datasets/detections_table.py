@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import UInt32
 
 from sim.datasets.csv_table import CsvTable, cells_of, read_table
-from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE, covariances_of
+from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
+from sim.datasets.some_rows import covariances_of
 from sim.datasets.tables import File
 from sim.datasets.utias_rows import on_circle
 from sim.world.identities import in_order

@@ -26,6 +26,7 @@ from sim.datasets.csv_table import CsvTable, read_table
 from sim.datasets.detections_table import detections_of, together
 from sim.datasets.folder_files import EXPECTED, left_out, opened_folder
 from sim.datasets.folder_odometry import intervals_of
+from sim.datasets.some_rows import POSE_COVARIANCE
 from sim.datasets.tables import DatasetError, File
 from sim.world.config import FolderWorld, starts_unknown
 from sim.world.streams import (
@@ -39,7 +40,7 @@ from sim.world.streams import (
 from team.config import RobotConfig
 
 DAY_NS = 86_400 * 10**9
-COVARIANCE = rows.POSE_COVARIANCE
+COVARIANCE = POSE_COVARIANCE
 TABLES = {
     "odometry": (
         "t_s", "duration_s", *rows.SPEEDS, *rows.POSES, *rows.INCREMENTS, *rows.STEERED,

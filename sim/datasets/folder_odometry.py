@@ -7,14 +7,12 @@ from sim.datasets.csv_table import CsvTable
 from sim.datasets.folder_tables import (
     INCREMENTS,
     NOT_A_COVARIANCE,
-    POSE_COVARIANCE,
     POSES,
     SPEEDS,
     STEERED,
     Rows,
-    numbers_in,
-    pose_covariances,
 )
+from sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
 from sim.datasets.utias_rows import on_circle
 from sim.world.streams import Intervals, moved
 from team.config import Bounds
@@ -81,8 +79,10 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
             motions[arced] = arcs(steps[arced], duration[arced])
         as_motions = ~np.isnan(motions[:, 0])
         forward[as_motions], yaw_rate[as_motions] = 0.0, 0.0
-        told = motions if as_motions.any() else None
-        intervals = Intervals(ends, duration, forward, yaw_rate, form == STEERED, told, claims)
+        increments = motions if as_motions.any() else None
+        intervals = Intervals(
+            ends, duration, forward, yaw_rate, form == STEERED, increments, claims
+        )
         if len(forms) > 1:
             _judge_speeds(rows, INCREMENTS, motions, duration)
     else:
@@ -99,11 +99,11 @@ def _drop_other_clocks(rows: Rows) -> None:
         return
     edges = np.concatenate([[0], jumps, [len(rows.stamps_ns)]])
     longest = int(np.diff(edges).argmax())
-    kept = np.zeros(len(rows.stamps_ns), np.bool_)
-    kept[edges[longest] : edges[longest + 1]] = True
+    chosen = np.zeros(len(rows.stamps_ns), np.bool_)
+    chosen[edges[longest] : edges[longest + 1]] = True
     days = float(np.diff(rows.stamps_ns).max()) * 1e-9 / 86_400.0
     rows.drop(
-        ~kept,
+        ~chosen,
         f"by another clock than most rows: it jumps by {days:,.0f} days at most, as where a clock "
         "is set",
     )

@@ -13,11 +13,11 @@ from sim.datasets.folder_tables import (
     POINTS,
     POLAR,
     POLAR_COVARIANCE,
-    POSE_COVARIANCE,
     POSES,
     SPEEDS,
     STEERED,
 )
+from sim.datasets.some_rows import POSE_COVARIANCE
 from sim.world.streams import Detections, RobotStream, WorldStreams
 
 Row = Sequence[object]

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSE_COVARIANCE, POSES, SPEEDS
+from sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSES, SPEEDS
 from sim.datasets.folder_writer import Row, seconds, write_table
+from sim.datasets.some_rows import POSE_COVARIANCE
 from team.ros2.translator import Measured, Pose, Seen, Speeds
 
 

@@ -114,7 +114,7 @@ def _stream(
     sighted = [each for each in measurements if isinstance(each, m.Sightings)]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
     intervals = intervals_of(robot, odometry, clock_offset_s)
-    told = (forms_of(odometry), forms_of(seen))
+    mixed = (forms_of(odometry), forms_of(seen))
     truth = sorted(truth, key=lambda each: each.stamp_ns)
     times = [stamps(each.stamps, "stamps") for each in truth]
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
@@ -128,7 +128,7 @@ def _stream(
         teammates=robots,
         truth_ns=np.concatenate(times) if times else None,
         truth=np.concatenate(poses) if poses else None,
-        notes=[f"its stream has {forms}; each stays in its own form" for forms in told if forms],
+        notes=[f"its stream has {forms}; each stays in its own form" for forms in mixed if forms],
     )
 
 
