@@ -152,7 +152,7 @@ def _entries(
 ) -> tuple[tuple[Entry, ...], list[str]]:
     """The entry of every measurement that exists or should, and the violations among them."""
     robot, incarnation = stream
-    measurements = log.measurements.get(stream, {})
+    measurements: Mapping[int, m.Measurement] = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
     if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):
         raise RerunError(

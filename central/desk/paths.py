@@ -7,7 +7,6 @@ ends (`team.estimation.hybrid_slam.window_path`).
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import takewhile
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -17,7 +16,9 @@ from team import translate
 from team.containment import Boundary
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.window_path import Ends, placed, window_path
+from team.robot.driven import driven
 from team.robot.node import RobotNode
+from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
@@ -67,11 +68,16 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
 
     node, boundary = RobotNode(config, on_window=keep), Boundary(ch.robot_node(robot))
     boundary.give(node, m.Liveliness(stamp_ns=0, node="central", alive=False))
-    measurements = found.measurements.get((robot, incarnation), {})
-    whole = range(max(measurements, default=-1) + 1)
-    for number in takewhile(measurements.__contains__, whole):
-        boundary.give(node, measurements[number])
-    end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(whole))
+    count = 0
+    measurements = found.measurements.get((robot, incarnation))
+    if measurements is not None:
+        count = max(measurements) + 1
+        for each in measurements.consecutive(0, count):
+            if isinstance(each, OdometryBlock):
+                driven(node, each, lambda message: boundary.give(node, message))
+            else:
+                boundary.give(node, each)
+    end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
     boundary.give(node, m.End(stamp_ns=0, streams=(end,)))
     return windows
 

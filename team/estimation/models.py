@@ -6,7 +6,8 @@ noise of motion carried to the tangent space of the motion's end, so that motion
 
 import math
 from dataclasses import dataclass
-from typing import Self
+from functools import lru_cache
+from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -69,6 +70,79 @@ def composed(
     return compose(mean, then), total
 
 
+class CourseModel(NamedTuple):
+    """The numbers of a `MotionModel` as kernels take them: `model_of`.
+
+    Densities are (per_s, per_m, per_rad). What a model does not have has its flag down; a limit
+    that it does not have is infinite, as is the range of speeds whose scale is known.
+    """
+
+    turns_first: bool
+    forward: tuple[float, float, float]
+    turn: tuple[float, float, float]
+    final_turn: tuple[float, float, float]
+    lateral: tuple[float, float, float]
+    forward_scale: float
+    yaw_scale: float
+    yaw_rate_limit: float
+    turn_drag: float
+    veer: float
+    slow_below: float
+    slow_scale: float
+    calibrated_speed: tuple[float, float]
+    has_alphas: bool
+    alphas: tuple[float, float, float, float, float, float]
+    alpha_interval_s: float
+    has_wheels: bool
+    wheels: tuple[float, float, float]
+    has_shares: bool
+    shares: tuple[float, float, float]
+    shares_interval_s: float
+
+
+Densities = tuple[float, float, float]
+Course = tuple[float, float, float, float, float, float, float]
+
+
+def model_of(motion: MotionModel) -> CourseModel:
+    """The numbers of a motion model."""
+    alphas, shares, base = motion.alphas, motion.shares, motion.wheel_base
+    speeds = motion.calibrated_speed
+    return CourseModel(
+        turns_first=motion.kind == "turn-then-drive",
+        forward=_densities(motion.forward),
+        turn=_densities(motion.turn),
+        final_turn=_densities(motion.final_turn),
+        lateral=_densities(motion.lateral),
+        forward_scale=motion.forward_scale,
+        yaw_scale=motion.yaw_scale,
+        yaw_rate_limit=math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit,
+        turn_drag=motion.turn_drag,
+        veer=motion.veer,
+        slow_below=motion.slow_below,
+        slow_scale=motion.slow_scale,
+        calibrated_speed=(-math.inf, math.inf) if speeds is None else speeds,
+        has_alphas=alphas is not None,
+        alphas=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) if alphas is None else alphas,
+        alpha_interval_s=motion.alpha_interval_s,
+        has_wheels=base is not None,
+        wheels=(1.0 if base is None else base, motion.left_wheel, motion.right_wheel),
+        has_shares=shares is not None,
+        shares=(0.0, 0.0, 0.0) if shares is None else shares,
+        shares_interval_s=motion.shares_interval_s,
+    )
+
+
+def _densities(noise: MotionNoise) -> Densities:
+    return float(noise.per_s), float(noise.per_m), float(noise.per_rad)
+
+
+@lru_cache(maxsize=256)
+def known_model(motion: MotionModel) -> CourseModel:
+    """`model_of`, kept from call to call."""
+    return model_of(motion)
+
+
 def increment_of(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Increment:
@@ -76,14 +150,14 @@ def increment_of(
 
     The motion of `course_of`, and its noise in the tangent space of its end.
     """
-    kernel = turn_then_drive if motion.kind == "turn-then-drive" else arc
-    return Increment(*kernel(*course_of(motion, duration_s, forward, yaw_rate)))
+    model = known_model(motion)
+    kernel = turn_then_drive if model.turns_first else arc
+    return Increment(*kernel(*course_of(model, duration_s, forward, yaw_rate)))
 
 
-def course_of(
-    motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """The way [m] and the turn [rad] of an interval, and the `motion_variances` over them.
+@compiled
+def course_of(model: CourseModel, duration_s: float, forward: float, yaw_rate: float) -> Course:
+    """The way [m] and the turn [rad] of an interval, and the `_variances` over them.
 
     With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below),
     ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
@@ -95,51 +169,68 @@ def course_of(
     Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|, and what `_of_alphas`,
     `_of_wheels` and the shares add; by the wheels alone are a and b correlated.
     """
-    rate = motion.yaw_scale * yaw_rate
-    if motion.yaw_rate_limit is not None:
-        rate = min(max(rate, -motion.yaw_rate_limit), motion.yaw_rate_limit)
-    lost = motion.turn_drag * abs(rate) * duration_s
-    slow = abs(forward) < motion.slow_below
-    logged = (motion.slow_scale if slow else motion.forward_scale) * forward * duration_s
-    distance = math.copysign(max(abs(logged) - lost, 0.0), logged)
-    turn = rate * duration_s + motion.veer * distance
-    return (distance, turn, *motion_variances(motion, duration_s, distance, turn))
+    rate = _clipped(model.yaw_scale * yaw_rate, model.yaw_rate_limit)
+    lost = model.turn_drag * abs(rate) * duration_s
+    scale = model.slow_scale if abs(forward) < model.slow_below else model.forward_scale
+    logged = scale * forward * duration_s
+    left = abs(logged) - lost
+    distance = math.copysign(0.0 if left < 0.0 else left, logged)
+    turn = rate * duration_s + model.veer * distance
+    forward_var, turn_var, both, final, lateral = _variances(model, duration_s, distance, turn)
+    return distance, turn, forward_var, turn_var, both, final, lateral
+
+
+@compiled
+def _clipped(rate: float, limit: float) -> float:
+    if rate < -limit:
+        return -limit
+    return limit if rate > limit else rate
 
 
 def motion_variances(
     motion: MotionModel, duration_s: float, distance: float, turn: float
 ) -> tuple[float, float, float, float, float]:
+    """The noises of a motion model over a way [m] and a turn [rad], as `_variances` has them."""
+    return _variances(known_model(motion), duration_s, distance, turn)
+
+
+@compiled
+def _variances(
+    model: CourseModel, duration_s: float, distance: float, turn: float
+) -> tuple[float, float, float, float, float]:
     """Of (forward, turn, final turn, lateral) over a way and a turn, the third before the last two:
     the covariance of forward and turn.
     """
-    forward_var = _variance(motion.forward, duration_s, distance, turn)
-    turn_var = _variance(motion.turn, duration_s, distance, turn)
-    final = _variance(motion.final_turn, duration_s, distance, turn)
+    forward_var = _variance(model.forward, duration_s, distance, turn)
+    turn_var = _variance(model.turn, duration_s, distance, turn)
+    final = _variance(model.final_turn, duration_s, distance, turn)
     both = 0.0
-    if motion.alphas is not None and duration_s > 0.0:
-        added = _of_alphas(motion.alphas, motion.alpha_interval_s, duration_s, distance, turn)
+    if model.has_alphas and duration_s > 0.0:
+        added = _of_alphas(model.alphas, model.alpha_interval_s, duration_s, distance, turn)
         forward_var, turn_var, final = forward_var + added[0], turn_var + added[1], final + added[2]
-    if motion.wheel_base is not None:
-        added = _of_wheels(motion.wheel_base, motion.left_wheel, motion.right_wheel, distance, turn)
+    if model.has_wheels:
+        base, left, right = model.wheels
+        added = _of_wheels(base, left, right, distance, turn)
         forward_var, turn_var, both = forward_var + added[0], turn_var + added[1], added[2]
-    lateral = _variance(motion.lateral, duration_s, distance, turn)
-    if motion.shares is not None and duration_s > 0.0:
-        shared = distance * distance * motion.shares_interval_s / duration_s
-        along, across, heading = motion.shares
+    lateral = _variance(model.lateral, duration_s, distance, turn)
+    if model.has_shares and duration_s > 0.0:
+        shared = distance * distance * model.shares_interval_s / duration_s
+        along, across, heading = model.shares
         forward_var += along * along * shared
         lateral += across * across * shared
         turn_var += heading * heading * shared
     return forward_var, turn_var, both, final, lateral
 
 
-def _variance(noise: MotionNoise, duration_s: float, distance: float, turn: float) -> float:
+@compiled
+def _variance(noise: Densities, duration_s: float, distance: float, turn: float) -> float:
+    per_s, per_m, per_rad = noise
     return (
-        noise.per_s * noise.per_s * duration_s
-        + noise.per_m * noise.per_m * abs(distance)
-        + noise.per_rad * noise.per_rad * abs(turn)
+        per_s * per_s * duration_s + per_m * per_m * abs(distance) + per_rad * per_rad * abs(turn)
     )
 
 
+@compiled
 def _of_alphas(
     alphas: Alphas, interval_s: float, duration_s: float, distance: float, turn: float
 ) -> tuple[float, float, float]:
@@ -148,7 +239,8 @@ def _of_alphas(
     Their errors of v, ω and γ have the variances α₁v² + α₂ω², α₃v² + α₄ω², α₅v² + α₆ω² and are held
     for one interval T (eq. 2-4): times T² on the way and the turns. As a density that is T·t.
     """
-    v2, w2 = elementary.squared(distance / duration_s), elementary.squared(turn / duration_s)
+    v, w = distance / duration_s, turn / duration_s
+    v2, w2 = v * v, w * w
     spread = interval_s * duration_s
     a1, a2, a3, a4, a5, a6 = alphas
     return (
@@ -158,6 +250,7 @@ def _of_alphas(
     )
 
 
+@compiled
 def _of_wheels(
     base: float, left: float, right: float, distance: float, turn: float
 ) -> tuple[float, float, float]:
@@ -170,6 +263,24 @@ def _of_wheels(
     of_left, of_right = left * left * abs(distance - half), right * right * abs(distance + half)
     total = of_left + of_right
     return 0.25 * total, total / (base * base), 0.5 * (of_right - of_left) / base
+
+
+@compiled
+def scale_column(
+    model: CourseModel, duration_s: float, forward: float, yaw_rate: float
+) -> tuple[float, float]:
+    """d/db at 0 of the interval's motion (ahead, left) if the true way is (1 + b) times the
+    measured one, in the tangent space of its end: `odometry.forward_column`.
+    """
+    least, most = model.calibrated_speed
+    if least <= abs(forward) <= most:
+        return 0.0, 0.0
+    way = model.forward_scale * forward * duration_s
+    if model.turns_first:
+        return way, 0.0
+    turn = _clipped(model.yaw_scale * yaw_rate, model.yaw_rate_limit) * duration_s
+    s, c = elementary.sin_and_cos(0.5 * turn)
+    return way * c, -way * s
 
 
 @compiled

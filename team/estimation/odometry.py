@@ -8,13 +8,19 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from team.config import MotionModel
 from team.estimation import dense, elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Pose, adjoint, exponential, logarithm
-from team.estimation.models import Increment, increment_of, motion_variances
+from team.estimation.models import (
+    Increment,
+    increment_of,
+    known_model,
+    motion_variances,
+    scale_column,
+)
 
 
 class Moved(NamedTuple):
@@ -53,6 +59,15 @@ class OdometryInterval(NamedTuple):
         twist = self.moved.twist * (duration_ns / self.duration_ns)
         return self._replace(end_ns=end_ns, duration_ns=duration_ns, moved=Moved(twist))
 
+    def lasting(self, duration_ns: int) -> "Intervals":
+        """A part of the interval, which tells speeds, as a row of its own."""
+        return Intervals(
+            np.array([self.end_ns], np.int64),
+            np.array([duration_ns], np.int64),
+            np.array([self.forward], np.float64),
+            np.array([self.yaw_rate], np.float64),
+        )
+
     @property
     def speed(self) -> float:
         """Magnitude of the velocity [m/s], or the signed forward speed where no motion was
@@ -76,6 +91,29 @@ class OdometryInterval(NamedTuple):
         return column
 
 
+class Intervals(NamedTuple):
+    """Consecutive intervals that tell speeds, one row each: ends and durations [ns], mean forward
+    speeds [m/s] and yaw rates [rad/s].
+    """
+
+    ends_ns: Int64[np.ndarray, " n"]
+    durations_ns: Int64[np.ndarray, " n"]
+    forward: Float[np.ndarray, " n"]
+    yaw_rates: Float[np.ndarray, " n"]
+
+    def first(self, count: int) -> "Intervals":
+        """The first `count` of them."""
+        return Intervals(*(column[:count] for column in self))
+
+    @property
+    def last(self) -> OdometryInterval:
+        """The last one."""
+        end_ns, duration_ns = int(self.ends_ns[-1]), int(self.durations_ns[-1])
+        return OdometryInterval(
+            end_ns, duration_ns, float(self.forward[-1]), float(self.yaw_rates[-1])
+        )
+
+
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)
 """The interval that is assumed before the first measurement."""
 
@@ -88,18 +126,8 @@ def forward_column(
     In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale is
     known, and without such a range.
     """
-    column = np.zeros(3)
-    speeds = motion.calibrated_speed
-    if speeds is None or speeds[0] <= abs(forward) <= speeds[1]:
-        return column
-    way = motion.forward_scale * forward * duration_s
-    if motion.kind == "turn-then-drive":
-        column[0] = way
-        return column
-    limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
-    turn = min(max(motion.yaw_scale * yaw_rate, -limit), limit) * duration_s
-    column[0], column[1] = way * elementary.cos(0.5 * turn), -way * elementary.sin(0.5 * turn)
-    return column
+    ahead, left = scale_column(known_model(motion), duration_s, forward, yaw_rate)
+    return np.array([ahead, left, 0.0])
 
 
 def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:

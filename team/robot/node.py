@@ -34,6 +34,7 @@ from team.robot.statements import MessageWriter
 from team.robot.stream_end import EndOfStream
 from team.robot.warnings import driver_away, slipped, unexpected
 from team.stream.inbox import Inbox
+from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -273,6 +274,28 @@ class RobotNode:
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
         return self._sound([*self._handled(message), *self._go_on()])
+
+    def drive_on(self, block: OdometryBlock) -> tuple[int, list[Outgoing]]:
+        """Take the first of many odometry intervals at once: those that only move the robot, as
+        `handle` takes each. Returns their number and what is to be published; of 0 intervals the
+        first one needs `handle`.
+        """
+        inbox, most = self._inbox, self._pace.until_report
+        is_own = block.robot == self.robot and inbox.is_next(block.incarnation, block.first)
+        here = is_own and block.incarnation == self._incarnation and self._consumed == block.first
+        if not here or self._pending or self._blocked or not self._stream_end.is_open:
+            return 0, []
+        count = self._front.drive_on(block.part(0, most))
+        if not count:
+            return 0, []
+        inbox.passed(count)
+        self._consumed += count
+        self._steps += count
+        end_ns = int(block.stamps_ns[count - 1]) + round(self.config.clock_offset_s * 1e9)
+        self._now_ns, self._passed_ns = max(self._now_ns, end_ns), max(self._passed_ns, end_ns)
+        self.ledger.count_intervals(block.first, count)
+        self._pace.unreported += count
+        return count, [self._progress()] if self._pace.until_report <= 0 else []
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue behind a measurement whose handling raised an exception, as if it had not come.

@@ -24,6 +24,11 @@ class EndOfStream:
         """Whether every measurement up to the last one has been consumed."""
         return self._last is not None and self._inbox.complete(self._last)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether neither an end nor an order to end has come."""
+        return self._last is None and not self.is_ordered
+
     def last_of(self, incarnation: int) -> int | None:
         """The measurements of an incarnation that has ended; None while it has not."""
         last = self._last

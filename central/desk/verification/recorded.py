@@ -1,15 +1,19 @@
 """Indexes a log by recorded inputs and recomputable outputs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TypeVar
 
 import msgspec
+import numpy as np
 
 from central.config import CentralConfig
+from central.desk.verification.measurements import RecordedMeasurements
 from team.config import RobotConfig
 from team.former_names import with_current_names
-from team.recording.reader import Log
+from team.recording.reader import Log, LogError
+from team.stream.odometry_block import decoded_odometry
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -40,25 +44,52 @@ class Recorded:
     """Everything in a log that is an input or an output of a node; each measurement once.
 
     measurements: by (robot, incarnation) and counter. configured: the last announcement of each
-    node. outputs: the recomputable messages, in the order of the log. contradicted: measurements
-    that the log has twice with different content. reported: number of measurements that a robot has
-    reported as consumed. published: number of measurements that the source has announced.
+    node. outputs: the recomputable messages, in the order of the log. reported: number of
+    measurements that a robot has reported as consumed. published: number of measurements that the
+    source has announced.
     known_map: the prior map of localisation-only robots, if there is one. withdrawals: the first
     order on each withdrawn robot. unsound: number of invalid samples.
     """
 
-    measurements: dict[Stream, dict[int, m.Measurement]] = field(default_factory=dict)
+    measurements: dict[Stream, RecordedMeasurements] = field(default_factory=dict)
     configured: dict[str, m.Configuration] = field(default_factory=dict)
     outputs: list[RecordedOutput] = field(default_factory=list)
-    contradicted: list[m.Measurement] = field(default_factory=list)
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
     known_map: m.KnownMap | None = None
     withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
     unsound: int = 0
+    _filed: int = 0
 
-    def take(self, sample: Sample) -> None:
-        """File one sample; a viewer's samples are neither input nor output."""
+    def take_all(self, samples: Sequence[Sample]) -> None:
+        """File samples in the order of the log; those with odometry are decoded together."""
+        odometry: dict[str, list[int]] = {}
+        for place, sample in enumerate(samples):
+            robot = _driver_of(sample.key)
+            if robot is None:
+                self.take(sample, self._filed + place)
+            else:
+                odometry.setdefault(robot, []).append(place)
+        for robot, places in odometry.items():
+            table = decoded_odometry(robot, [samples[place].payload for place in places])
+            of_log = self._filed + np.array(places)
+            for k in np.flatnonzero(~table.is_plain).tolist():
+                self.take(samples[places[k]], int(of_log[k]))
+            for incarnation in np.unique(table.incarnations[table.is_plain]).tolist():
+                rows = table.is_plain & (table.incarnations == incarnation)
+                self._stream(robot, incarnation).put_rows(table.only(rows), of_log[rows])
+        self._filed += len(samples)
+
+    def _stream(self, robot: str, incarnation: int) -> RecordedMeasurements:
+        there = self.measurements.get((robot, incarnation))
+        if there is None:
+            there = self.measurements[robot, incarnation] = RecordedMeasurements(robot, incarnation)
+        return there
+
+    def take(self, sample: Sample, place: int = 0) -> None:
+        """File one sample, at this place of the log; a viewer's samples are neither input nor
+        output.
+        """
         if ch.VIEW.owner(sample.key) is not None:
             return
         try:
@@ -68,9 +99,7 @@ class Recorded:
             return
         match message:
             case m.Measurement():
-                stream = self.measurements.setdefault((message.robot, message.incarnation), {})
-                if stream.setdefault(message.number, message) != message:
-                    self.contradicted.append(message)
+                self._stream(message.robot, message.incarnation).put(message, place)
             case m.Configuration():
                 of_a_fold = channel is ch.TEAM_CONFIG
                 self.configured["central" if of_a_fold else message.node] = message
@@ -168,9 +197,17 @@ INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_
 def recorded(log: Log) -> Recorded:
     """One pass over a log."""
     found = Recorded()
-    for sample in log.samples(INPUTS):
-        found.take(sample)
+    for chunk in log.chunks(INPUTS):
+        if isinstance(chunk, LogError):
+            raise chunk
+        found.take_all(chunk)
     return found
+
+
+@lru_cache(maxsize=4096)
+def _driver_of(key: str) -> str | None:
+    """The robot of an odometry key; None for any other key."""
+    return ch.ODOMETRY.owner(key)
 
 
 def identity(key: str, message: m.Message) -> Identity:

@@ -3,15 +3,18 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
+from central.desk.verification.measurements import RecordedMeasurements
 from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
+from team.robot.driven import driven
 from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import OnDisposition, no_listener
 from team.robot.node import RobotNode
 from team.robot.poses import RunningPoses
 from team.robot.statements import MessageWriter
+from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -61,6 +64,12 @@ class RecomputedRobot:
             on_disposition=on_disposition,
         )
         self._boundary = Boundary(ch.robot_node(config.id))
+
+    def driven(self, each: m.Measurement | OdometryBlock) -> list[Outgoing]:
+        """Handle a measurement, or many odometry intervals at once."""
+        if isinstance(each, m.Measurement):
+            return self.given(each)
+        return driven(self.node, each, self.given)
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell does: one that raises is set aside."""
@@ -132,24 +141,19 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
     return [found[k] for k in takewhile(found.__contains__, range(len(found)))]
 
 
-def _first_of(
-    done: m.Done, chain: Sequence[m.Submap], measurements: Mapping[int, m.Measurement]
-) -> int:
+def _first_of(done: m.Done, chain: Sequence[m.Submap], measurements: RecordedMeasurements) -> int:
     """The first measurement of the process that ended with this `Done`, by its steps."""
-    steps = 0
+    last = min(done.measurements, max(measurements) + 1)
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
-    for counter in range(min(done.measurements, max(measurements) + 1), -1, -1):
-        steps += counter < done.measurements and isinstance(
-            measurements.get(counter), m.AnyOdometry
-        )
-        if counter in begins and steps == done.steps:
+    for counter in sorted((each for each in begins if each <= last), reverse=True):
+        if measurements.intervals(counter, done.measurements) == done.steps:
             return counter
     return 0
 
 
 def _life(
     new: NewRobot,
-    measurements: Mapping[int, m.Measurement],
+    measurements: RecordedMeasurements,
     chain: Sequence[m.Submap],
     first: int,
     until: int | None,
@@ -166,9 +170,9 @@ def _life(
         if first:
             node.node.resume(start, [s for s in chain if s.last_measurement < first])
         counter = first
-        while counter < last and counter in measurements:
-            yield from node.given(measurements[counter])
-            counter += 1
+        for each in measurements.consecutive(first, last):
+            yield from node.driven(each)
+            counter += each.size if isinstance(each, OdometryBlock) else 1
         if counter == last and until is not None:
             end = m.StreamEnd(robot=start.robot, incarnation=start.incarnation, measurements=until)
             yield from node.given(m.End(stamp_ns=0, streams=(end,)))
@@ -224,13 +228,15 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
-    measurements = log.measurements.get((robot, incarnation), {})
+    measurements = log.measurements.get((robot, incarnation))
+    if measurements is None:
+        return {}
     done = max((d.measurements for d in _dones(log, robot, incarnation)), default=None)
-    most = len(measurements) if done is None else done
-    consumed = list(takewhile(measurements.__contains__, range(most)))
-    for counter in consumed:
-        node.given(measurements[counter])
+    consumed = 0
+    for each in measurements.consecutive(0, len(measurements) if done is None else done):
+        node.driven(each)
+        consumed += each.size if isinstance(each, OdometryBlock) else 1
     if consumed and done is not None:
-        end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=len(consumed))
+        end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=consumed)
         node.given(m.End(stamp_ns=0, streams=(end,)))
-    return {counter: disposition_of.get(counter, "lost") for counter in consumed}
+    return {counter: disposition_of.get(counter, "lost") for counter in range(consumed)}

@@ -137,9 +137,10 @@ def verify(log: Log) -> Verification:
         outputs = [each for each in of_channel if getattr(each.message, "robot", "") not in others]
         if outputs:
             results.append(_compared(channel.name, outputs, recomputed, found, exact=not other))
-    stamps = [r.stamp_ns for stream in found.measurements.values() for r in stream.values()]
-    span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
-    return Verification(tuple(results), other, len(stamps), span_s, found.unsound)
+    spans = [stream.span_ns for stream in found.measurements.values()]
+    span_s = (max(s[1] for s in spans) - min(s[0] for s in spans)) * 1e-9 if spans else 0.0
+    count = sum(map(len, found.measurements.values()))
+    return Verification(tuple(results), other, count, span_s, found.unsound)
 
 
 def _others(log: Log, found: Recorded) -> frozenset[str]:

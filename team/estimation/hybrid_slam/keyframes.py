@@ -17,7 +17,7 @@ from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
 from team.estimation.hybrid_slam.sensitivity import carried_on
 from team.estimation.models import Increment, acceptable, corrected
 from team.estimation.mount import of_sensor
-from team.estimation.odometry import STANDING, OdometryInterval
+from team.estimation.odometry import STANDING, Intervals, OdometryInterval
 from team.estimation.scans import Own, calibrated, unclaimed
 from team.rejection import Rejection
 
@@ -173,6 +173,25 @@ class Segmenter:
             keyframes.append(self._close_keyframe(stamp_ns))
         return keyframes
 
+    def quiet(self, intervals: Intervals) -> int:
+        """Number of the first intervals that only move the robot: no scan, no pose node and no
+        end of a keyframe is in them.
+        """
+        grid = self._grid
+        if self._sensor.is_mounted or (grid is not None and grid.carries):
+            return 0
+        until_ns = [scan.stamp_ns for scan in self._waiting[:1]]
+        until_ns += [] if grid is None else [grid.quiet_until_ns]
+        until_ns += [self._keyframe_start_ns + self._keyframe_ns] if self._keyframe else []
+        ends_ns = intervals.ends_ns
+        return int(ends_ns.searchsorted(min(until_ns))) if until_ns else len(ends_ns)
+
+    def drive_on(self, intervals: Intervals) -> None:
+        """Take some of the `quiet` intervals, as `drive` takes each of them."""
+        self._last, self._unmeasured = intervals.last, None
+        self._run.add(intervals)
+        self.now_ns = self._last.end_ns
+
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
         """Close the window here: returns its last keyframe, if one is open, and the motion after
         it.
@@ -225,7 +244,7 @@ class Segmenter:
         if duration_ns <= 0:
             return
         if self._is_plain(over):
-            self._run.add(over, duration_ns)
+            self._run.add(over.lasting(duration_ns))
             return
         self._settle()
         step = over.part(self._motion, duration_ns, rest_ns)

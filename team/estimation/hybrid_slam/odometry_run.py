@@ -14,8 +14,17 @@ from team.config import MotionModel
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Pose, compose
 from team.estimation.hybrid_slam.sensitivity import carried_on
-from team.estimation.models import Increment, arc, composed, course_of, turn_then_drive
-from team.estimation.odometry import OdometryInterval
+from team.estimation.models import (
+    CourseModel,
+    Increment,
+    arc,
+    composed,
+    course_of,
+    model_of,
+    scale_column,
+    turn_then_drive,
+)
+from team.estimation.odometry import Intervals
 
 Spread = Float[np.ndarray, "3 3"]
 
@@ -40,7 +49,7 @@ class Since(NamedTuple):
 def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) -> Since:
     """All motions after further intervals, in order: equal to `Increment.then` and `compose`.
 
-    rows: `models.course_of` of each interval, then its `odometry.forward_column`.
+    rows: `models.course_of` of each interval, then its `odometry.forward_column`, as `rows_of`.
     """
     motion, covariance, shift, node_motion, node_covariance, of_scan = since
     for row in rows:
@@ -57,28 +66,41 @@ def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) ->
     return Since(motion, covariance, shift, node_motion, node_covariance, of_scan)
 
 
+@compiled
+def rows_of(model: CourseModel, intervals: Intervals) -> Float[np.ndarray, "n 10"]:
+    """A row of `gone_on` for each interval."""
+    _, durations_ns, forward, yaw_rates = intervals
+    rows = np.zeros((len(forward), 10))
+    for k in range(len(forward)):
+        duration_s = durations_ns[k] * 1e-9
+        course = course_of(model, duration_s, forward[k], yaw_rates[k])
+        for i in range(7):
+            rows[k, i] = course[i]
+        rows[k, 7], rows[k, 8] = scale_column(model, duration_s, forward[k], yaw_rates[k])
+    return rows
+
+
 class OdometryRun:
     """Parts of intervals whose motion follows from their speeds, stored until it is needed."""
 
     def __init__(self, motion: MotionModel) -> None:
-        self._motion = motion
-        self._rows: list[tuple[float, ...]] = []
+        self._model = model_of(motion)
+        self._rows: list[Float[np.ndarray, "n 10"]] = []
 
     def __bool__(self) -> bool:
         """Whether there are any."""
         return bool(self._rows)
 
-    def add(self, over: OdometryInterval, duration_ns: int) -> None:
-        """Adds the next part of an interval."""
-        course = course_of(self._motion, duration_ns * 1e-9, over.forward, over.yaw_rate)
-        self._rows.append((*course, *over.forward_column(self._motion, duration_ns).tolist()))
+    def add(self, intervals: Intervals) -> None:
+        """Adds the next parts, whose durations these are."""
+        self._rows.append(rows_of(self._model, intervals))
 
     def behind(self, motion: Increment) -> Increment:
         """A motion followed by all stored parts, which remain stored."""
         none = np.zeros(3)
         still = none, np.zeros((3, 3))
         since = Since(motion.mean, motion.covariance, none, *still, none)
-        after = gone_on(since, np.array(self._rows), self._motion.kind == "turn-then-drive")
+        after = gone_on(since, self._whole(), self._model.turns_first)
         return Increment(after.motion, after.covariance)
 
     def driven(
@@ -89,7 +111,12 @@ class OdometryRun:
         of_scan: Pose,
     ) -> Since:
         """The motions up to now with all stored parts, which are removed."""
-        rows, self._rows = np.array(self._rows), []
+        rows, self._rows = self._whole(), []
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
-        return gone_on(since, rows, self._motion.kind == "turn-then-drive")
+        return gone_on(since, rows, self._model.turns_first)
+
+    def _whole(self) -> Float[np.ndarray, "n 10"]:
+        if len(self._rows) > 1:
+            self._rows = [np.concatenate(self._rows)]
+        return self._rows[0]

@@ -15,6 +15,7 @@ configuration and (seed, robot, incarnation, sequence) alone. Joining submaps is
 from dataclasses import replace
 
 from team.config import RobotConfig
+from team.estimation.compiled import compiled
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
@@ -22,10 +23,13 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.open_window import OpenWindow
 from team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
 from team.estimation.hybrid_slam.window import Window
-from team.estimation.odometry import OdometryInterval
+from team.estimation.odometry import Intervals, OdometryInterval
 from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
 from team.rejection import Rejection
+
+LONGEST_NS = 2**62
+"""No two stamps are as far apart."""
 
 
 class HybridSlam:
@@ -41,6 +45,7 @@ class HybridSlam:
         self._grid = PoseGrid(config.sensor, front) if with_nodes else None
         self._segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s, self._grid)
         self._innovation, self._scans = NOTHING, 0
+        self._driven_m: float
         self._start_ns: int | None = None
         self._begin_window(0, 0)
 
@@ -85,6 +90,30 @@ class HybridSlam:
             self._grid.go_on(stamp_ns)
         return None
 
+    def drive_on(self, intervals: Intervals) -> int:
+        """Take the first of some measured intervals at once, those that only move the robot, as
+        `drive` takes each; returns their number. The next one leads to a keyframe or closes the
+        window, or there is none.
+        """
+        if self._start_ns is None or self._is_half_a_submap:
+            return 0
+        count = self._segmenter.quiet(intervals)
+        front = self._config.front_end
+        lasting_ns = (
+            min(round(front.window_s * 1e9), LONGEST_NS),
+            min(round(front.standing_s * 1e9), LONGEST_NS),
+        )
+        count, driven_m = still_open(
+            intervals.first(count), self._start_ns, lasting_ns, self._driven_m, front.window_m
+        )
+        if count:
+            taken = intervals.first(count)
+            self._driven_m = driven_m
+            self._segmenter.drive_on(taken)
+            if self._grid is not None:
+                self._grid.go_on(int(taken.ends_ns[-1]))
+        return count
+
     def finish(self) -> tuple[ClosedWindow | None, int]:
         """End the stream; returns the last submap, and the number of scans that no odometry
         covered.
@@ -101,11 +130,15 @@ class HybridSlam:
 
         A window with half as many landmarks as a submap may hold closes at once.
         """
-        front, bounds = self._config.front_end, self._config.bounds
-        if 2 * len(self.window.particles.ids) >= bounds.submap_landmarks:
+        front = self._config.front_end
+        if self._is_half_a_submap:
             return True
         stands = self._driven_m < front.window_m and lasting_ns < round(front.standing_s * 1e9)
         return lasting_ns >= round(front.window_s * 1e9) and not stands
+
+    @property
+    def _is_half_a_submap(self) -> bool:
+        return 2 * len(self.window.particles.ids) >= self._config.bounds.submap_landmarks
 
     def _close(self, start_ns: int, end_ns: int, late: int = 0) -> ClosedWindow:
         """Close the open window; where it has no solution, its submap is the odometry's motion
@@ -179,6 +212,30 @@ class HybridSlam:
     def innovation(self) -> Innovation:
         """The innovations of all windows of this incarnation that this process has computed."""
         return self._innovation.plus(self.window.innovation)
+
+
+@compiled
+def still_open(
+    intervals: Intervals,
+    start_ns: int,
+    lasting_ns: tuple[int, int],
+    driven_m: float,
+    least_m: float,
+) -> tuple[int, float]:
+    """Number of the first intervals that do not fill a window, as `HybridSlam._is_full` has it, and
+    the way [m] driven with them.
+
+    lasting_ns: after which a window is closed, and after which that of a standing robot is.
+    """
+    window_ns, standing_ns = lasting_ns
+    for k in range(len(intervals.forward)):
+        way = abs(intervals.forward[k]) * intervals.durations_ns[k] * 1e-9
+        lasting = intervals.ends_ns[k] - start_ns
+        stands = driven_m + way < least_m and lasting < standing_ns
+        if lasting >= window_ns and not stands:
+            return k, driven_m
+        driven_m += way
+    return len(intervals.forward), driven_m
 
 
 def _submap(window: Window) -> LocalMap:

@@ -1,0 +1,93 @@
+"""The measurements of a log, odometry as arrays: the same as a table of messages by number."""
+
+import msgspec
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.desk.verification.measurements import RecordedMeasurements
+from central.desk.verification.recorded import Recorded
+from team.stream.odometry_block import OdometryBlock
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import encoded
+
+numbers = st.integers(0, 12)
+plain = st.builds(
+    lambda number, forward: m.Odometry(
+        stamp_ns=10 * number,
+        robot="r1",
+        incarnation=0,
+        number=number,
+        duration_ns=10,
+        forward=forward,
+        yaw_rate=0.0,
+    ),
+    numbers,
+    st.sampled_from([1.0, 1.0, 1.0, 2.0]),
+)
+steering = st.builds(
+    lambda number: m.Steering(
+        stamp_ns=10 * number,
+        robot="r1",
+        incarnation=0,
+        number=number,
+        duration_ns=10,
+        wheel_speed=1.0,
+        steering=0.0,
+    ),
+    numbers,
+)
+scan = st.builds(
+    lambda number: m.Observations(
+        stamp_ns=10 * number, robot="r1", incarnation=0, number=number, ids=b"", ranges=b"",
+        bearings=b"",
+    ),
+    numbers,
+)  # fmt: skip
+logs = st.lists(st.one_of(plain, plain, steering, scan), max_size=30)
+
+
+def sample_of(message):
+    key = ch.OBSERVATIONS if isinstance(message, m.Observations) else ch.ODOMETRY
+    return Sample(key.key("r1"), encoded(message), message.stamp_ns, 0, 0)
+
+
+@settings(deadline=None, max_examples=300)
+@given(logs, st.integers(1, 30), numbers, numbers)
+def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, end):
+    found = Recorded()
+    for at in range(0, len(log), chunk):
+        found.take_all([sample_of(each) for each in log[at : at + chunk]])
+    table = {}
+    for each in log:
+        table.setdefault(each.number, each)
+    there = found.measurements.get(("r1", 0), RecordedMeasurements("r1", 0))
+    assert dict(there) == table
+    assert all((number in there) == (number in table) for number in range(-1, 14))
+    end = max(begin, end)
+    of_odometry = (isinstance(table.get(n), m.AnyOdometry) for n in range(begin, end))
+    assert there.intervals(begin, end) == sum(of_odometry)
+    if table:
+        stamps = [each.stamp_ns for each in table.values()]
+        assert there.span_ns == (min(stamps), max(stamps))
+    consecutive = []
+    for each in there.consecutive(begin, end):
+        consecutive += [*each.messages()] if isinstance(each, OdometryBlock) else [each]
+    last = next((n for n in range(begin, end) if n not in table), end)
+    assert consecutive == [table[n] for n in range(begin, last)]
+
+
+def test_unsound_odometry_is_counted_and_another_robots_is_not_taken():
+    sound = m.Odometry(
+        stamp_ns=1, robot="r1", incarnation=0, number=1, duration_ns=1, forward=1.0, yaw_rate=0.0
+    )
+    other = msgspec.structs.replace(sound, robot="r2")
+    found = Recorded()
+    found.take_all(
+        [sample_of(sound), sample_of(other), Sample("source/r1/odometry", b"x", 0, 0, 0)]
+    )
+    assert found.unsound == 2
+    assert [*found.measurements] == [("r1", 0)]
+    assert np.array_equal([*found.measurements["r1", 0]], [1])
