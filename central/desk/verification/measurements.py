@@ -12,6 +12,8 @@ from team.wire import messages as m
 class RecordedMeasurements(Mapping[int, m.Measurement]):
     """The measurements of one incarnation of a robot, each once: of two with one number the first
     in the log. A place is a sample's index in the log.
+
+    contradicted: numbers of measurements that the log has twice with different content.
     """
 
     def __init__(self, robot: str, incarnation: int) -> None:
@@ -19,10 +21,14 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         self._messages: dict[int, tuple[m.Measurement, int]] = {}
         self._parts: list[tuple[OdometryTable, Int64[np.ndarray, " n"]]] = []
         self._last_row = -1
+        self.contradicted: list[int] = []
 
     def put(self, message: m.Measurement, place: int) -> None:
         """Add a measurement, unless one of its number is there from before this place."""
         number = message.number
+        before = self.get(number)
+        if before is not None and before != message:
+            self.contradicted.append(number)
         there = self._messages.get(number)
         row = self._row_of(number) if there is None else None
         if there is not None and there[1] < place:
@@ -38,7 +44,8 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         """Add plain odometry in the order of the log, as `put` adds each."""
         numbers = table.numbers
         before = np.maximum.accumulate(np.concatenate(([self._last_row], numbers[:-1])))
-        is_new = (numbers > before) & ~np.isin(numbers, list(self._messages))
+        is_new = np.array([each not in self._messages for each in numbers.tolist()], np.bool_)
+        is_new &= numbers > before
         if is_new.any():
             self._parts.append((table.only(is_new), places[is_new]))
             self._last_row = int(numbers[is_new][-1])
@@ -119,6 +126,8 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         return self._parts[0]
 
     def _row_of(self, number: int) -> int | None:
+        if number > self._last_row:
+            return None
         numbers = self._rows.numbers
         row = int(numbers.searchsorted(number))
         return row if row < len(numbers) and numbers[row] == number else None

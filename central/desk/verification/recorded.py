@@ -132,6 +132,12 @@ class Recorded:
         return [outputs.message for outputs in self.outputs if outputs.channel is channel]
 
     @property
+    def contradicted(self) -> list[m.Measurement]:
+        """The measurements that the log has twice with different content, as it has them first."""
+        streams = self.measurements.values()
+        return [stream[number] for stream in streams for number in stream.contradicted]
+
+    @property
     def robots(self) -> list[str]:
         """Every robot with measurements or messages in the log, by name."""
         names = {robot for robot, _ in self.measurements}

@@ -60,11 +60,13 @@ def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, 
     found = Recorded()
     for at in range(0, len(log), chunk):
         found.take_all([sample_of(each) for each in log[at : at + chunk]])
-    table = {}
+    table, contradicted = {}, set()
     for each in log:
-        table.setdefault(each.number, each)
+        if table.setdefault(each.number, each) != each:
+            contradicted.add(each.number)
     there = found.measurements.get(("r1", 0), RecordedMeasurements("r1", 0))
     assert dict(there) == table
+    assert {each.number for each in found.contradicted} == contradicted
     assert all((number in there) == (number in table) for number in range(-1, 14))
     end = max(begin, end)
     of_odometry = (isinstance(table.get(n), m.AnyOdometry) for n in range(begin, end))
