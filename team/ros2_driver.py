@@ -19,12 +19,12 @@ from team.containment import place_of
 from team.driver.measured import MeasurementError
 from team.ros2.arrivals import MOST_WAITING, Backlog, Lost
 from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, decode
-from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token
+from team.ros2.frames import misplaced
+from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
 from team.ros2.topics import RobotTopics
 from team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
 from team.wire.zenoh.foreign import ForeignSample
 
-STATIC = "/tf_static"
 ODOMETRY = "nav_msgs/msg/Odometry"
 HELD = 1000
 """Messages of a topic whose type no token has told yet."""
@@ -43,6 +43,10 @@ _LOG = logging.getLogger("teamslam")
 @runtime_checkable
 class Robot(Protocol):
     """What is needed of a driver."""
+
+    @property
+    def sensor_mount(self) -> tuple[float, float, float] | None:
+        """Where the robot's process has its sensor; None where that is not known."""
 
     def odometry(self, t: Decimal, forward: float, yaw_rate: float) -> None:
         """Speeds since the last call."""
@@ -85,14 +89,20 @@ class Ros2Driver:
         self.taken: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.lost = Lost()
-        self._names = {topics.odometry, *topics.detections, STATIC} - {""}
+        self._static = static_topics(topics.odometry)
+        self._names = {topics.odometry, *topics.detections, *self._static} - {""}
         self._silent = {topics.odometry} - {""}
         self._began_s = time.monotonic()
 
     @property
     def keys(self) -> list[str]:
         """What to subscribe to."""
-        return expressions(sorted(self._names), self._domain)
+        return expressions(sorted(self._names - self._static), self._domain)
+
+    @property
+    def latched(self) -> list[str]:
+        """What was published once, before or after this driver has begun: static transforms."""
+        return expressions(sorted(self._static), self._domain)
 
     tokens = (BRIDGE_TOKENS,)
 
@@ -118,7 +128,7 @@ class Ros2Driver:
         if not kind:
             self._held.setdefault(topic, deque(maxlen=HELD)).append(sample.payload)
             self._note(f"{topic}: no bridge has told its type; give it in `types`")
-        elif topic == STATIC:
+        elif topic in self._static:
             self._decoded(topic, kind, sample.payload)
         else:
             self._backlog.put(topic, kind, sample.payload)
@@ -171,10 +181,9 @@ class Ros2Driver:
         except DamagedError as error:
             self._note(f"{topic}: damaged", str(error))
             return []
-        if topic == STATIC:
+        if topic in self._static:
             if isinstance(record, TransformsRecord):
-                for transform in record.transforms:
-                    self._translator.frames.take(transform)
+                self._translator.take_static(record)
             return []
         try:
             return self._translator.take(topic, _stamped(record))
@@ -204,6 +213,11 @@ class Ros2Driver:
                     self._robot.observe_points(t, ids, points, blocks or None)
             case _:
                 pass
+
+    @property
+    def mounts(self) -> list[tuple[float, float, float]]:
+        """Where the robot's sensor is taken to be (x [m], y [m], yaw [rad]); empty until it saw."""
+        return list(dict.fromkeys(mount.pose for mount in self._translator.mounts.values()))
 
     def _note(self, reason: str, detail: str = "") -> None:
         if reason not in self.dropped and len(self.dropped) >= MOST_REASONS:
@@ -239,6 +253,9 @@ class Ros2Driver:
                 "at --ros2-connect"
                 for topic in self._silent
             ]
+        configured = self._robot.sensor_mount
+        if configured is not None and self.mounts:
+            said += misplaced(self.mounts[0], configured)
         late_s = self._backlog.oldest_s
         if late_s > BEHIND_S:
             said.append(

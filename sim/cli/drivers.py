@@ -89,9 +89,12 @@ def driver(
         ):
             translated = Ros2Driver(source, topics.robots[robot], topics.domain)
             with ForeignKeys(
-                ros2_connect or connect, translated.keys, translated.tokens
+                ros2_connect or connect,
+                translated.keys,
+                translated.tokens,
+                latched=translated.latched,
             ) as foreign:
-                _LOG.info("listening to %s", ", ".join(translated.keys))
+                _LOG.info("listening to %s", ", ".join((*translated.keys, *translated.latched)))
                 while not (stop.is_set() or source.team_has_ended):
                     for sample in foreign.receive(0.0 if translated.waiting else WAIT_S):
                         translated.put(sample)

@@ -4,11 +4,12 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.importing.bag_topics import STATIC, UndecidedError, decided, listing
+from sim.importing.bag_topics import UndecidedError, decided, listing
 from sim.importing.tables import RobotTables
 from team.ros2.bags import Bag, opened_bag
 from team.ros2.decoding import DamagedError, Record, TransformsRecord, decode
 from team.ros2.frames import Frames
+from team.ros2.keys import static_topics
 from team.ros2.topics import Topics
 from team.ros2.translator import Translator
 
@@ -114,12 +115,7 @@ def _static_frames(bag: Bag, odometry: str) -> Frames:
     odometry topic has, too.
     """
     frames = Frames()
-    places = {topic.name: topic.name.rpartition("/") for topic in bag.topics}
-    static = [
-        name
-        for name, (space, _, last) in places.items()
-        if last == STATIC and odometry.startswith(f"{space}/")
-    ]
+    static = static_topics(odometry)
     for raw in bag.messages(static):
         try:
             record = decode(raw.kind, raw.data, bag.store)

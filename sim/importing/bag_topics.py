@@ -6,13 +6,13 @@ from typing import NamedTuple
 from sim.datasets.tables import DatasetError
 from team.ros2.bags import Bag, Topic, opened_bag
 from team.ros2.decoding import READERS, DamagedError, OdometryRecord, TransformsRecord, decode
+from team.ros2.keys import STATIC
 from team.ros2.topics import RobotTopics, Topics
 from team.ros2.translator import TAG
 
 ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-STATIC = "tf_static"
 TRUTH_WORDS = ("truth", "gt", "mocap", "vicon", "vrpn", "optitrack")
 FUSED_WORDS = (
     "filtered", "fused", "ekf", "ukf", "global", "map", "amcl", "gps", "slam", "localization",

@@ -293,6 +293,12 @@ class Driver:
         """(t, (x, y, theta)) of the robot in the team's frame, as last published by its process."""
         return self._node.team_pose
 
+    @property
+    def sensor_mount(self) -> tuple[float, float, float] | None:
+        """Where the robot's process has its sensor (x [m], y [m], yaw [rad]); None: not heard."""
+        models = self._node.models
+        return None if models is None else models.sensor.mount
+
     def status(self) -> m.Status:
         """The state of the stream: counts, who has received them, and problems."""
         return self._link.status()

@@ -6,6 +6,9 @@ It is the source of one robot's stream, as a world is of all (`sim.publisher`). 
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+import msgspec
+
+from team.config import RobotConfig
 from team.door import absurd
 from team.driver.journal import Journal
 from team.driver.source import BATCH, CREDIT_MEASUREMENTS, CREDIT_RECORDER, answered, channel_of
@@ -28,7 +31,7 @@ class SourceNode:
     the rest of that. delivered, recorded: how far the robot and a recorder are by their own word.
     done: incarnation, measurements and submaps of the robot's last word; joined: incarnation and
     submaps that the centre has dealt with. concluded: without a centre, the robot has its own final
-    map; is_peer: it has a set of its own.
+    map; is_peer: it has a set of its own. models: those that the robot's process has announced.
     """
 
     journal: Journal
@@ -41,6 +44,7 @@ class SourceNode:
     is_peer: bool = field(default=False, init=False)
     concluded: bool = field(default=False, init=False)
     pose: m.PoseEstimate | None = field(default=None, init=False)
+    models: RobotConfig | None = field(default=None, init=False)
     warnings: list[str] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
@@ -60,6 +64,7 @@ class SourceNode:
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
         ch.ROBOT_DONE,
+        ch.ROBOT_CONFIG,
         ch.CENTRAL_PROGRESS,
         ch.RECORDER_PROGRESS,
         ch.CONCLUDED,
@@ -180,13 +185,20 @@ class SourceNode:
             case m.SetSummary() | m.Concluded():
                 self.is_peer = True
                 self.concluded |= isinstance(message, m.Concluded) and message.robot == self._robot
-            case m.PoseEstimate():
-                self.pose = message
+            case m.PoseEstimate() | m.Configuration():
+                self._hear_robot(message)
             case m.StreamHead() if message.robot != self._robot:
                 self._compare(message)
             case _:
                 pass
         return []
+
+    def _hear_robot(self, message: m.PoseEstimate | m.Configuration) -> None:
+        """Take what the robot's process says of itself."""
+        if isinstance(message, m.PoseEstimate):
+            self.pose = message
+        elif message.node == ch.robot_node(self._robot):
+            self.models = _models(message)
 
     def _compare(self, head: m.StreamHead) -> None:
         """Warns when two drivers' stamps differ by a day: the team needs one clock."""
@@ -264,3 +276,11 @@ class SourceNode:
             return None
         x, y, theta = (float(v) for v in floats(self.pose.pose, "pose"))
         return 1e-9 * self.pose.stamp_ns, (x, y, theta)
+
+
+def _models(message: m.Configuration) -> RobotConfig | None:
+    """The models in a robot's announcement; None where it is not one of this version."""
+    try:
+        return msgspec.json.decode(message.configuration, type=RobotConfig)
+    except (msgspec.MsgspecError, ValueError):
+        return None

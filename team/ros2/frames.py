@@ -1,7 +1,7 @@
 """A sensor's mount on its robot from static transforms, and detections in the plane."""
 
 from dataclasses import dataclass, field
-from math import atan2
+from math import atan2, pi, remainder
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +35,10 @@ def heading(q: Quaternion) -> float:
 
 Place = tuple[float, float, float]
 """A pose (x, y, yaw) on the base."""
+
+
+SAME_PLACE = 1e-3
+"""Places that differ by less [m, rad] are the same."""
 
 
 @dataclass(frozen=True)
@@ -134,3 +138,17 @@ class Frames:
         exact = np.abs(plane - BODY).max() < 1e-12
         place = float(moved[0]), float(moved[1]), yaw
         return Mount(place, BODY if exact else plane, place)
+
+
+def misplaced(here: Place, configured: Place) -> list[str]:
+    """A warning where the frames have the sensor elsewhere than the robot's scenario has it."""
+    turned = remainder(here[2] - configured[2], 2.0 * pi)
+    apart = here[0] - configured[0], here[1] - configured[1], turned
+    if max(map(abs, apart)) < SAME_PLACE:
+        return []
+    place, other = (", ".join(f"{value:.4g}" for value in each) for each in (here, configured))
+    return [
+        f"the sensor is at ({place}) on the base by its frames, and the scenario has it at "
+        f"({other}), so all landmarks are shifted: write mount = [{place}] into [defaults.sensor], "
+        "or the robot's sensor, and start the team again"
+    ]

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
 BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
 SLASH = "§"
+STATIC = "tf_static"
 
 
 def expressions(topics: Iterable[str], domain: int) -> list[str]:
@@ -33,3 +34,9 @@ def of_token(key: str) -> tuple[str, str] | None:
     if len(parts) < 6 or parts[2:4] != ["@ros2_lv", "MP"]:
         return None
     return "/" + parts[4].replace(SLASH, "/").strip("/"), parts[5].replace(SLASH, "/")
+
+
+def static_topics(odometry: str) -> set[str]:
+    """The topics of a robot's static transforms: /tf_static, and those in its namespaces."""
+    spaces = odometry.strip("/").split("/")[:-1]
+    return {"/" + "/".join([*spaces[:k], STATIC]) for k in range(len(spaces) + 1)}

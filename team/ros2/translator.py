@@ -67,6 +67,7 @@ class Translator:
         self.mounts: dict[str, Mount] = {}
         self.said: list[str] = []
         self._two_names = False
+        self._guessed: set[str] = set()
 
     def take(self, topic: str, record: Record) -> list[Measured]:
         """The measurements of one message of a topic."""
@@ -79,6 +80,19 @@ class Translator:
         if topic == topics.truth:
             found += self._truth(record)
         return found
+
+    def take_static(self, record: TransformsRecord) -> None:
+        """Static transforms; a sensor whose place was not known is looked for again."""
+        for transform in record.transforms:
+            self.frames.take(transform)
+        for frame in self._guessed & self.mounts.keys():
+            if self.frames.mount(frame, self.topics.base_frame) is not None:
+                self._guessed.discard(frame)
+                del self.mounts[frame]
+                self.said.append(
+                    f"the transform from {frame} to {self.topics.base_frame} is here now; what was "
+                    "seen before is taken as seen from the base"
+                )
 
     def _odometry(self, record: Record) -> list[Measured]:
         match record:
@@ -181,6 +195,7 @@ class Translator:
             place = topics.mount or (0.0, 0.0, 0.0)
             found = Mount(place, OPTICAL if optical else BODY, place)
             if topics.mount is None and frame != topics.base_frame:
+                self._guessed.add(frame)
                 axes = "z ahead" if optical else "x ahead"
                 self.said.append(
                     f"no transform from {frame or 'the frame without a name'} to "

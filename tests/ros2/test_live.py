@@ -8,10 +8,13 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
+import zenoh.ext
 
+from team.config import RobotConfig, Sensor
 from team.driver.journal import Journal
 from team.driver.measured import MeasurementError
 from team.driver.node import SourceNode
@@ -20,6 +23,7 @@ from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics, TopicsError, load_topics
 from team.ros2.translator import Measured
 from team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
+from team.wire.digest import configured
 from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
@@ -42,6 +46,8 @@ TOPICS = RobotTopics(
 
 class Robot:
     """Takes what a driver would, and refuses time that goes back, as it does."""
+
+    sensor_mount: tuple[float, float, float] | None = None
 
     def __init__(self) -> None:
         self.calls: list[tuple[Any, ...]] = []
@@ -166,6 +172,74 @@ def test_a_static_transform_says_where_the_sensor_sits() -> None:
     driver.take(ForeignSample(by_rmw("/tf", kind), ros.cdr(kind, tag)))
     assert [call[0] for call in robot.calls] == ["points"]
     np.testing.assert_allclose(robot.calls[0][3], [[2.0, 1.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("topic", ["/tf_static", "/r1/tf_static"])
+def test_what_was_published_once_before_the_driver_began_is_received(topic: str) -> None:
+    port = free_port()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("timestamping/enabled", "true")
+    robot = Robot()
+    driver = Ros2Driver(robot, RobotTopics(odometry="/r1/odom", detections=("/r1/tags",)))
+    kind = "tf2_msgs/msg/TFMessage"
+    here = ros.transforms((0, "base_link", "eye", ros.vector(0.2), (0.0, 0.0, 1.0, 0.0)))
+    seen = ros.cdr(TAGS, ros.detections(S, "eye", [("7", ros.pose(3.0, 4.0))]))
+    with zenoh.open(config) as router:
+        latched = zenoh.ext.declare_advanced_publisher(
+            router,
+            by_rmw(topic, kind),
+            cache=zenoh.ext.CacheConfig(max_samples=1),
+            publisher_detection=True,
+        )
+        latched.put(ros.cdr(kind, here))
+        with ForeignKeys(
+            f"tcp/127.0.0.1:{port}", driver.keys, driver.tokens, latched=driver.latched
+        ) as foreign:
+
+            def has_come() -> bool:
+                for sample in foreign.receive(0.05):
+                    driver.take(sample)
+                return driver.taken[topic] > 0
+
+            wait_until(has_come)
+    driver.take(ForeignSample(by_rmw("/r1/tags", TAGS), seen))
+    np.testing.assert_allclose(robot.calls[0][3], [[3.0, 4.0]], atol=1e-12)
+    (mount,) = driver.mounts
+    np.testing.assert_allclose(mount, (0.2, 0.0, np.pi))
+    assert driver.warnings() == ()
+    robot.sensor_mount = 0.2, 0.0, -np.pi
+    assert driver.warnings() == ()
+    robot.sensor_mount = 0.0, 0.0, 0.0
+    (warning,) = driver.warnings()
+    assert "at (0.2, 0, 3.142) on the base by its frames, and the scenario has it at (0," in warning
+
+
+def test_a_driver_hears_where_its_robot_s_process_has_the_sensor(tmp_path: Path) -> None:
+    node = SourceNode(Journal(tmp_path / "r1.stream", "r1"))
+    mounted = RobotConfig("r1", sensor=Sensor(mount=(0.2, 0.0, 1.0)))
+    node.handle(configured("robot/r2", 0, 0, RobotConfig("r2")), 0)
+    assert node.models is None
+    told = configured("robot/r1", 0, 0, mounted)
+    node.handle(told, 0)
+    assert node.models == mounted
+    node.handle(msgspec.structs.replace(told, configuration='{"sensor": 7}'), 0)
+    assert node.models is None
+
+
+def test_a_sensor_whose_place_comes_late_is_there_from_then_on() -> None:
+    robot = Robot()
+    driver = Ros2Driver(robot, RobotTopics(odometry="/odom", detections=("/tags",)))
+    kind = "tf2_msgs/msg/TFMessage"
+    here = ros.transforms((0, "base_link", "eye", ros.vector(0.2), (0.0, 0.0, 1.0, 0.0)))
+    for k in (1, 2):
+        seen = ros.detections(k * S, "eye", [("7", ros.pose(3.0, 4.0))])
+        driver.take(ForeignSample(by_rmw("/tags", TAGS), ros.cdr(TAGS, seen)))
+        found = [mount[0] for mount in driver.mounts]
+        driver.take(ForeignSample(by_rmw("/tf_static", kind), ros.cdr(kind, here)))
+    assert found == [0.2]
 
 
 def test_keys_name_topic_and_type() -> None:

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import zenoh
+from zenoh import ext
 from zenoh.handlers import FifoChannel
 
 from team.wire.bus import BusError
@@ -40,11 +41,17 @@ class ForeignKeys:
 
     Samples wait in one channel per subscription, which Zenoh's thread fills without running Python:
     a process that is busy decoding does not block it. `receive` reads from these channels; samples
-    of one key are in their publisher's order, those of different keys are in none.
+    of one key are in their publisher's order, those of different keys are in none. latched: keys
+    of which what was published before is requested, too, from the publishers' caches.
     """
 
     def __init__(
-        self, connect: str, keys: Sequence[str], tokens: Sequence[str], patience_s: float = 10.0
+        self,
+        connect: str,
+        keys: Sequence[str],
+        tokens: Sequence[str],
+        patience_s: float = 10.0,
+        latched: Sequence[str] = (),
     ) -> None:
         config = zenoh.Config()
         settings: dict[str, object] = {
@@ -72,6 +79,22 @@ class ForeignKeys:
         ]
         self._samples: list[Any] = [
             self._session.declare_subscriber(key, FifoChannel(CAPACITY)) for key in keys
+        ]
+        self._samples += [
+            ext.declare_advanced_subscriber(
+                self._session,
+                key,
+                FifoChannel(CAPACITY),
+                history=ext.HistoryConfig(detect_late_publishers=True),
+            )
+            for key in latched
+        ]
+        # Of publishers whose cache answers on their own key, as those of older versions.
+        self._cached = [
+            _of_sample(reply.ok)
+            for key in latched
+            for reply in self._session.get(key, timeout=TOKENS_S)
+            if reply.ok is not None
         ]
 
     def __enter__(self) -> Self:
@@ -102,6 +125,8 @@ class ForeignKeys:
         self._first.clear()
         for channel in self._tokens:
             found += [_of_token(sample) for sample in _some_of(channel)]
+        found += self._cached
+        self._cached = []
         for channel in self._samples:
             found += [_of_sample(sample) for sample in _some_of(channel)]
         return found
