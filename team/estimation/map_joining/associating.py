@@ -2,7 +2,8 @@
 
 Every submap adds its unnamed landmarks to the graph as nodes of their own; here nodes are merged.
 The steps of a tick, in their order: tracking (against the last submaps of the same robot), nearby
-landmarks (of older submaps, where the standard deviation of the difference is small), sweeping
+landmarks (of older submaps, where the standard deviation of the difference is small; one submap
+after the other), sweeping
 (landmarks that were split), closures (anywhere else in the map, by map matching), and merges of
 islands. Each step is a function of the fold alone, and the fold is a function of the set of submaps
 in its canonical order; so are the decisions.
@@ -12,11 +13,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Int64
 
 from team.config import UNNAMED
-from team.estimation import elementary, elementwise
+from team.estimation import elementwise
 from team.estimation.contribution import Contribution, Stream
+from team.estimation.map_joining.association.absence import overlooked
+from team.estimation.map_joining.association.comparing import (
+    AGAIN_WITHIN,
+    by_turns,
+    comparable,
+    undecided,
+)
 from team.estimation.map_joining.association.crowding import Crowd
 from team.estimation.map_joining.association.growing import (
     Indices,
@@ -39,16 +47,6 @@ from team.estimation.map_joining.gauss_newton import (
 )
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.submap_graph import Graph, tied
-
-OVERLOOKED = 0.4
-"""Upper bound of the probability that a window which sees a landmark misses one beside it."""
-LEAST_OVERLOOKED = 0.1
-"""Lower bound of the same probability: some landmarks can be seen from one side only."""
-
-AGAIN = 8
-"""Number of older submaps with unmatched landmarks that a tick examines again …"""
-AGAIN_WITHIN = 10.0
-"""… if they lie within this many object radii of a landmark that the tick brings."""
 
 
 class IslandView:
@@ -73,9 +71,10 @@ class IslandView:
         self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
         apart = _apart(graph, self.seen_by, self.ids, landmarks, self.place_of)
         points = mean.reshape(-1, 2)
-        unseen = _unseen(points, self.seen_by, self.profile.same)
+        unseen = overlooked(points, self.seen_by, self.profile.same)
         self.joint = Joint(points, covariance, apart, around, unseen)
         self.gone = np.zeros(len(nodes), np.bool_)
+        self._now = np.arange(len(nodes))
         self.ties: list[tuple[int, MergeRecord]] = []
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
 
@@ -94,15 +93,13 @@ class IslandView:
             )
             self.ties.append((self.ids[pair.first], tie))
             self.gone[pair.first] = True
+            self._now[self._now == pair.first] = pair.second
 
-    def step(
-        self,
-        kind: str,
-        first: Indices,
-        second: Indices,
-        most_sd: float,
-        joint_sd: float | None = None,
-    ) -> None:
+    def current(self, k: int) -> Indices:
+        """The landmarks of submap k, where some are merged the ones that they are now."""
+        return np.unique(self._now[self.seen_by[k]])
+
+    def step(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
         """Merges pairs out of two lists of landmarks, growing from the most certain pair
         onwards.
         """
@@ -111,21 +108,20 @@ class IslandView:
             return
         one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
         different = one != two
-        one, two = one[different], two[different]
-        self._grow(kind, one, two, most_sd)
-        if joint_sd is not None:
-            self.assign(kind, first, second, joint_sd)
+        self._grow(kind, one[different], two[different], most_sd)
 
-    def assign(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
-        """Merges the pairs of two lists of landmarks on which all likely joint assignments
-        agree.
+    def compare(self, kind: str, k: int, most_sd: float) -> None:
+        """Merges the pairs of submap k and one other submap after the other on which all likely
+        joint assignments of the two agree.
         """
-        first, second = first[~self.gone[first]], second[~self.gone[second]]
-        if not len(first) or not len(second):
-            return
-        one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
-        found = jointly(self.joint, one, two, self.profile, most_sd)
-        self.take(found.pairs, found.joint, kind)
+        own = np.unique(self._now[_unnamed(self, k)])
+        submaps = [self.current(each) for each in range(len(self.seen_by)) if each != k]
+        for candidates in comparable(self.joint, own, submaps, self.profile, most_sd):
+            first, second = own[~self.gone[own]], np.unique(self._now[candidates])
+            one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
+            different = one != two
+            found = jointly(self.joint, one[different], two[different], self.profile, most_sd)
+            self.take(found.pairs, found.joint, kind)
 
     def _grow(self, kind: str, one: Indices, two: Indices, most_sd: float) -> None:
         found = grow(
@@ -168,18 +164,6 @@ class IslandView:
                 continue
             joint = conditioned(self.joint, one, two, self.profile)
             self.take([Pair(one, two, np.inf, 0.0, -np.inf)], joint, "verdict")
-
-
-def _unseen(
-    points: Float[np.ndarray, "n 2"], seen_by: Sequence[Indices], radius: float
-) -> Float[np.ndarray, " n"]:
-    """Probability, for each landmark, that all windows that saw it missed another one beside it."""
-    counts = np.zeros(len(points))
-    for places in seen_by:
-        away = elementwise.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
-        counts += (away < radius).any(axis=1)
-    chance = elementwise.exp(elementary.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
-    return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))
 
 
 def _apart(
@@ -238,32 +222,30 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
         )
         view.step("track", fresh, union(view.seen_by[at] for at in before), np.inf)
         others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
-        view.step("near", fresh, others, view.profile.near, view.profile.near)
-    for k in _doubtful(view, order, arrived):
-        own = _unnamed(view, k)
-        others = np.setdiff1d(np.arange(len(view.ids)), view.seen_by[k])
-        view.assign("near", own, others, view.profile.near)
+        view.compare("near", k, view.profile.near)
+        view.step("near", fresh, others, view.profile.near)
+    for k in _again(view, order, arrived):
+        view.compare("near", k, view.profile.near)
     view.sweep()
     return applied(fold, key, view)
 
 
-def _doubtful(
+def _again(
     view: IslandView, order: Mapping[int, int], arrived: Sequence[Contribution]
 ) -> list[int]:
-    """Indices of the newest submaps near the tick's submaps that have two or more landmarks which
-    no other submap has: a pair that was undecided may be decidable now.
+    """Indices of older submaps near the tick's ones with landmarks that may be one with others: a
+    pair that was undecided may be decidable now.
     """
     fresh = [k for each in arrived if (k := order.get(id(each))) is not None]
-    near = union(view.seen_by[k] for k in fresh)
+    near = union(view.current(k) for k in fresh)
     if not len(near):
         return []
-    count = np.bincount(np.concatenate(view.seen_by), minlength=len(view.ids))
-    alone = np.flatnonzero((count == 1) & ~view.gone)
-    away = np.abs(view.joint.mean[alone, None] - view.joint.mean[near][None]).max(axis=2)
+    away = np.abs(view.joint.mean[:, None] - view.joint.mean[near][None]).max(axis=2).min(axis=1)
+    around = np.flatnonzero((away < AGAIN_WITHIN * view.profile.same) & ~view.gone)
     loose = np.zeros(len(view.ids), np.bool_)
-    loose[alone[(away < AGAIN_WITHIN * view.profile.same).any(axis=1)]] = True
-    found = [k for k, each in enumerate(view.seen_by) if k not in fresh and loose[each].sum() >= 2]
-    return found[-AGAIN:]
+    loose[undecided(view.joint, around, view.profile)] = True
+    found = [k for k in range(len(view.seen_by)) if k not in fresh and loose[view.current(k)].any()]
+    return by_turns(found, len(view.seen_by))
 
 
 def applied(fold: Fold, key: Stream, view: IslandView) -> Fold:

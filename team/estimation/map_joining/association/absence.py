@@ -5,12 +5,17 @@ field of view is convex. A landmark of the other side that lies in this polygon 
 should have been observed.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.estimation import elementwise
+from team.estimation import elementary, elementwise
+
+OVERLOOKED = 0.4
+"""Upper bound of the probability that a window which sees a landmark misses one beside it."""
+LEAST_OVERLOOKED = 0.1
+"""Lower bound of the same probability: some landmarks can be seen from one side only."""
 
 SeenTogether = Int64[np.ndarray, "_ _"]
 """For each keyframe the landmarks that it observed together; rows are padded with −1."""
@@ -59,3 +64,19 @@ def covered(
     gap = np.fmax(widest, angle[:, 0] + 2.0 * np.pi - last)
     inside[point[gap < np.pi]] = True
     return inside
+
+
+def overlooked(
+    points: Float[np.ndarray, "n 2"], seen_by: Sequence[Int64[np.ndarray, " _"]], radius: float
+) -> Float[np.ndarray, " n"]:
+    """Probability, for each landmark, that all windows that saw it missed another one beside it.
+
+    seen_by: the landmarks of each window. radius: windows saw the place that have a landmark within
+        it [m].
+    """
+    counts = np.zeros(len(points))
+    for places in seen_by:
+        away = elementwise.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
+        counts += (away < radius).any(axis=1)
+    chance = elementwise.exp(elementary.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
+    return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))
