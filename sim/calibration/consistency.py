@@ -164,7 +164,8 @@ def _apart(
         numbers,
     )
     for own, of_team in zip(graph.submaps, submaps, strict=True):
-        known = len(of_team.nodes) - len(of_team.common)
+        own_biases = of_team.contribution.local.biases
+        known = len(of_team.nodes) - len(of_team.biases) + len(own_biases)
         for node, there in zip(own.nodes[:known], of_team.nodes[:known], strict=True):
             first, last = island.graph.offset[there : there + 2]
             state[graph.offset[node] : graph.offset[node + 1]] = island.state[first:last]

@@ -116,7 +116,7 @@ class PlainCost:
         Jacobian.
         """
         offset = self._graph.offset
-        for W, (contribution, nodes, _) in zip(self._of_submap, self._graph.submaps, strict=True):
+        for W, (contribution, nodes, *_) in zip(self._of_submap, self._graph.submaps, strict=True):
             poses = 1 + len(contribution.local.node_stamps)
             h, at, J = _submap(state, offset[nodes], poses)
             r = h - contribution.local.mean

@@ -147,7 +147,7 @@ def _at_truth(
     for id_, node in graph.landmarks.items():
         if id_ in landmarks:
             place(node, landmarks[id_])
-    for contribution, nodes, _ in graph.submaps:
+    for contribution, nodes, *_ in graph.submaps:
         path = paths[contribution.robot]
         stamps = np.array([contribution.end_ns, *contribution.local.node_stamps.tolist()])
         poses, there = interpolated(path, stamps)

@@ -31,7 +31,7 @@ from team.estimation.map_joining.condensed_factor import (
     places,
 )
 from team.estimation.map_joining.condensing_kernel import add_submaps
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island, prior_terms
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
 from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
@@ -145,7 +145,7 @@ def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarra
     """Marks the nodes that no later factor can contain: poses of old submaps but the last one."""
     eliminated = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(leaving):
-        contribution, nodes, _ = graph.submaps[f]
+        contribution, nodes, *_ = graph.submaps[f]
         eliminated[nodes[0]] = True
         eliminated[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
     return eliminated
@@ -182,11 +182,11 @@ def _quadratic(
     for s in np.flatnonzero(seen):
         _add_sighting(H, g, place, island, int(s))
     for k in np.flatnonzero(prior):
-        slope, hessian, _ = prior_terms(island, int(k))
-        begin, weight = place[graph.priors[k].node], island.prior_weight[k]
+        each, slope = graph.priors[k], island.prior_slope(int(k))
+        begin, weight = place[each.node], island.prior_weight[k]
         end = begin + len(slope)
         g[begin:end] += weight * slope
-        H[begin:end, begin:end] += weight * hessian
+        H[begin:end, begin:end] += weight * each.information
     return H, g, cost
 
 

@@ -21,13 +21,13 @@ from jaxtyping import Bool, Float, Int64
 
 from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
-from team.estimation import dense, elementary, elementwise
+from team.estimation import elementary, elementwise
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.geometry import wrapped
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import least_squares
 from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
+from team.estimation.map_joining.priors_kernel import prior_terms
 from team.estimation.map_joining.submap_graph import CommonBias, Graph
 from team.estimation.sparse_cholesky import sparse
 
@@ -208,7 +208,15 @@ class Island(least_squares.Iterate):
     @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:
         """χ² of each prior, of an initial pose or of a bias."""
-        return np.array([prior_terms(self, k)[2] for k in range(len(self.graph.priors))])
+        return self._prior_terms[1]
+
+    @cached_property
+    def _prior_terms(self) -> tuple[Float[np.ndarray, "priors 3"], Values]:
+        return prior_terms(self.state, self.graph.prior_factors)
+
+    def prior_slope(self, k: int) -> Values:
+        """P⁻¹r of a prior."""
+        return self._prior_terms[0][k, : self.graph.prior_factors.size[k]]
 
     @cached_property
     def prior_weight(self) -> Float[np.ndarray, " priors"]:
@@ -311,11 +319,11 @@ class Island(least_squares.Iterate):
                 values, gradient, self.state, graph.offset, entry, pattern.value_start
             )
         for k, prior in enumerate(graph.priors):
-            slope, hessian, _ = prior_terms(self, k)
+            slope = self.prior_slope(k)
             begin = graph.offset[prior.node]
             weight = self.prior_weight[k]
             gradient[begin : begin + len(slope)] += weight * slope
-            pattern.diagonal_block(values, prior.node)[...] += weight * hessian
+            pattern.diagonal_block(values, prior.node)[...] += weight * prior.information
         return values, gradient
 
     @property
@@ -376,19 +384,6 @@ def is_solvable(island: Island) -> bool:
     return bool(np.isfinite(island.state).all() and np.isfinite(factor.panels).all()) and (
         math.isfinite(cost)
     )
-
-
-def prior_terms(
-    island: Island, k: int
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], float]:
-    """P⁻¹r, P⁻¹ and χ² of a prior."""
-    node, mean, information = island.graph.priors[k]
-    begin = island.graph.offset[node]
-    residual = island.state[begin : begin + len(mean)] - mean
-    if len(mean) == 3:
-        residual[2] = wrapped(residual[2])
-    slope = dense.product(information, residual)
-    return slope, information, float(dense.product(residual, slope))
 
 
 def iterated(island: Island) -> Island:

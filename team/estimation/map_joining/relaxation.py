@@ -105,7 +105,7 @@ def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
     """The equations of submaps, inter-robot measurements and priors; `at`: first number of each
     node.
     """
-    for contribution, nodes, _ in graph.submaps:
+    for contribution, nodes, *_ in graph.submaps:
         local, start = contribution.local, int(at[nodes[0]])
         variances = np.diag(local.covariance)
         count = 1 + len(local.node_stamps)

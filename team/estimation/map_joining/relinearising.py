@@ -117,7 +117,7 @@ def _raw(
         known = [*left.poses, *(value(node) for node in nodes)]
         for node, pose in zip(full.streams[stream], known, strict=True):
             put(node, pose)
-    for contribution, members, _ in full.submaps:
+    for contribution, members, *_ in full.submaps:
         start = state[full.offset[members[0]] : full.offset[members[0]] + 3]
         for at, local in zip(members[2:].tolist(), contribution.local.nodes, strict=False):
             put(at, compose(start, local))

@@ -22,6 +22,7 @@ from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed
 from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
+from team.estimation.map_joining.priors_kernel import PriorFactors
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
@@ -60,13 +61,27 @@ class Prior(NamedTuple):
 class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
 
-    common: the errors with a node of the whole team, which stand last: of its biases, and of its
-        landmarks' markers.
+    biases: the error of each row of `sensitivity`; those with a node of the whole team stand last:
+        of its biases, and of its landmarks' markers. range_power: of each, `RANGE_POWER`.
+    sensitivity: ∂mean/∂b, one row for each bias node: a robot's own error and the team's common one
+        add up. The row of a marker is that of the scale of the ranges, restricted to that marker's
+        landmark.
     """
 
     contribution: Contribution
     nodes: Indices
-    common: tuple[CommonError, ...] = ()
+    biases: tuple[CommonError, ...]
+    range_power: Indices
+    sensitivity: Float[np.ndarray, "B _"]
+
+    @classmethod
+    def of(
+        cls, contribution: Contribution, nodes: Indices, common: tuple[CommonError, ...]
+    ) -> "Joined":
+        """A submap whose `common` errors have a node of the whole team."""
+        biases = (*contribution.local.biases, *common)
+        powers = np.array([RANGE_POWER[_scaling(each)] for each in biases], np.int64)
+        return cls(contribution, nodes, biases, powers, _sensitivity(contribution.local, biases))
 
     @property
     def landmarks(self) -> Indices:
@@ -75,29 +90,17 @@ class Joined(NamedTuple):
         first = 2 + len(local.node_stamps)
         return self.nodes[first : first + len(local.ids)]
 
-    @property
-    def biases(self) -> tuple[CommonError, ...]:
-        """The error of each row of `sensitivity`."""
-        return (*self.contribution.local.biases, *self.common)
 
-    @property
-    def sensitivity(self) -> Float[np.ndarray, "B _"]:
-        """∂mean/∂b, one row for each bias node: a robot's own error and the team's common one add
-        up.
-
-        The row of a marker is that of the scale of the ranges, restricted to that marker's
-        landmark.
-        """
-        local = self.contribution.local
-        if not self.common:
-            return local.sensitivity
-        rows = local.sensitivity[[local.biases.index(_scaling(error)) for error in self.biases]]
-        first = len(local.mean) - 2 * len(local.ids)
-        for row, error in zip(rows, self.biases, strict=True):
-            if isinstance(error, int):
-                at = first + 2 * int(np.searchsorted(local.ids, error))
-                row[:at] = row[at + 2 :] = 0.0
-        return rows
+def _sensitivity(local: LocalMap, biases: Sequence[CommonError]) -> Float[np.ndarray, "B _"]:
+    if len(biases) == len(local.biases):
+        return local.sensitivity
+    rows = local.sensitivity[[local.biases.index(_scaling(error)) for error in biases]]
+    first = len(local.mean) - 2 * len(local.ids)
+    for row, error in zip(rows, biases, strict=True):
+        if isinstance(error, int):
+            at = first + 2 * int(np.searchsorted(local.ids, error))
+            row[:at] = row[at + 2 :] = 0.0
+    return rows
 
 
 def _scaling(error: CommonError) -> Bias:
@@ -160,11 +163,21 @@ class Graph:
             sensitivity_start=_starts([each.sensitivity.size for each in self.submaps]),
             block=np.concatenate([np.zeros((0, 3)), *(each.blocks for each in submaps)]),
             block_start=_starts([len(each.local.ids) for each in submaps]),
-            range_power=np.array(
-                [RANGE_POWER[_scaling(b)] for each in self.submaps for b in each.biases], np.int64
+            range_power=np.concatenate(
+                [np.zeros(0, np.int64), *(each.range_power for each in self.submaps)]
             ),
             row_start=_starts([len(each.biases) for each in self.submaps]),
         )
+
+    @cached_property
+    def prior_factors(self) -> PriorFactors:
+        """The priors in flat arrays, for the kernel."""
+        sizes = np.array([len(each.mean) for each in self.priors], np.int64)
+        nodes = [each.node for each in self.priors]
+        means, information = np.zeros((len(sizes), 3)), np.zeros((len(sizes), 3, 3))
+        for k, (n, each) in enumerate(zip(sizes.tolist(), self.priors, strict=True)):
+            means[k, :n], information[k, :n, :n] = each.mean, each.information
+        return PriorFactors(self.offset[nodes], sizes, means, information)
 
     @cached_property
     def sighting_factors(self) -> InterRobotFactors:
@@ -359,7 +372,7 @@ def extended(
         errors = [growth.biases[stream, bias] for bias in local.biases]
         errors += [growth.common[error] for error in common]
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
-        submaps.append(Joined(contribution, nodes, tuple(common)))
+        submaps.append(Joined.of(contribution, nodes, tuple(common)))
     grown = Graph(
         streams=growth.streams,
         landmarks=growth.landmarks,
