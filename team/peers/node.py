@@ -168,16 +168,28 @@ class PeerNode:
         statements.sort(key=_turn)
         orders = sum(_turn(each) < 0 for each in statements)
         yield from statements[:orders]
+        yield from self._new_of_streams()
+        yield from statements[orders:]
+
+    def _new_of_streams(self) -> Iterator[m.Message]:
+        """The initial poses, then the submaps by their ends, each after the inter-robot
+        measurements from it: a fold in the order of time takes back nothing.
+        """
+        parcels: list[tuple[int, Stream, int]] = []
         for stream, share in sorted(self.replica.streams.items()):
             fed = self._fed.get(stream, -1)
             if share.start is None or fed >= share.count:
                 continue
             if fed < 0:
                 yield share.start.message
+            latest_ns = 0
             for sequence in range(max(fed, 0), share.count):
-                yield from (member.message for member in share.parcel(sequence))
+                latest_ns = max(latest_ns, share.submaps[sequence].message.stamp_ns)
+                parcels.append((latest_ns, stream, sequence))
             self._fed[stream] = share.count
-        yield from statements[orders:]
+        for _, stream, sequence in sorted(parcels):
+            parcel = self.replica.streams[stream].parcel(sequence)
+            yield from (member.message for member in parcel)
 
     def again(self) -> None:
         """Give everything to the fold again, which begins anew."""

@@ -64,3 +64,18 @@ def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(
         assert (final.withdrawn, final.lost) == (withdrawn, ())
         found.add(encoded(final))
     assert len(found) == 1
+
+
+def test_a_fold_is_given_submaps_in_the_order_of_time() -> None:
+    """By robots, one after the other, it took back what it had and cost three times as much."""
+    node = PeerNode("robot/r1", ROBOTS)
+    for robot in reversed(ROBOTS):
+        for each in (done(robot, 3), *parcel(robot, 2), *parcel(robot, 1), *parcel(robot, 0)):
+            node.take(each, "robot/r2")
+        node.take(start(robot), "robot/r2")
+    given = list(node.new_messages())
+    submaps = [each for each in given if isinstance(each, m.Submap)]
+    assert [each.robot for each in submaps] == ["r1", "r2"] * 3
+    assert [each.stamp_ns for each in submaps] == sorted(each.stamp_ns for each in submaps)
+    assert all(isinstance(each, m.InitialPose) for each in given[:2])
+    assert all(isinstance(each, m.Done) for each in given[-2:])
