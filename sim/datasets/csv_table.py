@@ -23,6 +23,7 @@ LARGEST_NAME = 2**31 - 1
 """Landmarks with names have numbers up to this; the numbers beyond it are of those without."""
 
 
+POINT, COMMA = (re.compile(rf"[+-]?[0-9]*{mark}[0-9]+([eE][+-]?[0-9]+)?") for mark in (r"\.", ","))
 NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
 """A landmark's name as a text that ends in its number."""
 
@@ -128,13 +129,17 @@ class CsvTable:
 def read_table(file: File, name: str, known: Sequence[str] | None = None) -> CsvTable:
     """A table whose first line names its columns; empty lines and lines with `#` are left out.
 
-    known: the columns that may be there; None: any. Raises DatasetError.
+    known: the columns that may be there, in letters of either case; None: any. Columns may be
+    parted by ; or tabs, and decimals then by commas. A first column without a name that counts the
+    rows is left out. Raises DatasetError.
     """
     try:
         text = file.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DatasetError(f"{name}: not UTF-8 text ({error.reason}); save it as UTF-8") from None
-    rows = csv.reader(text.splitlines())
+    lines_of_text = text.splitlines()
+    delimiter = _delimiter(lines_of_text)
+    rows = csv.reader(lines_of_text, delimiter=delimiter, skipinitialspace=True)
     try:
         header = _header(rows, name)
         lines, cells = [], []
@@ -145,6 +150,12 @@ def read_table(file: File, name: str, known: Sequence[str] | None = None) -> Csv
                 cells.append(stripped)
     except csv.Error as error:
         raise DatasetError(f"{name}, line {rows.line_num}: {error}; check its quotes") from None
+    if delimiter != ",":
+        cells = _with_points(cells)
+    if not header[0] and all(row[0] in (str(k), str(k + 1)) for k, row in enumerate(cells)):
+        header, cells = header[1:], [row[1:] for row in cells]  # an index, as pandas writes it
+    lowered = {column.lower(): column for column in known or ()}
+    header = [lowered.get(column.lower(), column) for column in header]
     _check_header(header, name, known)
     if not header[-1] and all(len(row) == len(header) and not row[-1] for row in cells):
         header, cells = header[:-1], [row[:-1] for row in cells]  # each line ends with a comma
@@ -167,6 +178,19 @@ def cells_of(numbers: Float[np.ndarray, "R C"]) -> Sequence[Sequence[object]]:
     return [["" if value != value else value for value in row] for row in rows]
 
 
+def _delimiter(lines: Sequence[str]) -> str:
+    """What parts the columns in the first line that names them: a comma, else ; or a tab."""
+    first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
+    return next((mark for mark in (",", ";", "\t") if mark in first), ",")
+
+
+def _with_points(cells: list[list[str]]) -> list[list[str]]:
+    """Decimal commas as points, unless there are decimal points, too."""
+    if any(POINT.fullmatch(cell) for row in cells for cell in row):
+        return cells
+    return [[c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row] for row in cells]
+
+
 def _header(rows: Iterable[list[str]], name: str) -> list[str]:
     for row in rows:
         if row and not row[0].startswith("#"):
@@ -175,8 +199,6 @@ def _header(rows: Iterable[list[str]], name: str) -> list[str]:
 
 
 def _check_header(header: list[str], name: str, known: Sequence[str] | None) -> None:
-    if len(header) == 1 and any(mark in header[0] for mark in (";", "\t")):
-        raise DatasetError(f"{name}, line 1: columns are parted by commas, not by ; or tabs")
     for i, column in enumerate(header):
         if column in header[:i]:
             raise DatasetError(f"{name}, line 1: two columns are called {column!r}")
@@ -206,7 +228,8 @@ def _number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise ValueError(f"{text[:SHOWN]!r} is not a number") from None
+        comma = "; decimals have a point, thousands nothing" if "," in text else ""
+        raise ValueError(f"{text[:SHOWN]!r} is not a number{comma}") from None
     if not isfinite(value):
         raise ValueError(f"{text[:SHOWN]!r} is not finite")
     if abs(value) > LARGEST:
@@ -218,7 +241,10 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
     try:
         value = Decimal(text) * scale
     except InvalidOperation:
-        raise ValueError(f"{text[:SHOWN]!r} is not a time in numbers") from None
+        raise ValueError(
+            f"{text[:SHOWN]!r} is not a time in numbers: times are in seconds, since 1970 or since "
+            "the start"
+        ) from None
     if not value.is_finite() or abs(value) > LARGEST * 1e9:
         raise ValueError(
             f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s"
@@ -242,7 +268,7 @@ def _landmark(text: str) -> int:
     except ValueError:
         raise ValueError(
             f"{text[:SHOWN]!r} is not a whole number, nor are all rows texts that end in one, as "
-            "tag36h11:5"
+            "tag36h11:5: give each landmark a number"
         ) from None
     if not 0 <= value <= LARGEST_NAME:
         raise ValueError(f"{value} is out of bounds: a landmark has a number from 0 to 2^31 - 1")

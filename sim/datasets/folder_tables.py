@@ -35,6 +35,8 @@ EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
 EARLY_NS = 2_000_000_000
 """Longest time by which measurements may precede the odometry, while the robot stands."""
+FAR_M = 1_000.0
+"""A median range above this [m] is probably not in metres."""
 MOST_RAD = 2.0 * np.pi + 1e-3
 """The largest absolute bearing; larger values are not in radians."""
 
@@ -155,6 +157,12 @@ def measurements_of(
         rows.drop(~chosen, otherwise)
         return found.where(chosen)
 
+    if len(found.ranges) and np.median(found.ranges) > FAR_M:
+        rows.notes.append(
+            f"what it measures is {np.median(found.ranges):,.0f} m away most of the time "
+            f"({rows.table.name}): metres are meant; of millimetres a map of columns makes them "
+            "(scale = 0.001)"
+        )
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
         aa, ab, bb = found.covariances.T

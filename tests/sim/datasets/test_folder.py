@@ -283,7 +283,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
     ("table", "text", "words"),
     [
         ("odometry", "", "r1/odometry.csv: empty; its first line names the columns"),
-        ("odometry", "t_s;v\n", "r1/odometry.csv, line 1: columns are parted by commas"),
+        ("odometry", "t_s;v\n", "r1/odometry.csv, line 1: unknown column 'v'"),
         ("odometry", "t_s,speed\n0,1\n", "line 1: unknown column 'speed'; known: t_s"),
         ("odometry", "t_s,t_s\n", "line 1: two columns are called 't_s'"),
         ("odometry", "t_s,x_m\n0,1\n", "line 1: no odometry in its columns; give t_s with one of"),
@@ -471,3 +471,40 @@ def test_landmarks_whose_names_end_in_numbers_have_these(tmp_path: Path) -> None
     ):
         with pytest.raises(DatasetError, match=words):
             only(data_set(tmp_path / row[2:6], odometry=SPEEDS, observations=named + row))
+
+
+@pytest.mark.parametrize(
+    "odometry",
+    [
+        "t_s;forward_m_s;yaw_rate_rad_s\n0;1;0,1\n1;2;0,2\n3;0;0\n",
+        "t_s\tforward_m_s\tyaw_rate_rad_s\n0\t1\t0.1\n1\t2\t0.2\n3\t0\t0\n",
+        '"yaw_rate_rad_s", "T_S", "Forward_m_s"\r\n"0.1", "0", "1"\r\n0.2,1,2\r\n0,3,0\r\n',
+        ",t_s,forward_m_s,yaw_rate_rad_s\n0,0,1,0.1\n1,1,2,0.2\n2,3,0,0\n",
+    ],
+    ids=["decimal commas", "tabs", "quotes, order and capitals", "an index"],
+)
+def test_tables_as_other_programs_write_them_are_the_same(tmp_path: Path, odometry: str) -> None:
+    plain = only(data_set(tmp_path / "a", odometry=SPEEDS, observations=SEEN))
+    other = only(data_set(tmp_path / "b", odometry=odometry, observations=SEEN))
+    assert same(plain, other)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("1,7,2.5", '1,7,"2,5"', "column range_m: '2,5' is not a number; decimals have a point"),
+        ("1,7,2.5", "1,door,2.5", "give each landmark a number"),
+        ("1,7,2.5", "2024-05-01T12:00:00Z,7,2.5", "times are in seconds, since 1970 or since"),
+    ],
+)
+def test_a_cell_of_another_kind_is_named_with_the_kind_that_is_needed(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    with pytest.raises(DatasetError, match=words):
+        only(data_set(tmp_path, odometry=SPEEDS, observations=SEEN.replace(old, new)))
+
+
+def test_ranges_that_are_hardly_metres_are_noted(tmp_path: Path) -> None:
+    far = SEEN.replace("2.5", "2500").replace("1.5,", "1500,").replace("2.4", "2400")
+    notes = only(data_set(tmp_path, odometry=SPEEDS, observations=far)).notes
+    assert any("2,400 m away most of the time" in note for note in notes)
