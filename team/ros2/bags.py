@@ -87,7 +87,8 @@ def opened_bag(path: Path) -> Iterator[Bag]:
         reader.open()
     except Exception as error:  # the library and what it reads with raise all there is
         remedy = "`ros2 bag reindex` may repair it"
-        files = [each for each in _parts(path) or [path] if each.suffix == ".mcap"]
+        there = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        files = [each for each in there if each.suffix == ".mcap"]
         if files:
             remedy = f"`teamslam repair {files[0]} -o WHOLE.mcap` takes what is whole out of it"
         raise BagError(f"{path}: no ROS 2 bag, or a damaged one ({error}); {remedy}") from None
