@@ -37,6 +37,8 @@ from team.wire.channels import VIEW, Channel, channel_of
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "open_log"]
 
 _MESSAGE = struct.Struct("<HIQQ")
+_OF_MESSAGE = int(Opcode.MESSAGE)
+"""As a plain number: to compare with an enum's member takes a tenth of the time of reading."""
 
 
 @dataclass(frozen=True)
@@ -116,17 +118,17 @@ class Log:
         to `keys`.
         """
         samples = []
-        for record in records(expanded(frame.body)):
-            if record.opcode == Opcode.CHANNEL:
-                self._introduce(record.body, names, keys)
-            elif record.opcode == Opcode.MESSAGE:
-                number, sequence, log_time, wall_ns = _MESSAGE.unpack_from(record.body)
+        for _, opcode, body in records(expanded(frame.body)):
+            if opcode == _OF_MESSAGE:
+                number, sequence, log_time, wall_ns = _MESSAGE.unpack_from(body)
                 if number not in keys:
                     raise ValueError(f"message on channel {number}, which nothing describes")
                 if (key := keys[number]) is not None:
-                    payload = record.body[_MESSAGE.size :]
+                    payload = body[_MESSAGE.size :]
                     stamp_ns = log_time or _stamp_in(payload)
                     samples.append(Sample(key, payload, stamp_ns, wall_ns, sequence))
+            elif opcode == Opcode.CHANNEL:
+                self._introduce(body, names, keys)
         return samples
 
     def _key(self, topic: str, names: set[str] | None) -> str | None:

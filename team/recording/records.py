@@ -159,16 +159,16 @@ def records(data: bytes) -> Iterator[Frame]:
     Small records take many times their size as Python objects, so their number is bounded as well.
     """
     starts: list[int] = []
-    offset, size = 0, len(data)
+    offset, size, head = 0, len(data), _FRAME.size
     while offset < size:
         if len(starts) == MOST_RECORDS:
             raise ValueError(f"more than {MOST_RECORDS} records, which no recorder writes")
         starts.append(offset)
-        offset += _FRAME.size + _FRAME.unpack_from(data, offset)[1]
+        offset += head + _FRAME.unpack_from(data, offset)[1]
     if offset > size:
         raise ValueError("a record ends beyond its chunk")
     for start, end in pairwise([*starts, size]):
-        yield Frame(start, data[start], data[start + _FRAME.size : end])
+        yield Frame(start, data[start], data[start + head : end])
 
 
 def expanded(body: bytes) -> bytes:

@@ -90,7 +90,7 @@ class Recorded:
         """File one sample, at this place of the log; a viewer's samples are neither input nor
         output.
         """
-        if ch.VIEW.owner(sample.key) is not None:
+        if _is_a_view(sample.key):
             return
         try:
             channel, _, message = opened(sample)
@@ -208,6 +208,11 @@ def recorded(log: Log) -> Recorded:
             raise chunk
         found.take_all(chunk)
     return found
+
+
+@lru_cache(maxsize=4096)
+def _is_a_view(key: str) -> bool:
+    return ch.VIEW.owner(key) is not None
 
 
 @lru_cache(maxsize=4096)

@@ -24,6 +24,20 @@ def mean_direction(angles: Float[np.ndarray, " M"], weights: Float[np.ndarray, "
     return elementary.atan2(sine, cosine)
 
 
+@compiled
+def mean_path(
+    paths: Float[np.ndarray, "K M 3"], weights: Float[np.ndarray, " M"]
+) -> Float[np.ndarray, "K 3"]:
+    """The weighted mean of the particles' poses at each of K keyframes, headings on the circle."""
+    means = np.zeros((len(paths), 3))
+    for k in range(len(paths)):
+        for i in range(len(weights)):
+            means[k, 0] += weights[i] * paths[k, i, 0]
+            means[k, 1] += weights[i] * paths[k, i, 1]
+        means[k, 2] = mean_direction(paths[k, :, 2], weights)
+    return means
+
+
 def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
     """What the scatter of particles is to be taken times for its inverse to be right on average.
 

@@ -21,7 +21,7 @@ from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
-from team.estimation.hybrid_slam.moments import mean_direction, moments, sample_factor
+from team.estimation.hybrid_slam.moments import mean_path, moments, sample_factor
 from team.estimation.hybrid_slam.sensitivity import Motion, Noise, columns
 from team.estimation.models import Increment
 from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
@@ -290,7 +290,7 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
     if window.sensor.is_mounted:
         away = inverse(mount)
         of_sensor = base_poses(of_sensor[0], away), base_points(of_sensor[1], away)
-    path = np.array([*(_mean_pose(poses, weights) for poses in window.paths), of_sensor[0][0]])
+    path = np.concatenate((mean_path(np.ascontiguousarray(window.paths), weights), of_sensor[0]))
     path = path[: len(window.motions)]
     slots = np.searchsorted(local.ids, window.ids)
     poses, landmarks = columns(
@@ -310,8 +310,3 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
     rows = (submap_poses.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
     return replace(local, biases=biases, sensitivity=np.concatenate(rows, axis=1))
 
-
-def _mean_pose(
-    poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, "3"]:
-    return np.array([*(dense.product(weights, poses[:, :2])), mean_direction(poses[:, 2], weights)])
