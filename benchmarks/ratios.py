@@ -4,8 +4,12 @@
 
 in_a_run: an interval of odometry as the segmenter takes it, against composing it at once.
 improved: a step of FastSLAM 2.0 against one of 1.0, 100 particles and four known landmarks.
-innovation: the NIS of that step against the step. CPU time, the halves of a ratio alternate, each
-is the least of its rounds. Held against benchmarks/ratios.json; exit status 1 if one is worse.
+innovation: the NIS of that step against the step.
+in_blocks: odometry at 70 Hz with a scan every half second, decoded and taken by a robot's node in
+blocks, against message by message. singly_us and in_blocks_us: what an interval then takes [us],
+with its share of scans and keyframes; they are the machine's and have no baseline.
+CPU time, the halves of a ratio alternate, each is the least of its rounds. Held against
+benchmarks/ratios.json; exit status 1 if one is worse.
 """
 
 import argparse
@@ -17,18 +21,24 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.baseline import concluded
-from team.config import MotionModel, MotionNoise, Sensor
+from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
 from team.estimation.hybrid_slam.innovation import innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment, increment_of
 from team.estimation.odometry import OdometryInterval
+from team.robot.driven import driven
+from team.robot.node import RobotNode
+from team.stream.odometry_block import decoded_odometry
+from team.wire import messages as m
+from team.wire.codec import decoded, encoded
 
 MOTION = MotionModel(forward=MotionNoise(per_m=0.03), turn=MotionNoise(per_rad=0.1))
 SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)
 PARTICLES, KNOWN, SEEN = 100, 12, 4
 INTERVALS = 300
 INTERVAL_NS = 15_000_000
+DRIVEN, SCANNED = 600, 33
 
 
 def least(parts: list[Callable[[], None]], rounds: int) -> list[float]:
@@ -90,14 +100,71 @@ def steps() -> list[Callable[[], None]]:
     return [step("fastslam1"), step("fastslam2"), judged]
 
 
+def driving() -> list[Callable[[], None]]:
+    """A robot's node takes the same payloads message by message and in blocks."""
+    front_end = FrontEnd(particles=PARTICLES, keyframe_s=0.5, window_s=10.0)
+    config = RobotConfig("r1", MOTION, SENSOR, front_end)
+    start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
+    scan = np.array([3.0, 4.0]).tobytes()
+    inputs: list[list[bytes]] = []
+    number = 0
+    for k in range(DRIVEN):
+        if k % SCANNED == 0:
+            number += 1
+            seen = m.Observations(
+                stamp_ns=k * INTERVAL_NS,
+                robot="r1",
+                incarnation=0,
+                number=number,
+                ids=np.array([1, 2], np.uint32).tobytes(),
+                ranges=scan,
+                bearings=np.array([0.1, -0.2]).tobytes(),
+            )
+            inputs += [[encoded(seen)], []]
+        number += 1
+        interval = m.Odometry(
+            stamp_ns=(k + 1) * INTERVAL_NS,
+            robot="r1",
+            incarnation=0,
+            number=number,
+            duration_ns=INTERVAL_NS,
+            forward=0.01,
+            yaw_rate=0.02,
+        )
+        inputs[-1].append(encoded(interval))
+
+    def singly() -> None:
+        node = RobotNode(config)
+        node.handle(start, 0)
+        for payload in (each for run in inputs for each in run):
+            node.handle(decoded(payload), 0)
+
+    def in_blocks() -> None:
+        node = RobotNode(config)
+        node.handle(start, 0)
+        for run in inputs:
+            if len(run) == 1:
+                node.handle(decoded(run[0]), 0)
+                continue
+            table = decoded_odometry("r1", run)
+            block = table.block("r1", 0, 0, len(run))
+            driven(node, block, lambda message: node.handle(message, 0))
+
+    return [singly, in_blocks]
+
+
 def measured(rounds: int) -> dict[str, float]:
     """The ratios."""
+    singly, in_blocks = least(driving(), rounds)
     at_once, in_a_run = least([composed_at_once, composed_in_a_run], rounds)
     plain, improved, judged = least(steps(), rounds)
     return {
         "in_a_run": in_a_run / at_once,
         "improved": improved / plain,
         "innovation": judged / improved,
+        "in_blocks": in_blocks / singly,
+        "singly_us": 1e6 * singly / DRIVEN,
+        "in_blocks_us": 1e6 * in_blocks / DRIVEN,
     }
 
 

@@ -59,15 +59,6 @@ class OdometryInterval(NamedTuple):
         twist = self.moved.twist * (duration_ns / self.duration_ns)
         return self._replace(end_ns=end_ns, duration_ns=duration_ns, moved=Moved(twist))
 
-    def lasting(self, duration_ns: int) -> "Intervals":
-        """A part of the interval, which tells speeds, as a row of its own."""
-        return Intervals(
-            np.array([self.end_ns], np.int64),
-            np.array([duration_ns], np.int64),
-            np.array([self.forward], np.float64),
-            np.array([self.yaw_rate], np.float64),
-        )
-
     @property
     def speed(self) -> float:
         """Magnitude of the velocity [m/s], or the signed forward speed where no motion was

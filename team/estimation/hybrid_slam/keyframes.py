@@ -189,7 +189,7 @@ class Segmenter:
     def drive_on(self, intervals: Intervals) -> None:
         """Take some of the `quiet` intervals, as `drive` takes each of them."""
         self._last, self._unmeasured = intervals.last, None
-        self._run.add(intervals)
+        self._run.add_all(intervals)
         self.now_ns = self._last.end_ns
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
@@ -244,7 +244,7 @@ class Segmenter:
         if duration_ns <= 0:
             return
         if self._is_plain(over):
-            self._run.add(over.lasting(duration_ns))
+            self._run.add(over, duration_ns)
             return
         self._settle()
         step = over.part(self._motion, duration_ns, rest_ns)

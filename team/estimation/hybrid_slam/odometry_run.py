@@ -8,7 +8,7 @@ keyframe are updated when they are needed.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from team.config import MotionModel
 from team.estimation.compiled import compiled
@@ -24,7 +24,7 @@ from team.estimation.models import (
     scale_column,
     turn_then_drive,
 )
-from team.estimation.odometry import Intervals
+from team.estimation.odometry import Intervals, OdometryInterval
 
 Spread = Float[np.ndarray, "3 3"]
 
@@ -67,9 +67,13 @@ def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) ->
 
 
 @compiled
-def rows_of(model: CourseModel, intervals: Intervals) -> Float[np.ndarray, "n 10"]:
+def rows_of(
+    model: CourseModel,
+    durations_ns: Int64[np.ndarray, " n"],
+    forward: Float[np.ndarray, " n"],
+    yaw_rates: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 10"]:
     """A row of `gone_on` for each interval."""
-    _, durations_ns, forward, yaw_rates = intervals
     rows = np.zeros((len(forward), 10))
     for k in range(len(forward)):
         duration_s = durations_ns[k] * 1e-9
@@ -86,14 +90,29 @@ class OdometryRun:
     def __init__(self, motion: MotionModel) -> None:
         self._model = model_of(motion)
         self._rows: list[Float[np.ndarray, "n 10"]] = []
+        self._parts: list[tuple[int, float, float]] = []
 
     def __bool__(self) -> bool:
         """Whether there are any."""
-        return bool(self._rows)
+        return bool(self._rows or self._parts)
 
-    def add(self, intervals: Intervals) -> None:
-        """Adds the next parts, whose durations these are."""
-        self._rows.append(rows_of(self._model, intervals))
+    def add(self, over: OdometryInterval, duration_ns: int) -> None:
+        """Adds the next part of an interval."""
+        self._parts.append((duration_ns, over.forward, over.yaw_rate))
+
+    def add_all(self, intervals: Intervals) -> None:
+        """Adds whole intervals."""
+        self._note_parts()
+        _, durations_ns, forward, yaw_rates = intervals
+        self._rows.append(rows_of(self._model, durations_ns, forward, yaw_rates))
+
+    def _note_parts(self) -> None:
+        if self._parts:
+            durations, forward, yaw_rates = zip(*self._parts, strict=True)
+            speeds = np.array([forward, yaw_rates], np.float64)
+            of_parts = np.array(durations, np.int64), speeds[0], speeds[1]
+            self._rows.append(rows_of(self._model, *of_parts))
+            self._parts = []
 
     def behind(self, motion: Increment) -> Increment:
         """A motion followed by all stored parts, which remain stored."""
@@ -117,6 +136,7 @@ class OdometryRun:
         return gone_on(since, rows, self._model.turns_first)
 
     def _whole(self) -> Float[np.ndarray, "n 10"]:
+        self._note_parts()
         if len(self._rows) > 1:
             self._rows = [np.concatenate(self._rows)]
         return self._rows[0]

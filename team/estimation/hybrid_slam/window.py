@@ -309,4 +309,3 @@ def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
     submap_poses = np.concatenate((end, poses[:, window.node_keyframes]), axis=1)
     rows = (submap_poses.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
     return replace(local, biases=biases, sensitivity=np.concatenate(rows, axis=1))
-
