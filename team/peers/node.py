@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from team.peers.exchange import answered, named, oversized, request_for
+from team.peers.feed import new_of_streams, turn
+from team.peers.given import GIVEN_BYTES, Given
 from team.peers.members import CHANNELS, Member, Stream, member_of
 from team.peers.proofs import Proofs
 from team.peers.replica import SHARE, RefusedError, Replica
@@ -32,30 +34,6 @@ FRESH_S = 25.0
 MOST_OPEN = 16_384
 """A node that owes so many members is not asked for more until they arrive or the requests
 expire."""
-
-GIVEN_BYTES = 8 * 2**20
-"""Most bytes of members given to one node within a second; to all nodes together GIVEN_TO_ALL."""
-GIVEN_TO_ALL = 32 * 2**20
-
-
-class Given:
-    """Bytes given within the current second, to each node and to all, which limits the cost of
-    endless requests.
-    """
-
-    def __init__(self) -> None:
-        self._second = 0
-        self._bytes: dict[str, int] = {}
-
-    def allows(self, node: str, now_s: float) -> bool:
-        """Whether a node may be given more now."""
-        if int(now_s) != self._second:
-            self._second, self._bytes = int(now_s), {}
-        return self._bytes.get(node, 0) < GIVEN_BYTES and sum(self._bytes.values()) < GIVEN_TO_ALL
-
-    def note(self, node: str, size: int) -> None:
-        """Count bytes given to a node."""
-        self._bytes[node] = self._bytes.get(node, 0) + size
 
 
 @dataclass
@@ -165,31 +143,11 @@ class PeerNode:
         orders first, since it may end with the last member of a stream, and what ends it last.
         """
         statements, self._new_messages = self._new_messages, []
-        statements.sort(key=_turn)
-        orders = sum(_turn(each) < 0 for each in statements)
+        statements.sort(key=turn)
+        orders = sum(turn(each) < 0 for each in statements)
         yield from statements[:orders]
-        yield from self._new_of_streams()
+        yield from new_of_streams(self.replica, self._fed)
         yield from statements[orders:]
-
-    def _new_of_streams(self) -> Iterator[m.Message]:
-        """The initial poses, then the submaps by their ends, each after the inter-robot
-        measurements from it: a fold in the order of time takes back nothing.
-        """
-        parcels: list[tuple[int, Stream, int]] = []
-        for stream, share in sorted(self.replica.streams.items()):
-            fed = self._fed.get(stream, -1)
-            if share.start is None or fed >= share.count:
-                continue
-            if fed < 0:
-                yield share.start.message
-            latest_ns = 0
-            for sequence in range(max(fed, 0), share.count):
-                latest_ns = max(latest_ns, share.submaps[sequence].message.stamp_ns)
-                parcels.append((latest_ns, stream, sequence))
-            self._fed[stream] = share.count
-        for _, stream, sequence in sorted(parcels):
-            parcel = self.replica.streams[stream].parcel(sequence)
-            yield from (member.message for member in parcel)
 
     def again(self) -> None:
         """Give everything to the fold again, which begins anew."""
@@ -320,14 +278,3 @@ class PeerNode:
         """For each node with a summary, whether its set equals this one."""
         digest = self.replica.digest
         return {n: s.digest == digest for n, (_, s) in sorted(self._summaries.items())}
-
-
-def _turn(message: m.Message) -> int:
-    """Where a statement is given to a fold: before the streams (negative) or after them."""
-    match message:
-        case m.Withdrawal() | m.Verdict():
-            return -1
-        case m.GivenUp():  # whose stream has ended all the same is not lost
-            return 2
-        case _:
-            return 1

@@ -6,8 +6,9 @@ import msgspec
 import pytest
 
 from team.peers.exchange import MOST_ASKED, answered, request_for
+from team.peers.given import GIVEN_BYTES
 from team.peers.members import LARGEST_MEMBER, Member, member_of
-from team.peers.node import GIVEN_BYTES, PeerNode
+from team.peers.node import PeerNode
 from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica, intervals
 from team.wire import channels as ch
 from team.wire import messages as m

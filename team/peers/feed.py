@@ -1,0 +1,40 @@
+"""The order in which a fold is given the set: orders, streams by time, `Done`, who was given up."""
+
+from collections.abc import Iterator
+
+from team.peers.members import Stream
+from team.peers.replica import Replica
+from team.wire import messages as m
+
+
+def turn(message: m.Message) -> int:
+    """Where a statement is given to a fold: before the streams (negative) or after them."""
+    match message:
+        case m.Withdrawal() | m.Verdict():
+            return -1
+        case m.GivenUp():  # whose stream has ended all the same is not lost
+            return 2
+        case _:
+            return 1
+
+
+def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
+    """What streams have beyond the submaps that were given, which `fed` counts from now on: the
+    initial poses, then the submaps by their ends, each after the inter-robot measurements from it.
+
+    A fold in the order of time takes back nothing.
+    """
+    parcels: list[tuple[int, Stream, int]] = []
+    for stream, share in sorted(replica.streams.items()):
+        given = fed.get(stream, -1)
+        if share.start is None or given >= share.count:
+            continue
+        if given < 0:
+            yield share.start.message
+        latest_ns = 0
+        for sequence in range(max(given, 0), share.count):
+            latest_ns = max(latest_ns, share.submaps[sequence].message.stamp_ns)
+            parcels.append((latest_ns, stream, sequence))
+        fed[stream] = share.count
+    for _, stream, sequence in sorted(parcels):
+        yield from (member.message for member in replica.streams[stream].parcel(sequence))
