@@ -1,13 +1,16 @@
 """How the centre's cost grows with the length of a run: time, memory and bytes per broadcast.
 
     python -m benchmarks.growth [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
+                                [--identities hidden]
 
 Synthetic submaps, drawn about a known truth, go through the rule `join` without a network: all
 robots end a window in each tick, then comes a broadcast. At each size: CPU per tick with its
 broadcast (the median of the last WINDOW), resident memory, bytes of the map and of all priors, and
 how far the map is from the truth. `ratio_*` compare the ends of one run, so they hold on any
 machine; growth.json has the baseline with direction and tolerance. Exit status 1 if a figure is
-worse than that allows.
+worse than that allows. Without identities the submaps' landmarks are numbered anew in each, the
+centre associates them, the error is that from the nearest true landmark, and `window_ms` is what
+the association of one window of WINDOW scans costs its robot.
 """
 
 import argparse
@@ -27,7 +30,11 @@ from central.intake import Instant
 from central.join_rule import JoinRule
 from central.scheduler import Scheduler
 from team import translate
-from team.estimation.submap import LocalMap
+from team.association import profile_for
+from team.config import UNNAMED, AssociationSettings, Sensor
+from team.estimation.association.association import associated
+from team.estimation.association.scans import NOBODY, Scans
+from team.estimation.submap import LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, ids
 from team.wire.bus import Outgoing
@@ -47,7 +54,8 @@ SIGMAS = (0.1, 0.02, 0.2)
 class World:
     """Landmarks in a square, and robots that wander in it; submaps tick by tick."""
 
-    def __init__(self, robots: int, landmarks: int, seed: int = 1) -> None:
+    def __init__(self, robots: int, landmarks: int, seed: int = 1, hidden: bool = False) -> None:
+        self.hidden = hidden
         self._rng = np.random.default_rng(seed)
         self.size = SPACING_M * np.sqrt(landmarks)
         self._reach = SPACING_M * np.sqrt(SEEN / np.pi)
@@ -95,9 +103,32 @@ class World:
         self._poses[r] = [*(pose[:2] + turned @ local_end[:2]), pose[2] + turn]
         k = self._ticks
         ends = (round(k * TICK_S * 1e9), round((k + 1) * TICK_S * 1e9))
-        local = LocalMap(seen.astype(np.uint32), mean, 0.5 * (covariance + covariance.T))
+        symmetric = 0.5 * (covariance + covariance.T)
+        local = LocalMap(seen.astype(np.uint32), mean, symmetric)
+        if self.hidden:
+            numbers = (UNNAMED + np.arange(len(seen))).astype(np.uint32)
+            together = Unnamed(np.full(len(seen), 5, np.uint32), np.ones((len(seen), 1), np.bool_))
+            local = LocalMap(numbers, mean, symmetric, unnamed=together)
         counters = (1 + 100 * k, 100 * (k + 1))
         return translate.submap_message(f"r{r}", 1, k, counters, ends, bytes(8), local)
+
+    def window(self) -> Scans:
+        """What one robot detects in a window: WINDOW scans of what surrounds it, on one step."""
+        rng, pose = self._rng, self._poses[0]
+        offsets = self.landmarks - pose[:2]
+        seen = offsets[np.hypot(*offsets.T) < self._reach]
+        step = 0.6 * SPACING_M / WINDOW
+        truth = [seen - step * (k + 1) * np.array([1.0, 0.0]) for k in range(WINDOW)]
+        points = np.concatenate(truth)
+        n = len(points)
+        return Scans(
+            np.tile([step, 0.0, 0.0], (WINDOW, 1)),
+            np.tile(np.diag([0.02, 0.02, 0.004]) ** 2, (WINDOW, 1, 1)),
+            np.repeat(np.arange(WINDOW), len(seen)),
+            points + SIGMAS[2] * rng.normal(size=(n, 2)),
+            np.tile(SIGMAS[2] ** 2 * np.eye(2), (n, 1, 1)),
+            np.full(n, NOBODY),
+        )
 
 
 def resident_mb() -> float:
@@ -106,11 +137,25 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def measured(robots: int, landmarks: int, at: list[int]) -> list[dict[str, float]]:
+def window_ms(world: World) -> float:
+    """CPU time of a window's association, the median of five windows."""
+    spent = []
+    for _ in range(5):
+        scans = world.window()
+        before = time.process_time()
+        associated(scans, AssociationSettings())
+        spent.append(1e3 * (time.process_time() - before))
+    return float(np.median(spent))
+
+
+def measured(
+    robots: int, landmarks: int, at: list[int], hidden: bool = False
+) -> list[dict[str, float]]:
     """A row of figures at each number of submaps."""
-    world = World(robots, landmarks)
+    world = World(robots, landmarks, hidden=hidden)
     names = [f"r{r}" for r in range(robots)]
-    config = CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S)
+    lengths = profile_for(Sensor(range_sigma=SIGMAS[2], bearing_sigma=1e-6), 1.0)
+    config = CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S, association=lengths)
     scheduler = Scheduler(JoinRule(config, bytes(8), names))
     intake = scheduler.intake
     for start in world.starts():
@@ -137,6 +182,8 @@ def measured(robots: int, landmarks: int, at: list[int]) -> list[dict[str, float
                 "prior_bytes": float(np.mean([each[1] for each in sent[-WINDOW:]])),
                 "rmse_m": _rmse(out, world),
             }
+            if hidden:
+                row |= {"landmarks": float(_shown(out)), "window_ms": window_ms(world)}
             rows.append(row)
             print("  ".join(f"{key} {value:.5g}" for key, value in row.items()), flush=True)
     return rows
@@ -153,8 +200,17 @@ def _rmse(out: list[Outgoing], world: World) -> float:
     fused = next((o.message for o in out if isinstance(o.message, m.FusedMap)), None)
     if fused is None:
         return float("nan")
-    error = floats(fused.means, "means").reshape(-1, 2) - world.landmarks[ids(fused.ids, "ids")]
+    means = floats(fused.means, "means").reshape(-1, 2)
+    if world.hidden:
+        away = np.linalg.norm(means[:, None] - world.landmarks[None], axis=2)
+        return float(np.sqrt((away.min(axis=1) ** 2).mean()))
+    error = means - world.landmarks[ids(fused.ids, "ids")]
     return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def _shown(out: list[Outgoing]) -> int:
+    """Number of landmarks of the newest map."""
+    return max(len(ids(o.message.ids, "ids")) for o in out if isinstance(o.message, m.FusedMap))
 
 
 def figures(rows: list[dict[str, float]]) -> dict[str, float]:
@@ -180,14 +236,15 @@ def main() -> int:
     parser.add_argument("--landmarks", type=int, default=50)
     parser.add_argument("--at", default="250,500,1000,2500")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--identities", choices=["hidden"])
     told = parser.parse_args()
     at = sorted(int(each) for each in told.at.split(","))
-    rows = measured(told.robots, told.landmarks, at)
+    rows = measured(told.robots, told.landmarks, at, told.identities == "hidden")
     found: dict[str, Any] = {"rows": rows, "figures": figures(rows)}
     print(json.dumps(found["figures"], indent=1))
     if told.json:
         told.json.write_text(json.dumps(found, indent=1) + "\n")
-    standard = (told.robots, told.landmarks, at[-1]) == (5, 50, 2500)
+    standard = (told.robots, told.landmarks, at[-1], told.identities) == (5, 50, 2500, None)
     problems = worse(found["figures"], "growth") if standard else []
     print("\n".join(problems), file=sys.stderr)
     return 1 if problems else 0

@@ -30,7 +30,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load
+from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import streams_of
 from team.keys.authority import make_keys
 from team.keys.roster import nodes_of
@@ -152,6 +152,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
         folder = Path(name).resolve()
         more = ["--keys", str(options.keys_made)] if options.keys else []
         more += ["--without-centre"] if options.without_centre else []
+        more += ["--identities", options.identities] if options.identities else []
         if options.end_silent:
             more += ["--end-silent", str(options.end_silent)]
         began = time.monotonic()
@@ -278,6 +279,7 @@ def main() -> int:
     parser.add_argument("--keys", action="store_true", help="behind certificates")
     parser.add_argument("--verify", action="store_true", help="compute each log again")
     parser.add_argument("--without-centre", action="store_true", help="every robot is a peer")
+    parser.add_argument("--identities", choices=["hidden"], help="landmarks have no names")
     parser.add_argument("--what", default="robot,central,router,record,world,viewer")
     parser.add_argument("--load", type=int, default=0, help="busy loops beside the team")
     parser.add_argument("--steps", type=int, default=60)
@@ -290,7 +292,7 @@ def main() -> int:
     options.what = options.what.split(",")
     with tempfile.TemporaryDirectory() as name:
         scenario = shortened(Path(name), options.steps)
-        resolved = load(scenario)
+        resolved = with_options(load(scenario), identities=options.identities)
         options.keys_made = Path(name) / "keys"
         if options.keys:
             make_keys(options.keys_made, resolved.team, nodes_of([r.id for r in resolved.robots]))
