@@ -124,6 +124,20 @@ class LocalMap:
         np.fill_diagonal(away, np.inf)
         return np.asarray(away)
 
+    @cached_property
+    def distinct(self) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+        """The pairs of landmarks, by their places in `ids`, that can not be one: two that one
+        keyframe observed, and all pairs with a landmark that has a name. Empty where all have.
+        """
+        unnamed = self.ids >= UNNAMED
+        if not unnamed.any():
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        together = np.ones((len(self.ids), len(self.ids)), np.bool_)
+        masks = self.unnamed.seen.astype(np.float32)
+        together[np.ix_(unnamed, unnamed)] = masks @ masks.T > 0.0
+        one, two = np.nonzero(together)
+        return one, two
+
     @property
     def nodes(self) -> Float[np.ndarray, "K 3"]:
         """start_from_node of each pose node."""

@@ -179,14 +179,7 @@ def _apart(
     named = np.array(ids) < UNNAMED
     apart = named[:, None] & named[None, :]
     for submap, places in zip(graph.submaps, seen_by, strict=True):
-        local = submap.contribution.local
-        unnamed = local.ids >= UNNAMED
-        if not unnamed.any():
-            continue
-        together = np.ones((len(places), len(places)), np.bool_)
-        masks = local.unnamed.seen.astype(np.float32)
-        together[np.ix_(unnamed, unnamed)] = masks @ masks.T > 0.0
-        one, two = np.nonzero(together)
+        one, two = submap.contribution.local.distinct
         apart[places[one], places[two]] = True
     for first, second, same in landmarks.verdicts:
         here, there = (place_of.get(landmarks.identity(each) or -1) for each in (first, second))

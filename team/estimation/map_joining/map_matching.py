@@ -70,9 +70,9 @@ def matched(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
     for each in contributions:
         if len(each.local.unnamed.counts):
             last[each.stream] = each.sequence
-    for stream in sorted(last):
-        fold = _closed(fold, stream, last[stream])
     views = IslandViews()
+    for stream in sorted(last):
+        fold = _closed(fold, stream, last[stream], views)
     for stream in sorted(last):
         for key in sorted(fold.islands):
             if key in fold.islands and key != fold.home[stream]:
@@ -104,10 +104,10 @@ def _patch(view: IslandView, stream: Stream, last: int) -> list[int]:
     ]
 
 
-def _closed(fold: Fold, stream: Stream, last: int) -> Fold:
+def _closed(fold: Fold, stream: Stream, last: int, views: IslandViews) -> Fold:
     """The fold with a closure of the stream's last submaps inside their island, if there is one."""
     key = fold.home[stream]
-    view = IslandView(fold.islands[key], fold.landmarks)
+    view = views.of(fold, key)
     profile = view.profile
     submaps = _patch(view, stream, last)
     patch = union(view.seen_by[k] for k in submaps)
@@ -360,9 +360,10 @@ def _merged(
     streams = sorted(renamed[goes].graph.streams)
     fold = merged_islands(fold, stays, goes, Merge(best, waiting, words))
     fold = _tidied(fold, stays)
+    views = IslandViews()
     for stream in streams:
         for last in range(fold.next_sequence(stream) - 1, -1, -max(1, _step(fold, stays))):
-            fold = _closed(fold, stream, last)
+            fold = _closed(fold, stream, last, views)
     return fold
 
 

@@ -74,9 +74,11 @@ def overlooked(
     seen_by: the landmarks of each window. radius: windows saw the place that have a landmark within
         it [m].
     """
-    counts = np.zeros(len(points))
-    for places in seen_by:
-        away = elementwise.hypot(*(points[:, None] - points[places][None]).transpose(2, 0, 1))
-        counts += (away < radius).any(axis=1)
+    x, y = points.T
+    near = elementwise.hypot(x[:, None] - x, y[:, None] - y) < radius
+    seen = np.zeros((len(seen_by), len(points)), np.float32)
+    for row, places in zip(seen, seen_by, strict=True):
+        row[places] = 1.0
+    counts = (seen @ near.astype(np.float32) > 0.0).sum(axis=0)  # exact: sums of ones
     chance = elementwise.exp(elementary.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
     return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))
