@@ -37,7 +37,7 @@ class Outbox:
     @property
     def submaps(self) -> int:
         """Number of buffered submaps."""
-        return len(self._submaps)
+        return len(self._submaps) if self._buffered else 0
 
     @property
     def since_ns(self) -> int | None:

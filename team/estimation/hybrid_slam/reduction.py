@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -60,7 +61,7 @@ def reduced(looks: Sequence[KeyframeScan], end: Float[np.ndarray, "3"]) -> Measu
                 claim = carried(look.own[k], r, float(back[2]) + b, np.array([x, y]))
                 claims.setdefault(int(landmark), []).append(claim)
     ids = sorted(points)
-    ranges = [float(np.median([r for r, _ in points[i]])) for i in ids]
+    ranges = [median([r for r, _ in points[i]]) for i in ids]
     bearings = [_median_direction([b for _, b in points[i]]) for i in ids]
     own = together([(1, mean_claim(claims.get(i, []))) for i in ids])
     return np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings), own
@@ -87,4 +88,4 @@ def variances(
 def _median_direction(angles: list[float]) -> float:
     """The median of directions, relative to the first of them."""
     offsets = [geometry.wrapped(angle - angles[0]) for angle in angles]
-    return geometry.wrapped(angles[0] + float(np.median(offsets)))
+    return geometry.wrapped(angles[0] + median(offsets))
