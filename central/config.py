@@ -57,6 +57,9 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     of the part of these errors that all robots share, in addition. joined_ranges: for errors
     proportional to the range, a submap's landmarks are weighted by the range in the joined map:
     weighted by the measured range, short measurements weigh more and the map shrinks.
+    landmark_sigma [m]: standard deviation, in each direction, of the point that all robots measure
+    of a landmark about the landmark's own place (the front of a cylinder, a marker that hangs
+    beside its post): added to the covariance of each landmark of the map.
     withdraw_above: a robot is withdrawn if the median cost of its submaps per degree of freedom is
     above this and the rest of the team agrees without it; absent: by an operator only. bounds:
     submaps, inter-robot measurements and initial poses beyond them are refused. association:
@@ -78,3 +81,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     withdraw_above: Annotated[float, Meta(ge=2.0)] | None = 4.0
     bounds: Bounds = Bounds()
     association: AssociationProfile = AssociationProfile()
+    landmark_sigma: NonNegative = 0.0

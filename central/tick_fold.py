@@ -66,6 +66,7 @@ def join_settings(config: CentralConfig) -> JoinSettings:
             if (sigma := getattr(config.common_bias_sigma, name)) > 0.0
         },
         joined_ranges=config.joined_ranges,
+        landmark_sigma=config.landmark_sigma,
         association=config.association,
     )
 

@@ -26,7 +26,12 @@ import numpy as np
 from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.calibration import claims, motion, sensor
-from sim.calibration.consistency import covariance_factor, factor_by_cost, normal_scale
+from sim.calibration.consistency import (
+    covariance_factor,
+    factor_by_cost,
+    landmark_sigma,
+    normal_scale,
+)
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.detections import claim_notes, detection_figures, windows_of
 from sim.calibration.figures import (
@@ -141,7 +146,8 @@ def _by_truth(
         folds.append(team.fold)
     marker = marker_spread(data, depth=depth)
     strays = own.strays if marker is None else (*own.strays, marker)
-    of_central = _central_figures(folds, learnt, strays, progress)
+    true = [_positions(world) for _, world in worlds]
+    of_central = _central_figures(folds, scenario, strays, progress, true)
     findings = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
     return Calibration(of_motion, of_sensor, True, findings, of_central, own.robots)
 
@@ -196,10 +202,14 @@ def _by_the_map(
 
 
 def _central_figures(
-    folds: Sequence[Fold], scenario: Scenario, strays: Sequence[Figure], progress: Progress
+    folds: Sequence[Fold],
+    scenario: Scenario,
+    strays: Sequence[Figure],
+    progress: Progress,
+    true_landmarks: Sequence[Mapping[int, np.ndarray]] = (),
 ) -> tuple[Figure, ...]:
     """The standard deviations of robots' own biases, the covariance factor that remains with them,
-    and the monitor's normal scale.
+    the monitor's normal scale, and by the true landmarks of each world the landmarks' own sigma.
     """
     progress("maps of single robots against the rest of their team")
     fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
@@ -212,8 +222,10 @@ def _central_figures(
         return tuple(strays)
     found = (*strays, factor)
     central = msgspec.structs.replace(central, covariance_factor=factor.value)
-    normal = normal_scale(folds, central)
-    return found if normal is None else (*found, normal)
+    further = [normal_scale(folds, central)]
+    if true_landmarks:
+        further.append(landmark_sigma(list(zip(folds, true_landmarks, strict=True)), central))
+    return (*found, *(figure for figure in further if figure is not None))
 
 
 def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tuple[Figure, ...]:

@@ -5,9 +5,10 @@ A robot's own map a and the map b of the others share no measurement. If the cov
     D = min over rigid motions of (a − b)ᵀ (P_a + P_b − P_ab − P_ba)⁻¹ (a − b)
 
 has the mean 2n − 3 for the n landmarks of both. `covariance_factor` is the factor under which ΣD
-over all robots of all worlds has its expected value. It accounts for errors that last longer than a
-window, and for a robust loss, which down-weights inliers, too. Errors that all robots have alike do
-not show in D. a and b share the states of the biases that the team has in common
+over all robots of all worlds has its expected value. It accounts for errors that last longer than
+a window, and for a robust loss, which down-weights inliers, too. Errors that all robots have alike
+do not show in D, but in the distance between the joined map and the true landmarks, where these are
+known (`landmark_sigma`). a and b share the states of the biases that the team has in common
 (`central.common_bias_sigma`), hence P_ab: a marker that reads too far does so for both, from where
 each sees it.
 """
@@ -19,6 +20,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
 
 from central.config import CentralConfig
 from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
@@ -36,6 +38,8 @@ LEAST_LANDMARKS = 3
 """Two landmarks have one invariant only, their distance."""
 LEAST_ROBOTS = 3
 """Least number of robots in all worlds together from which a factor is learnt."""
+FARTHEST_M = 1.0
+"""No landmark is measured farther from its place than this."""
 SETTLED = 0.02
 """The iteration ends when the factor changes by a smaller share than this."""
 MOST_ROUNDS = 8
@@ -91,6 +95,54 @@ def factor_by_cost(
         if abs(factor / before - 1.0) < SETTLED:
             break
     return Figure("covariance_factor", factor, factor * float(np.sqrt(2.0 / found.dof)), "")
+
+
+def landmark_sigma(
+    teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
+) -> Figure | None:
+    """The σ [m] under which the shapes of the joined maps are as far from the true landmarks as
+    their covariances P + σ² I say: Σ χ²(σ) = Σ dof.
+
+    What is left between map and truth where the robots' maps agree among themselves is common to
+    all robots: they measure another point than the one that was surveyed. teams: the fold of each
+    world with its true landmarks. The standard deviation is half of what Σ χ² = Σ dof ± √(2 Σ dof)
+    leaves. None where no map has a shape; 0 where the covariances alone are wide enough.
+    """
+    settings = replace(join_settings(central), landmark_sigma=0.0)
+    maps = []
+    for fold, truth in teams:
+        key = fold.main_key
+        if key is None:
+            continue
+        island, _, _ = settled(replace(fold.main, settings=settings))
+        ids = [id_ for id_ in sorted(island.graph.landmarks) if id_ in truth]
+        if len(ids) >= LEAST_LANDMARKS:
+            nodes = [island.graph.landmarks[id_] for id_ in ids]
+            mean, P = joint_marginal(island, nodes)
+            maps.append((mean.reshape(-1, 2), P, np.array([truth[id_] for id_ in ids])))
+    if not maps:
+        return None
+    dof = sum(2 * len(means) - 3 for means, _, _ in maps)
+
+    def excess(sigma: float, of: float) -> float:
+        return sum(_shape_chi2(m, P + sigma**2 * np.eye(len(P)), t) for m, P, t in maps) - of
+
+    def solved(of: float) -> float:
+        if excess(0.0, of) <= 0.0:
+            return 0.0
+        return float(brentq(excess, 0.0, FARTHEST_M, args=(of,), xtol=1e-7))
+
+    spread = np.sqrt(2.0 * dof)
+    error = 0.5 * (solved(dof - spread) - solved(dof + spread))
+    return Figure("landmark_sigma", solved(dof), error, "m")
+
+
+def _shape_chi2(
+    means: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "m m"], truth: np.ndarray
+) -> float:
+    """χ² of a map's shape, with 2n − 3 degrees of freedom."""
+    shape = map_errors(means, covariance, truth).shape
+    return 0.0 if shape is None else 0.5 * (2 * len(means) - 3) * shape.nees_per_landmark
 
 
 def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:

@@ -41,7 +41,8 @@ BIAS_OF = {
 
 
 class Own(NamedTuple):
-    """robots: figures of each robot's sensor, empty where all are alike. strays: s of each bias,
+    """robots: figures of each robot's sensor, empty where all are alike. strays: of each bias, how
+    far a robot's constant in a further world is from that figure, √(s² + variance of the figure);
     and σ of the range scale that all have in common.
     """
 
@@ -85,8 +86,9 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
         for robot, value, sigma in zip(found, drawn, np.sqrt(of_means * share), strict=True):
             robots[robot].append(Figure(name, float(value), float(sigma), UNITS[name]))
         if name in BIAS_OF:
-            error = stray / np.sqrt(2.0 * dof[1])
-            strays.append(Figure(f"bias_sigma.{BIAS_OF[name]}", stray, error, UNITS[name]))
+            further = float(np.sqrt(stray**2 + np.mean(of_means * share)))
+            error = further / np.sqrt(2.0 * dof[1])
+            strays.append(Figure(f"bias_sigma.{BIAS_OF[name]}", further, error, UNITS[name]))
         if name == "range_scale":
             strays.append(_in_common(parts, [worlds[robot] for robot in found], stray))
     if not differ:

@@ -58,6 +58,9 @@ class JoinSettings:
         one landmark too far, for each landmark by itself.
     joined_ranges: whether errors of ranges are proportional to the range in the joined map
         (`joining_kernel.with_joined_ranges`).
+    landmark_sigma: standard deviation [m], in each direction, of the point that sensors measure
+        about the landmark's place, the same point for all robots: part of a map's covariance, not
+        of what the robots' measurements weigh.
     association: when landmarks without names count as one.
     """
 
@@ -74,6 +77,7 @@ class JoinSettings:
     bias_sigma: Mapping[Bias, float] = field(default_factory=dict)
     common_bias_sigma: Mapping[CommonBias, float] = field(default_factory=dict)
     joined_ranges: bool = False
+    landmark_sigma: float = 0.0
     association: AssociationProfile = DEFAULT_PROFILE
 
 

@@ -131,24 +131,28 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
     """The main island's landmarks (all, or those with the given ids) with their joint
-    covariance.
+    covariance, `landmark_sigma` included.
     """
     chosen = sorted(fold.main.graph.landmarks if ids is None else ids)
     mean, covariance = joint_marginal(fold.main, _nodes(fold.main, chosen))
+    covariance = covariance + fold.main.settings.landmark_sigma**2 * np.eye(len(covariance))
     return LandmarkMap(np.array(chosen, dtype=np.uint32), mean.reshape(-1, 2), covariance)
 
 
 def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
-    """The main island's landmarks (all, or those with the given ids), each with its own covariance.
+    """The main island's landmarks (all, or those with the given ids), each with its own covariance,
+    `landmark_sigma` included.
 
     By selected inversion of the information matrix.
     """
     island = fold.main
+    own = island.settings.landmark_sigma**2 * np.eye(2)
     chosen = sorted(island.graph.landmarks if ids is None else ids)
     means = np.zeros((len(chosen), 2))
     covariances = np.zeros((len(chosen), 2, 2))
     for k, node in enumerate(_nodes(island, chosen)):
-        means[k], covariances[k] = _own_marginal(island, node)
+        means[k], covariance = _own_marginal(island, node)
+        covariances[k] = covariance + own
     return LandmarkBlocks(np.array(chosen, dtype=np.uint32), means, covariances)
 
 

@@ -1,6 +1,7 @@
 """The covariance factor is learnt from how far single robots' maps are from the others'."""
 
 from dataclasses import replace
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from central.config import CentralConfig
 from central.tick_fold import join_settings
 from sim.calibration.calibrate import Calibration
-from sim.calibration.consistency import covariance_factor, disagreements
+from sim.calibration.consistency import covariance_factor, disagreements, landmark_sigma
 from sim.calibration.scenario import scenario_toml
 from sim.scenarios.scenario import load
 from team.estimation.map_joining.joining import (
@@ -25,6 +26,7 @@ from tests.estimation.submap_world import team
 SIGMAS = (0.05, 0.01, 0.1)
 
 
+@cache
 def folds_of(seeds, claimed=1.0):
     """Teams of four whose submaps say `claimed` times the variance that they have."""
     folds: list[Fold] = []
@@ -72,7 +74,7 @@ def test_the_factor_is_never_below_one_and_one_robot_says_nothing_of_it():
 
 
 def test_a_scenario_with_a_learnt_factor_keeps_the_rest_of_the_centre(tmp_path):
-    factor = covariance_factor(folds_of([1], 0.5), CentralConfig())
+    factor = covariance_factor(folds_of(range(1, 2), 0.5), CentralConfig())
     assert factor is not None
     document = scenario_toml(Calibration((), (), True, (), (factor,)), load("utias"), ["a set"])
     path = tmp_path / "learnt.toml"
@@ -82,3 +84,32 @@ def test_a_scenario_with_a_learnt_factor_keeps_the_rest_of_the_centre(tmp_path):
     before = load("utias").central
     kept = msgspec.structs.replace(central, covariance_factor=before.covariance_factor)
     assert kept == before
+
+
+def test_how_far_all_robots_see_landmarks_from_their_survey_is_learnt_by_the_truth():
+    folds, config = folds_of(range(30))[:12], CentralConfig()
+    rng = np.random.default_rng(5)
+    exact = [
+        dict(enumerate(team(seed, robots=4, submaps=8, landmarks=8).landmarks))
+        for seed in range(12)
+    ]
+    surveyed = [
+        {id_: place + rng.normal(0.0, 0.08, 2) for id_, place in each.items()} for each in exact
+    ]
+    none = landmark_sigma(list(zip(folds, exact, strict=True)), config)
+    found = landmark_sigma(list(zip(folds, surveyed, strict=True)), config)
+    assert none is not None
+    assert found is not None
+    assert none.value < 0.02
+    assert found.value == pytest.approx(0.08, abs=3.0 * found.sigma)
+    assert found.sigma < 0.015
+
+
+def test_where_the_covariances_are_wider_than_the_errors_landmarks_have_no_sigma():
+    folds = folds_of(range(5), 4.0)[:4]
+    true = [
+        dict(enumerate(team(seed, robots=4, submaps=8, landmarks=8).landmarks)) for seed in range(4)
+    ]
+    found = landmark_sigma(list(zip(folds, true, strict=True)), CentralConfig())
+    assert found is not None
+    assert found.value == 0.0
