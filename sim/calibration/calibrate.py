@@ -27,10 +27,8 @@ from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from sim.calibration import claims, motion, sensor
 from sim.calibration.consistency import (
-    covariance_factor,
+    central_figures,
     factor_by_cost,
-    landmark_sigma,
-    normal_scale,
 )
 from sim.calibration.data import Reference, references, true_paths
 from sim.calibration.detections import claim_notes, detection_figures, windows_of
@@ -38,7 +36,6 @@ from sim.calibration.figures import (
     CalibrationError,
     Figure,
     jackknifed,
-    nested,
     with_figures,
 )
 from sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
@@ -46,7 +43,6 @@ from sim.calibration.own import marker_spread, own_constants
 from sim.scenarios.scenario import Scenario
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise
-from team.estimation.map_joining.joining import Fold
 
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
@@ -147,7 +143,7 @@ def _by_truth(
     marker = marker_spread(data, depth=depth)
     strays = own.strays if marker is None else (*own.strays, marker)
     true = [_positions(world) for _, world in worlds]
-    of_central = _central_figures(folds, scenario, strays, progress, true)
+    of_central = central_figures(folds, scenario, strays, progress, true)
     findings = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
     return Calibration(of_motion, of_sensor, True, findings, of_central, own.robots)
 
@@ -191,7 +187,7 @@ def _by_the_map(
     for label, world in worlds:
         progress(f"joined map of {label} with what was learnt")
         teams.append(joined_team(world, learnt))
-    of_central = _central_figures([team.fold for team in teams], scenario, (), progress)
+    of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
         of_central = _by_cost(teams[0], scenario.central, progress)
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
@@ -199,33 +195,6 @@ def _by_the_map(
         note += "; so do the factors of covariances that come with measurements, and the mount"
     findings = (note, *notes, *_alarms(figures, scenario))
     return Calibration(figures, (), False, findings, of_central)
-
-
-def _central_figures(
-    folds: Sequence[Fold],
-    scenario: Scenario,
-    strays: Sequence[Figure],
-    progress: Progress,
-    true_landmarks: Sequence[Mapping[int, np.ndarray]] = (),
-) -> tuple[Figure, ...]:
-    """The standard deviations of robots' own biases, the covariance factor that remains with them,
-    the monitor's normal scale, and by the true landmarks of each world the landmarks' own sigma.
-    """
-    progress("maps of single robots against the rest of their team")
-    fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
-    for table in ("bias_sigma", "common_bias_sigma"):
-        fields_of_table = msgspec.to_builtins(getattr(scenario.central, table))
-        fields[table] = fields_of_table | msgspec.to_builtins(fields[table])
-    central = msgspec.convert(fields, CentralConfig)
-    factor = covariance_factor(folds, central)
-    if factor is None:
-        return tuple(strays)
-    found = (*strays, factor)
-    central = msgspec.structs.replace(central, covariance_factor=factor.value)
-    further = [normal_scale(folds, central)]
-    if true_landmarks:
-        further.append(landmark_sigma(list(zip(folds, true_landmarks, strict=True)), central))
-    return (*found, *(figure for figure in further if figure is not None))
 
 
 def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tuple[Figure, ...]:

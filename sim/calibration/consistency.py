@@ -25,7 +25,8 @@ from scipy.optimize import brentq
 from central.config import CentralConfig
 from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
 from central.tick_fold import join_settings
-from sim.calibration.figures import Figure
+from sim.calibration.figures import Figure, nested
+from sim.scenarios.scenario import Scenario
 from team.estimation.consistency import covariance_scale
 from team.estimation.contribution import InitialPoseFactor, Stream
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
@@ -52,6 +53,33 @@ class Disagreement(NamedTuple):
 
     chi2: float
     dof: int
+
+
+def central_figures(
+    folds: Sequence[Fold],
+    scenario: Scenario,
+    strays: Sequence[Figure],
+    progress: Callable[[str], None],
+    true_landmarks: Sequence[Mapping[int, Float[np.ndarray, "2"]]] = (),
+) -> tuple[Figure, ...]:
+    """The standard deviations of robots' own biases, the covariance factor that remains with them,
+    the monitor's normal scale, and by the true landmarks of each world the landmarks' own sigma.
+    """
+    progress("maps of single robots against the rest of their team")
+    fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
+    for table in ("bias_sigma", "common_bias_sigma"):
+        fields_of_table = msgspec.to_builtins(getattr(scenario.central, table))
+        fields[table] = fields_of_table | msgspec.to_builtins(fields[table])
+    central = msgspec.convert(fields, CentralConfig)
+    factor = covariance_factor(folds, central)
+    if factor is None:
+        return tuple(strays)
+    found = (*strays, factor)
+    central = msgspec.structs.replace(central, covariance_factor=factor.value)
+    further = [normal_scale(folds, central)]
+    if true_landmarks:
+        further.append(landmark_sigma(list(zip(folds, true_landmarks, strict=True)), central))
+    return (*found, *(figure for figure in further if figure is not None))
 
 
 def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:

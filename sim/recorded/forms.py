@@ -1,6 +1,7 @@
 """Odometry and scans of a log in the forms in which they were measured; a stream may mix forms."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -86,11 +87,12 @@ def landmarks_of(
     found = _scans(unnamed, [s._replace(ids=i) for s, i in zip(scans, own, strict=True)])
     signatures = [floats(each.signatures, "signatures") for each in unnamed]
     whole = all(each.signatures for each in unnamed)
-    hidden = Detections(
-        found.stamps_ns, found.offsets, found.ids, found.ranges, found.bearings, None,
-        found.covariances, np.ones(len(unnamed), np.bool_),
-        np.concatenate(signatures) if whole else None,
-    )  # fmt: skip
+    hidden = replace(
+        found,
+        points=None,
+        hidden=np.ones(len(unnamed), np.bool_),
+        signatures=np.concatenate(signatures) if whole else None,
+    )
     return together(seen, hidden)
 
 

@@ -1,5 +1,6 @@
 """A stream that mixes forms of measurements: from a log to tables and back, message for message."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def seeing(at_s: float, kind: type[m.Measurement], **fields: Any) -> m.Measureme
     return kind(stamp_ns=round(at_s * SECOND), robot="r1", incarnation=1, number=0, **fields)
 
 
-def stream(*measurements: m.Measurement) -> list[m.Message]:
+def stream(measurements: Sequence[m.Measurement]) -> list[m.Message]:
     """Numbered by time, the initial pose first."""
     begin = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
     kinds = m.AnyOdometry
@@ -49,22 +50,26 @@ def stream(*measurements: m.Measurement) -> list[m.Message]:
 
 STEP = from_floats(np.array([THIRD, 0.01, -0.02]))
 MIXED = stream(
-    moving(1, forward=THIRD, yaw_rate=0.1),
-    moving(2, increment=STEP, covariance=CLAIM),  # as a driver bridges a gap
-    moving(3, increment=STEP),
-    moving(4, forward=0.0, yaw_rate=-0.0),
-    seeing(0.5, m.Observations, **SEEN),
-    seeing(1.5, m.Observations, **SEEN, covariances=OWN),
-    seeing(2.0, m.Points, **AHEAD),
-    seeing(2.5, m.Points, **AHEAD, covariances=OWN),
-    seeing(3.5, m.Points, ids=b"", positions=b""),
+    [
+        moving(1, forward=THIRD, yaw_rate=0.1),
+        moving(2, increment=STEP, covariance=CLAIM),  # as a driver bridges a gap
+        moving(3, increment=STEP),
+        moving(4, forward=0.0, yaw_rate=-0.0),
+        seeing(0.5, m.Observations, **SEEN),
+        seeing(1.5, m.Observations, **SEEN, covariances=OWN),
+        seeing(2.0, m.Points, **AHEAD),
+        seeing(2.5, m.Points, **AHEAD, covariances=OWN),
+        seeing(3.5, m.Points, ids=b"", positions=b""),
+    ]
 )
 HIDDEN = stream(
-    moving(1, forward=THIRD, yaw_rate=0.1),
-    moving(2, forward=1.0, yaw_rate=0.1),
-    seeing(0.5, m.Points, **AHEAD, covariances=OWN),
-    seeing(1.0, m.Detections, **UNNAMED),
-    seeing(1.5, m.Detections, **UNNAMED, covariances=OWN),
+    [
+        moving(1, forward=THIRD, yaw_rate=0.1),
+        moving(2, forward=1.0, yaw_rate=0.1),
+        seeing(0.5, m.Points, **AHEAD, covariances=OWN),
+        seeing(1.0, m.Detections, **UNNAMED),
+        seeing(1.5, m.Detections, **UNNAMED, covariances=OWN),
+    ]
 )
 
 
