@@ -75,10 +75,39 @@ def _rows(
         ranges=seen.ranges[chosen],
         bearings=seen.bearings[chosen],
         points=None if seen.points is None or hidden else seen.points[chosen],
-        covariances=None if seen.covariances is None else seen.covariances[chosen],
+        covariances=_covariances(seen, chosen, hidden=hidden),
         hidden=np.full(count, hidden) if was is None else was | hidden,
         signatures=None if seen.signatures is None else seen.signatures[chosen],
     )
+
+
+def _covariances(
+    seen: Detections, chosen: Bool[np.ndarray, " R"], *, hidden: bool
+) -> Float[np.ndarray, "chosen 3"] | None:
+    """The chosen rows' own covariances; hidden ones are sent as ranges and bearings, so that those
+    of points become theirs.
+    """
+    if seen.covariances is None:
+        return None
+    covariances: Float[np.ndarray, "chosen 3"] = seen.covariances[chosen]
+    if hidden and seen.points is not None:
+        points = seen.points[chosen]
+        rows = ~np.isnan(points[:, 0])
+        covariances[rows] = _of_ranges(points[rows], covariances[rows])
+    return covariances
+
+
+def _of_ranges(
+    points: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """(rr, rb, bb) of points with (xx, xy, yy): J S Jᵀ with J = ∂(range, bearing)/∂(x, y)."""
+    ranges = np.hypot(points[:, 0], points[:, 1])
+    c, s = (points / ranges[:, np.newaxis]).T
+    xx, xy, yy = covariances.T
+    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
+    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / ranges
+    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / ranges**2
+    return np.column_stack((rr, rb, bb))
 
 
 def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> Detections:
