@@ -13,7 +13,7 @@ LARGEST_PAYLOAD = 64 * 2**20
 """Largest payload in bytes: that of a joint covariance of 4096 rows."""
 _LARGEST_ARRAY = 100_000
 _LARGEST_MAP = 1_000
-_LARGEST_TEXT = 100_000
+_LARGEST_TEXT = 1_000_000
 
 
 class WireError(ValueError):

@@ -13,6 +13,7 @@ Every message has `stamp_ns`, its team time: the time of the measurement that it
 from team.wire.messages.base import Bias as Bias
 from team.wire.messages.base import Count as Count
 from team.wire.messages.base import Digest as Digest
+from team.wire.messages.base import Document as Document
 from team.wire.messages.base import Message as Message
 from team.wire.messages.base import Name as Name
 from team.wire.messages.base import Real as Real

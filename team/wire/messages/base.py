@@ -16,6 +16,8 @@ from team.wire.arrays import (
 
 Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 Text = Annotated[str, Meta(max_length=20_000)]
+Document = Annotated[str, Meta(max_length=1_000_000)]
+"""A configuration: the world's has 1,500 characters for each robot."""
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 StampNs = Annotated[int, Meta(ge=-(2**62), lt=2**62)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]

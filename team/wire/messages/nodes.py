@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from team.wire.messages.base import Count, Digest, Message, Name, Real, StampNs, Text
+from team.wire.messages.base import Count, Digest, Document, Message, Name, Real, StampNs, Text
 
 
 class Configuration(Message, frozen=True, kw_only=True, tag="configured/1"):
@@ -13,7 +13,7 @@ class Configuration(Message, frozen=True, kw_only=True, tag="configured/1"):
     node: Text
     incarnation: Count
     digest: Digest
-    configuration: Text
+    configuration: Document
 
 
 class Progress(Message, frozen=True, kw_only=True, tag="progress/1"):

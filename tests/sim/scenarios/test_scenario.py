@@ -21,6 +21,8 @@ from team import former_names
 from team.association import AssociationProfile
 from team.pairs import PAIRS
 from team.wire import messages as m
+from team.wire.codec import decoded, encoded
+from team.wire.digest import configured
 
 SMALL = """
 [world]
@@ -354,3 +356,10 @@ def test_a_logs_configurations_with_former_names_are_read_with_todays() -> None:
     )
     recorded = Recorded(configured={announced.node: announced})
     assert recorded.robot_config("r1") == (today, announced.digest)
+
+
+def test_the_scenario_of_a_team_of_a_hundred_robots_is_understood_on_the_wire() -> None:
+    scenario = with_options(load("dlr"), robots=100)
+    announced = configured("world", 0, 0, scenario)
+    heard = decoded(encoded(announced), m.Configuration)
+    assert loads(heard.configuration) == scenario
