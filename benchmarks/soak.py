@@ -6,7 +6,8 @@
 Launches the team as real processes on a simulated world that is long enough for the given wall
 time at the given multiple of real time, and looks at each process every few seconds. The table has
 what each grew by between a quarter of the run and its end, per hour of wall time; the centre's
-growth under `join` is known (it keeps every submap). The run is ended when the time is over.
+growth under `join` is known (it keeps every submap). The run is ended when the time is over, and
+how far the team came is printed: a machine that is too slow does not keep the pace.
 Exit status 1 if a process died, or if one other than the centre has more descriptors or threads at
 the end than at a quarter of the run.
 """
@@ -14,6 +15,7 @@ the end than at a quarter of the run.
 import argparse
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -128,9 +130,12 @@ def main() -> int:
                 sys.stderr.write("launch had not ended 60 s after SIGTERM: killed\n")
                 launch.kill()
                 launch.wait()
+        said = (Path(place) / "output").read_text("utf-8", "replace")
         if died:
-            sys.stderr.write((Path(place) / "output").read_text("utf-8", "replace")[-2000:])
+            sys.stderr.write(said[-2000:])
+        reached = re.findall(r"team time (\d+) s", said) or ["0"]
         log = sum(each.stat().st_size for each in run.glob("*.mcap")) / 1e6
+    print(f"team time {reached[-1]} s: {float(reached[-1]) / seconds:.0f} times real time")
     return report(found, seconds, died, log, told)
 
 

@@ -5,19 +5,20 @@ It is a reference for the team's map joining and shares no code with it. The sam
     Σ ‖L_k⁻¹ (R(θ_s)ᵀ(p − p_s) …, θ_e − θ_s …; minus the submap's mean)‖², L_k L_kᵀ = f P_k
     + Σ ‖L⁻¹ (range, bearing of a teammate; minus the measurement)‖² + Σ ‖prior‖²
 
-are implemented with complex numbers and a dense Jacobian, and solved by MINPACK's
-Levenberg-Marquardt (Moré 1978), where the map joining has kernels, a sparse factorisation and
+are implemented with complex numbers and solved by Levenberg-Marquardt steps (damping as in
+Nielsen 1999) through SuperLU, where the map joining has kernels, a factorisation of its own and
 Gauss-Newton steps. The graph provides the measurements, and the indices in the state of each pose
 and landmark.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
+from scipy import sparse
 from scipy.linalg import solve_triangular
-from scipy.optimize import least_squares
+from scipy.sparse.linalg import splu
 
 from team.estimation.map_joining.submap_graph import Graph
 
@@ -25,10 +26,16 @@ Values = Float[np.ndarray, " _"]
 Rows = Float[np.ndarray, "r _"]
 Indices = Int64[np.ndarray, " _"]
 
-TOLERANCE = 1e-12
-"""Relative tolerance of cost and step: a solution is much nearer to a minimum than 1 in χ²."""
-SOLUTIONS = 6
-"""Most restarts along a long curved valley, each from the last solution."""
+AT_REST = 1e-9
+"""A state is at rest where an undamped step is expected to lower χ² by less than this."""
+SMALL = 1e-5
+"""A damped step has to be expected to lower χ² by less than this before that is looked at."""
+STEPS = 2000
+"""Most steps of a solution: a long curved valley takes many."""
+UNDAMPED = 1e-12
+"""The least damping: coordinates that nothing determines stay where they are."""
+DAMPING = 1e-3
+"""First damping, relative to the diagonal of the normal equations."""
 
 
 class Solution(NamedTuple):
@@ -64,52 +71,53 @@ class PlainCost:
         """The whitened residuals, term by term; the sum of their squares is the cost."""
         return np.concatenate([W @ r for W, r, _, _ in self._terms(state)])
 
-    def jacobian(self, state: Values) -> Rows:
+    def jacobian(self, state: Values) -> sparse.csr_array:
         """The Jacobian of the whitened residuals with respect to the free coordinates."""
-        blocks = []
-        for W, _, at, J in self._terms(state):
-            block = np.zeros((len(W), len(state)))
-            block[:, at] = W @ J
-            blocks.append(block[:, self.free])
-        return np.concatenate(blocks)
+        return self._rows((at, W @ J) for W, _, at, J in self._terms(state))
 
     def solved(self, state: Values) -> Solution:
-        """The minimum that the solver reaches from a state."""
-        found = Solution(state, self.of(state), at_rest=False)
-        for _ in range(SOLUTIONS):
-            if found.at_rest:
-                break
-            found = self._once(found.state)
-        return found
+        """The minimum that the steps reach from a state.
 
-    def _once(self, state: Values) -> Solution:
-        def at(x: Values) -> Values:
-            whole = state.copy()
-            whole[self.free] = x
-            return whole
+        Each is δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, and is taken where it lowers the cost.
+        """
+        state, cost, damping, growth = state.copy(), self.of(state), DAMPING, 2.0
+        N, gradient = self._normal(state)
+        for _ in range(STEPS):
+            step, foreseen = _step(N, damping, gradient)
+            if foreseen < SMALL and _step(N, UNDAMPED, gradient)[1] < AT_REST:
+                return Solution(state, cost, at_rest=True)
+            tried = state.copy()
+            tried[self.free] -= step
+            gained = cost - self.of(tried)
+            if gained > 0.0:
+                state, cost = tried, cost - gained
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gained / foreseen - 1.0) ** 3)
+                damping, growth = max(damping, UNDAMPED), 2.0
+                N, gradient = self._normal(state)
+            else:
+                damping, growth = damping * growth, 2.0 * growth
+                if damping > 1.0 / UNDAMPED:
+                    break
+        return Solution(state, cost, at_rest=False)
 
-        # MINPACK wants as many residuals as unknowns, also where a map is just determined.
-        lacking = max(0, len(self.free) - len(self.residuals(state)))
+    def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
+        """JᵀJ and Jᵀ r."""
+        terms = [(W @ r, at, W @ J) for W, r, at, J in self._terms(state)]
+        J = self._rows((at, WJ) for _, at, WJ in terms)
+        return (J.T @ J).tocsc(), J.T @ np.concatenate([Wr for Wr, *_ in terms])
 
-        def residuals(x: Values) -> Values:
-            return np.concatenate([self.residuals(at(x)), np.zeros(lacking)])
-
-        def jacobian(x: Values) -> Rows:
-            return np.concatenate([self.jacobian(at(x)), np.zeros((lacking, len(x)))])
-
-        result = least_squares(
-            residuals,
-            state[self.free],
-            jacobian,
-            method="lm",
-            x_scale="jac",
-            ftol=TOLERANCE,
-            xtol=TOLERANCE,
-            gtol=TOLERANCE,
-            max_nfev=300,
-        )
-        end = at(result.x)
-        return Solution(end, self.of(end), at_rest=result.status > 0)
+    def _rows(self, terms: Iterable[tuple[Indices, Rows]]) -> sparse.csr_array:
+        """The blocks of rows as one matrix, with the columns of the free coordinates."""
+        entries, rows, columns, begin = [], [], [], 0
+        for at, J in terms:
+            entries.append(J.ravel())
+            rows.append(np.repeat(begin + np.arange(len(J)), len(at)))
+            columns.append(np.tile(at, len(J)))
+            begin += len(J)
+        where = (np.concatenate(rows), np.concatenate(columns))
+        shape = (begin, int(self._graph.offset[-1]))
+        whole = sparse.csc_array((np.concatenate(entries), where), shape=shape)
+        return whole[:, self.free].tocsr()
 
     def _terms(self, state: Values) -> Iterator[tuple[Rows, Values, Indices, Rows]]:
         """For each term its whitening matrix, its residual, the indices of its coordinates and its
@@ -172,6 +180,13 @@ def _sighting(state: Values, observer: int, teammate: int) -> tuple[Values, Indi
     J = np.zeros((2, 6))
     J[:, :2], J[1, 2], J[:, 3:5] = -to, -1.0, to
     return h, np.concatenate([observer + np.arange(3), teammate + np.arange(3)]), J
+
+
+def _step(N: sparse.csc_array, damping: float, gradient: Values) -> tuple[Values, float]:
+    """δ = (N + μ diag N)⁻¹ g, and by how much −δ lowers a cost that is quadratic."""
+    D = damping * N.diagonal()
+    step = np.asarray(splu((N + sparse.diags_array(D)).tocsc()).solve(gradient))
+    return step, float(step @ (gradient + D * step))
 
 
 def _whitening(covariance: Rows) -> Rows:
