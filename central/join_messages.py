@@ -19,7 +19,7 @@ from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
 from team.estimation.contribution import Stream
-from team.estimation.map_joining import marginals
+from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.associating import IslandView
 from team.estimation.map_joining.association.landmarks import Decision
 from team.estimation.map_joining.distinctness import maybe_the_same
@@ -155,8 +155,8 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
     """Landmarks left out of the map, in words."""
     if not fold.contributions:
         return ()
-    known = fold.main.graph.landmarks.keys()
-    out = sorted(known - {*shown.ids, *shown.undecided})
+    known = landmark_view.known(fold.main)
+    out = sorted({*known} - {*shown.ids, *shown.undecided})
     needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
     pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
     return tuple(

@@ -13,7 +13,7 @@ from central.checkpoints import Checkpoint, thinned
 from central.config import CentralConfig
 from central.tick_fold import TickFold
 from team import translate
-from team.estimation.map_joining import marginals
+from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import EMPTY_FOLD
 from team.estimation.map_joining.relinearising import is_due
@@ -27,9 +27,10 @@ SUBMAPS = Submaps([stream(name, 40, y=y) for name, y in (("r1", 0.0), ("r2", 1.0
 
 @pytest.fixture(autouse=True, scope="module")
 def _small():
-    """Two submaps of each stream stay raw, and it begins with five; at 9 and at 13 it is again."""
+    """Two submaps of each stream stay raw, and it begins with five; at 9 and at 13 it is again.
+    Landmarks rest from the first one on."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tick_fold, "condensed", partial(condensed, lag=2, begin=5))
+        patch.setattr(tick_fold, "condensed", partial(condensed, lag=2, begin=5, first=1))
         patch.setattr(tick_fold, "is_due", partial(is_due, begin=6))
         yield
 
@@ -48,7 +49,11 @@ def add(ticks, submap):
 def bits(fold):
     old = fold.main.graph.condensed
     parts = [fold.main.state.tobytes(), *(str(c.key).encode() for c in fold.contributions)]
-    return b"".join(parts) + (b"" if old is None else old.information.tobytes())
+    if old is None:
+        return b"".join(parts)
+    rest = old.resting
+    more = () if rest is None else (rest.ids, rest.means, rest.gain, rest.covariance)
+    return b"".join([*parts, *(each.tobytes() for each in (old.information, *more))])
 
 
 def straight(bounded=True):
@@ -63,6 +68,7 @@ def straight(bounded=True):
 def expected():
     fold = straight().fold
     assert fold.departed > 0.5 * len(SUBMAPS.every())
+    assert len(landmark_view.resting_of(fold.main).ids) > 1
     return bits(fold)
 
 

@@ -69,12 +69,36 @@ NOBODY = Departed({}, (), {}, {})
 
 
 @dataclass(frozen=True, eq=False)
+class Resting:
+    """Landmarks that no raw submap contains, given the nodes of the condensed factor.
+
+    x ~ N(means + gain d, covariance), d as in `Condensed`: what eliminating them leaves besides the
+    quadratic over the other nodes. They are no nodes of the graph until a submap observes them.
+
+    ids: in the order in which they came to rest; two numbers each in the other arrays.
+    covariance: its upper triangle; what is below the diagonal is not read.
+    """
+
+    ids: Indices
+    means: Values
+    gain: Float[np.ndarray, "r n"]
+    covariance: Float[np.ndarray, "r r"]
+
+
+def nobody_rests(numbers: int) -> Resting:
+    """No landmark at rest, beside a condensed factor of so many numbers."""
+    none = np.zeros(0)
+    return Resting(none.astype(np.int64), none, np.zeros((0, numbers)), np.zeros((0, 0)))
+
+
+@dataclass(frozen=True, eq=False)
 class Condensed:
     """The quadratic cost of the module's equation over `nodes`, ascending, none of them fixed.
 
     headings: which of its numbers are headings.
     submaps: the number of submaps that it replaces.
     redundancy: the number of measured quantities less the number of eliminated unknowns.
+    resting: landmarks given these nodes; None: there have never been any.
     """
 
     nodes: Indices
@@ -86,6 +110,7 @@ class Condensed:
     submaps: int
     redundancy: int
     departed: Departed = field(default=NOBODY)
+    resting: Resting | None = None
 
     def moved(self, state: Values, offset: Indices) -> Values:
         """Difference d = state − at, headings wrapped: the distance from the linearisation

@@ -13,7 +13,7 @@ still be transformed.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -35,6 +35,7 @@ from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
 from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
+from team.estimation.map_joining.resting import FIRST, beside, idle, split
 from team.estimation.map_joining.submap_graph import Graph, without_nodes
 
 Indices = Int64[np.ndarray, " _"]
@@ -50,7 +51,7 @@ HISTORY = 50
 """Number of condensed submaps of each stream whose costs are stored."""
 
 
-def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN) -> Fold:
+def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST) -> Fold:
     """Condenses the old submaps of the fold's main island; returns the same fold where there are
     none.
 
@@ -64,8 +65,10 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN) -> Fold:
     leaving = _leaving(island, lag)
     if not leaving.any():
         return fold
+    others = (each for at, each in fold.islands.items() if at != key)
+    elsewhere = {id_ for each in others for id_ in each.graph.landmarks}
     try:
-        smaller = _condensed(island, leaving)
+        smaller = _condensed(island, leaving, elsewhere, first)
     except UNSOLVABLE:
         return fold
     gone = smaller.graph.gone
@@ -98,9 +101,13 @@ def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
     return leaving
 
 
-def _condensed(island: Island, leaving: Bool[np.ndarray, " F"]) -> Island:
+def _condensed(
+    island: Island, leaving: Bool[np.ndarray, " F"], elsewhere: Collection[int], first: int
+) -> Island:
     graph, before = island.graph, island.graph.condensed
+    rests = idle(graph, ~leaving, elsewhere, first)
     eliminated = _eliminated(graph, leaving)
+    eliminated[rests] = True
     seen = np.array(
         [eliminated[each.observer] or eliminated[each.teammate] for each in graph.sightings],
         np.bool_,
@@ -114,7 +121,7 @@ def _condensed(island: Island, leaving: Bool[np.ndarray, " F"]) -> Island:
     union = union[~graph.fixed[union]]
     H, g, cost = _quadratic(island, union, leaving, seen, prior)
     out = np.repeat(eliminated[union], np.diff(graph.offset)[union])
-    gain, slope, information = _schur(H, g, out)
+    parts = split(H, g, out)
     left, node_of = without_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
     remaining = union[~eliminated[union]]
     numbers = places(graph.offset, remaining)
@@ -124,12 +131,13 @@ def _condensed(island: Island, leaving: Bool[np.ndarray, " F"]) -> Island:
         nodes=node_of[remaining],
         at=island.state[numbers],
         headings=np.isin(numbers, graph.headings),
-        information=information,
-        slope=slope,
-        cost=cost - gain,
+        information=parts.information,
+        slope=parts.slope,
+        cost=cost - parts.lowered,
         submaps=int(leaving.sum()) + (0 if before is None else before.submaps),
         redundancy=measured - int(out.sum()) + (0 if before is None else before.redundancy),
         departed=_departed(island, leaving, seen, prior),
+        resting=beside(island, union, parts, rests),
     )
     stays = np.repeat(~eliminated, np.diff(graph.offset))
     return Island(
@@ -206,23 +214,6 @@ def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) 
                 H[row : row + 3, column : column + 3] += dense.product(
                     dense.product(left.T, weighted), right
                 )
-
-
-def _schur(
-    H: Matrix, g: Values, out: Bool[np.ndarray, " n"]
-) -> tuple[float, Values, Float[np.ndarray, "m m"]]:
-    """Eliminates some numbers from a quadratic: returns gᵀA⁻¹g over them, and the remaining slope
-    and matrix.
-    """
-    if not out.any():
-        return 0.0, g, H
-    remaining = ~out
-    cross = H[np.ix_(out, remaining)]
-    right = np.column_stack([cross, g[out]])
-    solved = dense.solve_factored(dense.cholesky(H[np.ix_(out, out)]), right)
-    information = H[np.ix_(remaining, remaining)] - dense.product(cross.T, solved[:, :-1])
-    slope: Values = g[remaining] - dense.product(cross.T, solved[:, -1])
-    return float(dense.product(g[out], solved[:, -1])), slope, 0.5 * (information + information.T)
 
 
 def _departed(

@@ -21,13 +21,14 @@ from jaxtyping import Bool, Float, Int64
 
 from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
-from team.estimation import elementary, elementwise
+from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import least_squares
 from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
 from team.estimation.map_joining.priors_kernel import prior_terms
+from team.estimation.map_joining.resting_kernel import own_blocks, symmetric_of
 from team.estimation.map_joining.submap_graph import CommonBias, Graph
 from team.estimation.sparse_cholesky import sparse
 
@@ -317,10 +318,13 @@ class Island(least_squares.Iterate):
             pattern.value_start,
         )
         if graph.condensed is not None:
-            first = graph.sighting_factors.first_pair + 4 * len(graph.sightings)
-            entry = graph.entry[first:]
             graph.condensed.add(
-                values, gradient, self.state, graph.offset, entry, pattern.value_start
+                values,
+                gradient,
+                self.state,
+                graph.offset,
+                graph.condensed_entry,
+                pattern.value_start,
             )
         for k, prior in enumerate(graph.priors):
             slope = self.prior_slope(k)
@@ -358,6 +362,38 @@ class Island(least_squares.Iterate):
     def selected_covariance(self) -> Values:
         """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
         return sparse.selected_inverse(self.posterior)
+
+    @cached_property
+    def resting_points(self) -> Float[np.ndarray, "L 2"]:
+        """The positions [m] of the landmarks at rest; for islands that have some."""
+        old = self.graph.condensed
+        assert old is not None
+        assert old.resting is not None
+        moved = old.moved(self.state, self.graph.offset)
+        points: Values = old.resting.means + dense.product(old.resting.gain, moved)
+        return points.reshape(-1, 2)
+
+    @cached_property
+    def boundary_covariance(self) -> Float[np.ndarray, "n n"]:
+        """The joint covariance of the condensed factor's nodes, if there is such a factor."""
+        graph, old = self.graph, self.graph.condensed
+        assert old is not None
+        return symmetric_of(
+            self.selected_covariance,
+            np.diff(graph.offset)[old.nodes],
+            graph.condensed_entry,
+            graph.pattern.value_start,
+            len(old.at),
+        )
+
+    @cached_property
+    def resting_blocks(self) -> Float[np.ndarray, "L 2 2"]:
+        """The covariance [m²] of each landmark at rest; for islands that have some."""
+        old = self.graph.condensed
+        assert old is not None
+        assert old.resting is not None
+        root = dense.cholesky(self.boundary_covariance)
+        return own_blocks(old.resting.covariance, old.resting.gain, root)
 
 
 def aged(island: Island, iterations: int | None) -> Island:

@@ -41,6 +41,7 @@ from team.estimation.map_joining.minima import (
     warnings,
     widened,
 )
+from team.estimation.map_joining.resting import woken
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 
 __all__ = [
@@ -247,7 +248,10 @@ def folded(
         arrived.setdefault(home[stream], []).append(contribution)
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
     landmarks, numbers = founded(fold.landmarks, contributions)
-    islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
+    seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
+    islands = {
+        key: woken(replace(island, settings=settings), seen) for key, island in fold.islands.items()
+    }
     for key, taken in arrived.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
         graph, state = extended(

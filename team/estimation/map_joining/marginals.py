@@ -18,6 +18,7 @@ from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrectio
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from team.estimation.map_joining.inter_robot_kernel import explained_by_sightings
 from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.landmark_view import blocks_of, joint, known, points_of
 
 BELIEVED = 0.5
 """A submap is believed as to a landmark whose weight in it is at least this."""
@@ -115,26 +116,27 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
-        return sorted(island.graph.landmarks)
+        return known(island)
     nodes = np.concatenate([each.landmarks for each in island.graph.submaps])
     found, counts = np.unique(nodes[island.landmark_weight >= BELIEVED], return_counts=True)
     count_of = dict(zip(found.tolist(), counts.tolist(), strict=True))
     old = island.graph.condensed
     before = {} if old is None else old.departed.believed
-    return sorted(
+    node_of = island.graph.landmarks
+    return [
         id_
-        for id_, node in island.graph.landmarks.items()
-        if count_of.get(node, 0) + before.get(id_, 0)
+        for id_ in known(island)
+        if count_of.get(node_of.get(id_, -1), 0) + before.get(id_, 0)
         >= (max(submaps, unnamed) if id_ >= UNNAMED else submaps)
-    )
+    ]
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
     """The main island's landmarks (all, or those with the given ids) with their joint
     covariance, `landmark_sigma` included.
     """
-    chosen = sorted(fold.main.graph.landmarks if ids is None else ids)
-    mean, covariance = joint_marginal(fold.main, _nodes(fold.main, chosen))
+    chosen = known(fold.main) if ids is None else sorted(ids)
+    mean, covariance = joint(fold.main, [], chosen)
     covariance = covariance + fold.main.settings.landmark_sigma**2 * np.eye(len(covariance))
     return LandmarkMap(np.array(chosen, dtype=np.uint32), mean.reshape(-1, 2), covariance)
 
@@ -147,13 +149,9 @@ def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlo
     """
     island = fold.main
     own = island.settings.landmark_sigma**2 * np.eye(2)
-    chosen = sorted(island.graph.landmarks if ids is None else ids)
-    means = np.zeros((len(chosen), 2))
-    covariances = np.zeros((len(chosen), 2, 2))
-    for k, node in enumerate(_nodes(island, chosen)):
-        means[k], covariance = _own_marginal(island, node)
-        covariances[k] = covariance + own
-    return LandmarkBlocks(np.array(chosen, dtype=np.uint32), means, covariances)
+    chosen = known(island) if ids is None else sorted(ids)
+    covariances = blocks_of(island, chosen) + own
+    return LandmarkBlocks(np.array(chosen, dtype=np.uint32), points_of(island, chosen), covariances)
 
 
 def prior_for(
@@ -163,7 +161,7 @@ def prior_for(
     jointly.
     """
     stream, island = (robot, incarnation), fold.island(robot, incarnation)
-    chosen = sorted(island.graph.landmarks if ids is None else ids)
+    chosen = known(island) if ids is None else sorted(ids)
     return _priors_in(island, {stream: chosen})[stream]
 
 
@@ -187,10 +185,10 @@ def main_priors(
         less accurate, and as consistent.
     """
     island = fold.main
-    ids = np.array(sorted(island.graph.landmarks) if chosen is None else chosen)
+    ids = np.array(known(island) if chosen is None else chosen)
     if most is None or len(ids) <= most:
         return _priors_in(island, dict.fromkeys(streams, ids.tolist()))
-    places = np.array([_mean(island, node) for node in _nodes(island, ids.tolist())])
+    places = points_of(island, ids.tolist())
     nearest = {}
     for stream in streams:
         offsets = places - _mean(island, island.graph.streams[stream][-1])[:2]
@@ -205,7 +203,7 @@ def _priors_in(
     """A prior of each stream with the given landmarks, ascending; one solve for all of them."""
     chosen = sorted({id_ for ids in landmarks_of.values() for id_ in ids})
     poses = [island.graph.streams[stream][-1] for stream in landmarks_of]
-    mean, covariance = joint_marginal(island, [*poses, *_nodes(island, chosen)])
+    mean, covariance = joint(island, poses, chosen)
     place = {id_: 3 * len(poses) + 2 * k for k, id_ in enumerate(chosen)}
     biases = _biases_in(island)
     priors = {}
@@ -303,10 +301,6 @@ def joint_cost(fold: Fold) -> Agreement:
     total = sum(robots[robot][1] for robot in sorted(robots))
     submaps = (*departed.submaps, *found.submaps)
     return Agreement(chi2, total, {robot: robots[robot] for robot in sorted(robots)}, submaps)
-
-
-def _nodes(island: Island, ids: Sequence[int]) -> list[int]:
-    return [island.graph.landmarks[id_] for id_ in ids]
 
 
 def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:

@@ -25,6 +25,7 @@ from team.estimation.map_joining.gauss_newton import (
     iterated,
 )
 from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.landmark_view import known, points_of
 from team.estimation.map_joining.merging import ages, sighted
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 
@@ -114,15 +115,17 @@ def _raw(
     for stream, nodes in graph.streams.items():
         left = paths.get(stream, EliminatedPath(np.zeros((0, 3)), bool(graph.fixed[nodes[0]])))
         fixed[full.streams[stream][0]] = left.is_fixed
-        known = [*left.poses, *(value(node) for node in nodes)]
-        for node, pose in zip(full.streams[stream], known, strict=True):
+        path = [*left.poses, *(value(node) for node in nodes)]
+        for node, pose in zip(full.streams[stream], path, strict=True):
             put(node, pose)
     for contribution, members, *_ in full.submaps:
         start = state[full.offset[members[0]] : full.offset[members[0]] + 3]
         for at, local in zip(members[2:].tolist(), contribution.local.nodes, strict=False):
             put(at, compose(start, local))
-    pairs = [(full.landmarks[id_], node) for id_, node in graph.landmarks.items()]
-    pairs += [(full.biases[of], node) for of, node in graph.biases.items()]
+    ids = known(island)
+    for id_, point in zip(ids, points_of(island, ids), strict=True):
+        put(full.landmarks[id_], point)
+    pairs = [(full.biases[of], node) for of, node in graph.biases.items()]
     pairs += [(full.common[bias], node) for bias, node in graph.common.items()]
     for node, own in pairs:
         put(node, value(own))

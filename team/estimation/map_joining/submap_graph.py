@@ -214,6 +214,11 @@ class Graph:
         """Entry of the pattern for each pair of members of each factor (see `block_pattern`)."""
         return self._pattern_and_entry[1]
 
+    @property
+    def condensed_entry(self) -> Indices:
+        """The part of `entry` for the pairs of the condensed factor's nodes."""
+        return self.entry[self.sighting_factors.first_pair + 4 * len(self.sightings) :]
+
     @cached_property
     def analysis(self) -> Analysis:
         """Order of elimination and places in the Cholesky factor."""
@@ -422,8 +427,8 @@ def without_nodes(
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
 ) -> tuple[Graph, Indices]:
-    """The graph without the eliminated poses, with the factors that stay, and each node's new
-    number.
+    """The graph without the eliminated poses and landmarks, with the factors that stay, and each
+    node's new number.
 
     The eliminated poses of a stream are its first ones. Condensed factors are left out.
     """
@@ -435,7 +440,7 @@ def without_nodes(
         gone[stream] = gone.get(stream, 0) + first
     left = Graph(
         streams=streams,
-        landmarks={id_: int(node_of[node]) for id_, node in graph.landmarks.items()},
+        landmarks={id_: int(node_of[n]) for id_, n in graph.landmarks.items() if not eliminated[n]},
         poses={at: int(node_of[n]) for at, n in graph.poses.items() if not eliminated[n]},
         biases={at: int(node_of[node]) for at, node in graph.biases.items()},
         offset=_starts(np.diff(graph.offset)[~eliminated].tolist()),
@@ -459,6 +464,19 @@ def without_nodes(
         gone=gone,
     )
     return left, node_of
+
+
+def with_landmarks(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
+    """The graph with landmarks that no factor contains yet, and their nodes."""
+    first = len(graph.fixed)
+    nodes = range(first, first + len(ids))
+    grown = replace(
+        graph,
+        landmarks={**graph.landmarks, **dict(zip(ids, nodes, strict=True))},
+        offset=_continued(graph.offset, [2] * len(ids)),
+        fixed=np.concatenate([graph.fixed, np.zeros(len(ids), np.bool_)]),
+    )
+    return grown, np.arange(first, first + len(ids))
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:

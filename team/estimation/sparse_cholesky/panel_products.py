@@ -13,7 +13,7 @@ from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import matrix_product
 
 Values = Float[np.ndarray, " _"]
-ROWS = 512
+ROWS = 256
 WIDTH = 16
 """Number of rows, and of columns, from which a panel is big."""
 BLOCK = 48

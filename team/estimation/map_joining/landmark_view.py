@@ -1,0 +1,126 @@
+"""Landmarks of an island as they are asked for: by their ids, nodes and those at rest alike.
+
+Of a landmark at rest, x = means + gain d + e with e ~ N(0, C): its mean follows from the state of
+the condensed factor's nodes, its covariances from theirs, Cov(x, z) = gain Cov(d, z) and
+Cov(x, x') = C + gain Cov(d, d) gainᵀ.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation import dense
+from team.estimation.map_joining.condensed_factor import Resting, nobody_rests, places
+from team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from team.estimation.map_joining.resting_kernel import between
+from team.estimation.sparse_cholesky import sparse
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
+
+
+def known(island: Island) -> list[int]:
+    """The ids of all landmarks, ascending."""
+    return sorted([*island.graph.landmarks, *resting_of(island).ids.tolist()])
+
+
+def resting_of(island: Island) -> Resting:
+    """The landmarks at rest; none where nothing is condensed."""
+    old = island.graph.condensed
+    if old is None:
+        return nobody_rests(0)
+    return nobody_rests(len(old.at)) if old.resting is None else old.resting
+
+
+def points_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2"]:
+    """The positions [m] of these landmarks."""
+    points = np.empty((len(ids), 2))
+    awake, nodes, at = _sorted_out(island, ids)
+    points[awake] = island.state[places(island.graph.offset, nodes)].reshape(-1, 2)
+    if len(at):
+        points[~awake] = island.resting_points[at]
+    return points
+
+
+def blocks_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2 2"]:
+    """The covariance [m²] of each of these landmarks by itself."""
+    blocks = np.empty((len(ids), 2, 2))
+    awake, nodes, at = _sorted_out(island, ids)
+    pattern = island.graph.pattern
+    begin = pattern.value_start[pattern.column_start[nodes]]
+    own = island.selected_covariance[begin[:, None] + np.arange(4)].reshape(-1, 2, 2)
+    own[island.graph.fixed[nodes]] = 0.0
+    blocks[awake] = own
+    if len(at):
+        blocks[~awake] = island.resting_blocks[at]
+    return blocks
+
+
+def joint(
+    island: Island, nodes: Sequence[int], ids: Sequence[int]
+) -> tuple[Values, Float[np.ndarray, "n n"]]:
+    """Mean and joint covariance of some nodes and of these landmarks, in this order."""
+    awake, own, at = _sorted_out(island, ids)
+    if not len(at):
+        return joint_marginal(island, [*nodes, *own.tolist()])
+    graph, rest = island.graph, resting_of(island)
+    first = np.concatenate([np.array(nodes, np.int64), own])
+    covariance, with_boundary = _beside_boundary(island, first)
+    resting = places(2 * np.arange(len(rest.ids) + 1), at)
+    gain = rest.gain[resting]
+    cross = dense.product(gain, with_boundary.T)
+    among = dense.product(dense.product(gain, island.boundary_covariance), gain.T)
+    among = 0.5 * (among + among.T) + between(rest.covariance, resting, resting)
+    whole = np.block([[covariance, cross.T], [cross, among]])
+    mean = np.concatenate(
+        [island.state[places(graph.offset, first)], island.resting_points[at].ravel()]
+    )
+    start = len(covariance) - 2 * len(own)
+    order = np.empty(len(ids), np.int64)
+    order[awake], order[~awake] = np.arange(len(own)), len(own) + np.arange(len(at))
+    chosen = np.arange(len(mean))
+    chosen[start:] = (start + 2 * order[:, None] + np.arange(2)).ravel()
+    return mean[chosen], whole[np.ix_(chosen, chosen)]
+
+
+def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.ndarray, "n b"]]:
+    """Joint covariance of some nodes, and theirs with the nodes of the condensed factor.
+
+    Among the latter it is known from the selected inverse; only other nodes take a solution each.
+    """
+    graph, old = island.graph, island.graph.condensed
+    assert old is not None
+    in_boundary = np.isin(nodes, old.nodes)
+    offset = graph.offset
+    at, boundary = places(offset, nodes), places(offset, old.nodes)
+    outside = np.repeat(~in_boundary, np.diff(offset)[nodes])
+    columns = sparse.inverse_columns(island.posterior, at[outside])
+    columns[:, graph.fixed[nodes[~in_boundary]].repeat(np.diff(offset)[nodes[~in_boundary]])] = 0.0
+    within = np.searchsorted(boundary, at[~outside])
+    covariance = np.empty((len(at), len(at)))
+    covariance[:, outside] = columns[at]
+    covariance[outside] = columns[at].T
+    covariance[np.ix_(~outside, ~outside)] = island.boundary_covariance[np.ix_(within, within)]
+    with_boundary = np.empty((len(at), len(boundary)))
+    with_boundary[outside] = columns[boundary].T
+    with_boundary[~outside] = island.boundary_covariance[within]
+    return 0.5 * (covariance + covariance.T), with_boundary
+
+
+def _sorted_out(
+    island: Island, ids: Sequence[int]
+) -> tuple[Bool[np.ndarray, " L"], Indices, Indices]:
+    """Which landmarks are nodes; the nodes of those, and the places of the others at rest.
+
+    Raises KeyError for an id that the island has not.
+    """
+    landmarks, rest = island.graph.landmarks, resting_of(island)
+    awake = np.array([id_ in landmarks for id_ in ids], np.bool_)
+    nodes = np.array([landmarks[id_] for id_ in ids if id_ in landmarks], np.int64)
+    if awake.all():
+        return awake, nodes, np.zeros(0, np.int64)
+    place = {id_: k for k, id_ in enumerate(rest.ids.tolist())}
+    at = np.array([place[id_] for id_ in ids if id_ not in landmarks], np.int64)
+    return awake, nodes, at

@@ -1,0 +1,155 @@
+"""Landmarks come to rest, and wake where a submap observes them.
+
+A landmark that no raw submap contains occurs in the condensed factor only. Given the factor's other
+nodes it has a Gaussian that later submaps of other places can not change (`Resting`), so it is
+eliminated from the quadratic like an old pose; the cost of a tick then depends on the landmarks
+near the robots, not on all of them. What wakes it is the inverse, exactly: with e = x − means −
+gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹ e, and the others that rest are conditioned on it.
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation import dense
+from team.estimation.dense_kernel import add_product
+from team.estimation.map_joining.condensed_factor import Resting, places
+from team.estimation.map_joining.gauss_newton import Island
+from team.estimation.map_joining.landmark_view import resting_of
+from team.estimation.map_joining.resting_kernel import between, upper_of
+from team.estimation.map_joining.submap_graph import Graph, with_landmarks
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+Marks = Bool[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
+
+FIRST = 64
+"""Number of landmarks without a raw submap from which landmarks come to rest: fewer cost less as
+nodes."""
+
+
+class Split(NamedTuple):
+    """A quadratic A, g whose numbers `out` are eliminated: x_out ~ N(step + gain d, (L Lᵀ)⁻¹).
+
+    lowered: gᵀA⁻¹g over them. slope, information: the quadratic over the others.
+    """
+
+    out: Marks
+    lowered: float
+    slope: Values
+    information: Matrix
+    factor: Matrix
+    step: Values
+    gain: Float[np.ndarray, "o n"]
+
+
+def split(H: Matrix, g: Values, out: Marks) -> Split:
+    """Eliminates some numbers from a quadratic (Schur complement)."""
+    remaining = ~out
+    if not out.any():
+        none = np.zeros((0, 0))
+        return Split(out, 0.0, g, H, none, np.zeros(0), np.zeros((0, len(g))))
+    cross = H[np.ix_(out, remaining)]
+    factor = dense.cholesky(H[np.ix_(out, out)])
+    solved = dense.solve_factored(factor, np.column_stack([cross, g[out]]))
+    information = H[np.ix_(remaining, remaining)] - dense.product(cross.T, solved[:, :-1])
+    slope: Values = g[remaining] - dense.product(cross.T, solved[:, -1])
+    lowered = float(dense.product(g[out], solved[:, -1]))
+    symmetric: Matrix = 0.5 * (information + information.T)
+    return Split(out, lowered, slope, symmetric, factor, -solved[:, -1], -solved[:, :-1])
+
+
+def idle(graph: Graph, stays: Marks, elsewhere: Collection[int], first: int) -> Indices:
+    """The nodes of landmarks that come to rest, ascending: no submap that stays contains them, nor
+    another island.
+
+    None, while nothing rests yet and there are fewer than `first`.
+    """
+    seen = np.zeros(len(graph.fixed), np.bool_)
+    for f in np.flatnonzero(stays):
+        seen[graph.submaps[f].nodes] = True
+    found = sorted(n for id_, n in graph.landmarks.items() if not seen[n] and id_ not in elsewhere)
+    begun = graph.condensed is not None and graph.condensed.resting is not None
+    return np.array(found if begun or len(found) >= first else [], np.int64)
+
+
+def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Resting | None:
+    """The landmarks at rest given the nodes of `union` that remain, with the landmarks `nodes`,
+    which are among those that are eliminated; None if there are none.
+    """
+    graph, old = island.graph, island.graph.condensed
+    if not len(nodes) and (old is None or old.resting is None):
+        return None
+    before, sizes = resting_of(island), np.diff(graph.offset)[union]
+    rests = np.repeat(np.isin(union, nodes), sizes)[parts.out]
+    gain, means = np.zeros((len(before.means), len(parts.out))), before.means
+    if old is not None:
+        first = np.concatenate([[0], np.cumsum(sizes)])
+        gain[:, places(first, np.searchsorted(union, old.nodes))] = before.gain
+        means = means + dense.product(before.gain, old.moved(island.state, graph.offset))
+    on_out = np.ascontiguousarray(gain[:, parts.out])
+    gain = np.ascontiguousarray(gain[:, ~parts.out])
+    add_product(on_out, parts.gain, gain, (0, 0), False, False)
+    covariance = dense.inverse_of_factored(parts.factor)
+    spread = dense.product(on_out, covariance)
+    n, total = len(means), len(means) + 2 * len(nodes)
+    upper = upper_of(before.covariance, np.arange(n), total)
+    add_product(spread, np.ascontiguousarray(on_out.T), upper, (0, 0), True, False)
+    upper[:n, n:] = spread[:, rests]
+    upper[n:, n:] = covariance[np.ix_(rests, rests)]
+    id_of = {node: id_ for id_, node in graph.landmarks.items()}
+    ids = np.array([id_of[node] for node in nodes.tolist()], np.int64)
+    points = island.state[places(graph.offset, nodes)] + parts.step[rests]
+    return Resting(
+        np.concatenate([before.ids, ids]),
+        np.concatenate([means + dense.product(on_out, parts.step), points]),
+        np.concatenate([gain, parts.gain[rests]]),
+        upper,
+    )
+
+
+def woken(island: Island, ids: Collection[int]) -> Island:
+    """The island with those of these landmarks that are at rest as nodes again."""
+    graph = island.graph
+    old = graph.condensed
+    if old is None or old.resting is None:
+        return island
+    rest = old.resting
+    wakes = np.isin(rest.ids, np.array(sorted(ids), np.int64))
+    if not wakes.any():
+        return island
+    numbers = np.repeat(wakes, 2)
+    out, left = np.flatnonzero(numbers), np.flatnonzero(~numbers)
+    gain, remaining = rest.gain[out], np.ascontiguousarray(rest.gain[left])
+    precision = dense.inverse_of_factored(dense.cholesky(between(rest.covariance, out, out)))
+    weighted = dense.product(precision, gain)
+    own = old.information + dense.product(gain.T, weighted)
+    information = np.block([[0.5 * (own + own.T), -weighted.T], [-weighted, precision]])
+    cross = between(rest.covariance, left, out)
+    share = dense.product(cross, precision)
+    add_product(-share, np.ascontiguousarray(gain), remaining, (0, 0), False, False)
+    upper = upper_of(rest.covariance, left, len(left))
+    add_product(-share, np.ascontiguousarray(cross.T), upper, (0, 0), True, False)
+    points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.offset))
+    grown, nodes = with_landmarks(graph, rest.ids[wakes].tolist())
+    condensed = replace(
+        old,
+        nodes=np.concatenate([old.nodes, nodes]),
+        at=np.concatenate([old.at, rest.means[out]]),
+        headings=np.concatenate([old.headings, np.zeros(len(out), np.bool_)]),
+        information=information,
+        slope=np.concatenate([old.slope, np.zeros(len(out))]),
+        redundancy=old.redundancy + len(out),
+        resting=Resting(
+            rest.ids[~wakes], rest.means[left], np.concatenate([remaining, share], axis=1), upper
+        ),
+    )
+    return replace(
+        island,
+        graph=replace(grown, condensed=condensed),
+        state=np.concatenate([island.state, points]),
+    )

@@ -1,0 +1,87 @@
+"""Compiled kernels of landmarks at rest: of their covariance the upper triangle is stored."""
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation.compiled import compiled
+from team.estimation.dense_kernel import add_product
+
+Indices = Int64[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
+
+
+@compiled
+def upper_of(upper: Matrix, chosen: Indices, size: int) -> Matrix:
+    """The upper triangle among these ascending numbers, at the corner of a larger matrix."""
+    result = np.zeros((size, size))
+    for a in range(len(chosen)):
+        source, target = upper[chosen[a]], result[a]
+        for b in range(a, len(chosen)):
+            target[b] = source[chosen[b]]
+    return result
+
+
+@compiled
+def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:
+    """The entries of these rows and columns of a symmetric matrix of which the upper triangle is
+    there.
+    """
+    result = np.empty((len(rows), len(columns)))
+    for a in range(len(rows)):
+        for b in range(len(columns)):
+            i, j = rows[a], columns[b]
+            result[a, b] = upper[i, j] if i <= j else upper[j, i]
+    return result
+
+
+@compiled
+def symmetric_of(
+    values: Float[np.ndarray, " _"],
+    sizes: Indices,
+    entry: Indices,
+    value_start: Indices,
+    numbers: int,
+) -> Matrix:
+    """The dense symmetric matrix over some nodes, from the values of a block pattern.
+
+    entry: the pattern's entries of each pair of nodes, −1 where the first is the smaller one.
+    """
+    result = np.zeros((numbers, numbers))
+    count = len(sizes)
+    row = 0
+    for a in range(count):
+        column = 0
+        for b in range(count):
+            at = entry[a * count + b]
+            if at >= 0:
+                base = value_start[at]
+                for p in range(sizes[a]):
+                    for q in range(sizes[b]):
+                        value = values[base + p * sizes[b] + q]
+                        result[row + p, column + q] = value
+                        result[column + q, row + p] = value
+            column += sizes[b]
+        row += sizes[a]
+    return result
+
+
+@compiled
+def own_blocks(
+    upper: Matrix, gain: Float[np.ndarray, "r n"], root: Matrix
+) -> Float[np.ndarray, "L 2 2"]:
+    """The 2 × 2 diagonal blocks of C + G R Rᵀ Gᵀ; R is lower triangular."""
+    spread = np.zeros(gain.shape)
+    add_product(gain, root, spread, (0, 0), False, True)
+    result = np.empty((len(gain) // 2, 2, 2))
+    for k in range(len(result)):
+        x, y = spread[2 * k], spread[2 * k + 1]
+        xx, xy, yy = 0.0, 0.0, 0.0
+        for i in range(len(x)):
+            xx += x[i] * x[i]
+            xy += x[i] * y[i]
+            yy += y[i] * y[i]
+        result[k, 0, 0] = upper[2 * k, 2 * k] + xx
+        result[k, 0, 1] = upper[2 * k, 2 * k + 1] + xy
+        result[k, 1, 0] = result[k, 0, 1]
+        result[k, 1, 1] = upper[2 * k + 1, 2 * k + 1] + yy
+    return result

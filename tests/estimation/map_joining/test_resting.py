@@ -1,0 +1,156 @@
+"""Landmarks at rest: map, covariance and cost are those of a fold in which none rests."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from team.estimation.map_joining import landmark_view, marginals
+from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.gauss_newton import final_cost
+from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
+from team.estimation.map_joining.minima import degrees_of_freedom
+from team.estimation.map_joining.relinearising import relinearised
+from tests.estimation.submap_world import team
+
+ROBUST = JoinSettings(robust_c=2.0)
+NEVER = 1_000_000
+STREAMS = (("r0", 0), ("r1", 0))
+
+
+def world(seed, submaps=24):
+    """Robots that see a part of the place at a time, and come back."""
+    return team(seed, submaps=submaps, landmarks=40, size=40.0, reach=10.0)
+
+
+def ticks_of(found):
+    ends = sorted({each.end_ns for each in found.submaps})
+    return [[each for each in found.submaps if each.end_ns == end] for end in ends]
+
+
+def folds(found, settings, first, starts=None):
+    """The fold after each tick."""
+    fold = EMPTY_FOLD
+    for start in found.starts if starts is None else starts:
+        fold = started(fold, start)
+    for tick in ticks_of(found):
+        fold = folded(condensed(fold, 2, begin=0, first=first), tick, settings)
+        yield fold
+
+
+def at_rest(fold):
+    return set(landmark_view.resting_of(fold.main).ids.tolist())
+
+
+@pytest.mark.parametrize("settings", [JoinSettings(), ROBUST], ids=["squares", "robust"])
+def test_a_fold_whose_landmarks_rest_and_wake_is_the_fold_in_which_none_rests(settings):
+    resting, woke = set(), 0
+    for one, other in zip(
+        folds(world(4), settings, NEVER), folds(world(4), settings, 1), strict=True
+    ):
+        assert not at_rest(one)
+        woke += len(resting - at_rest(other))
+        resting = at_rest(other)
+        assert not resting & other.main.graph.landmarks.keys()
+        a, b = marginals.landmark_map(one), marginals.landmark_map(other)
+        assert a.ids.tolist() == b.ids.tolist()
+        assert np.allclose(a.means, b.means, atol=1e-5)
+        assert np.allclose(a.covariance, b.covariance, rtol=1e-5, atol=1e-8)
+        assert degrees_of_freedom(one.main) == degrees_of_freedom(other.main)
+        assert final_cost(other.main) == pytest.approx(final_cost(one.main), rel=1e-6)
+        mine, theirs = marginals.joint_cost(one), marginals.joint_cost(other)
+        assert theirs.dof == pytest.approx(mine.dof, rel=1e-6)
+        assert marginals.confirmed(one, 2) == marginals.confirmed(other, 2)
+    assert len(resting) > 10
+    assert woke > 5
+
+
+@pytest.fixture(scope="module")
+def last():
+    """The last fold with landmarks at rest."""
+    *_, fold = folds(world(4), JoinSettings(), 1)
+    return fold
+
+
+def test_blocks_and_priors_are_those_of_the_joint_covariance(last):
+    whole, blocks = marginals.landmark_map(last), marginals.landmark_blocks(last)
+    own = np.array(
+        [whole.covariance[k : k + 2, k : k + 2] for k in range(0, len(whole.ids) * 2, 2)]
+    )
+    assert np.allclose(blocks.covariances, own, rtol=1e-9)
+    assert np.array_equal(blocks.means, whole.means)
+    for prior in marginals.main_priors(last, STREAMS, 12).values():
+        at = np.searchsorted(whole.ids, prior.ids)
+        numbers = (2 * at[:, None] + np.arange(2)).ravel()
+        assert set(prior.ids.tolist()) & at_rest(last)
+        assert np.allclose(prior.covariance[3:, 3:], whole.covariance[np.ix_(numbers, numbers)])
+        assert np.linalg.eigvalsh(prior.covariance)[0] > 0.0
+
+
+def test_the_pose_in_a_prior_goes_with_landmarks_at_rest_as_with_nodes(last):
+    *_, never = folds(world(4), JoinSettings(), NEVER)
+    for stream in STREAMS:
+        one = marginals.prior_for(never, *stream)
+        other = marginals.prior_for(last, *stream)
+        assert np.allclose(one.covariance, other.covariance, rtol=1e-4, atol=1e-8)
+
+
+def test_what_wakes_without_the_others_being_conditioned_on_it_is_seen():
+    """The mutant: those that stay at rest keep their former Gaussian; the first test rejects it."""
+    found = list(
+        zip(folds(world(4), JoinSettings(), NEVER), folds(world(4), JoinSettings(), 1), strict=True)
+    )
+    for (_, before), (one, after) in pairwise(found):
+        stays = at_rest(before) & at_rest(after)
+        if stays and at_rest(before) - at_rest(after):
+            old, new = (each.main.graph.condensed for each in (before, after))
+            places = np.repeat(np.isin(old.resting.ids, sorted(stays)), 2)
+            kept = np.repeat(np.isin(new.resting.ids, sorted(stays)), 2)
+            wrong = new.resting.covariance.copy()
+            wrong[np.ix_(kept, kept)] = old.resting.covariance[np.ix_(places, places)]
+            resting = replace(new.resting, covariance=wrong)
+            graph = replace(after.main.graph, condensed=replace(new, resting=resting))
+            mutant = replace(after, islands={after.main_key: replace(after.main, graph=graph)})
+            a, b = marginals.landmark_blocks(one), marginals.landmark_blocks(mutant)
+            if not np.allclose(a.covariances, b.covariances, rtol=1e-5, atol=1e-8):
+                return
+    pytest.fail("no tick tells the mutant from the fold")
+
+
+def test_what_rests_is_there_when_all_is_linearised_again(last):
+    found = world(4)
+    *_, never = folds(found, JoinSettings(), NEVER)
+    again = relinearised(last, found.submaps, [])
+    other = relinearised(never, found.submaps, [])
+    assert not at_rest(again)
+    a, b = marginals.landmark_map(again), marginals.landmark_map(other)
+    assert a.ids.tolist() == b.ids.tolist()
+    assert np.allclose(a.means, b.means, atol=1e-6)
+
+
+def test_a_landmark_that_another_island_has_does_not_rest_and_ties_it():
+    """A robot without a known initial pose joins by landmarks that the others left long ago."""
+    found = world(4)
+    late = [
+        replace(each, robot="s0", end_ns=each.end_ns + 1)
+        for each in found.submaps
+        if each.robot == "r1"
+    ]
+    found.submaps = sorted(
+        [each for each in found.submaps if each.robot == "r0"] + late, key=lambda each: each.key
+    )
+    starts = [each for each in found.starts if each.robot == "r0"]
+    for one, other in zip(
+        folds(found, JoinSettings(), NEVER, starts),
+        folds(found, JoinSettings(), 1, starts),
+        strict=True,
+    ):
+        apart = [each for key, each in other.islands.items() if key != other.main_key]
+        for island in apart:
+            assert not at_rest(other) & island.graph.landmarks.keys()
+        assert one.home == other.home
+        a, b = marginals.landmark_map(one), marginals.landmark_map(other)
+        assert np.allclose(a.means, b.means, atol=1e-4)
+    assert other.joined
+    assert at_rest(other)
