@@ -17,10 +17,13 @@ from jaxtyping import Bool, Float, Int64
 
 from team.estimation import dense
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.condensing_kernel import add_blocks
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
+
+
+PATH_BLOCK = 64
+"""Number of poses in each run of an eliminated path."""
 
 
 class SubmapCost(NamedTuple):
@@ -40,14 +43,27 @@ class SubmapCost(NamedTuple):
 
 
 class EliminatedPath(NamedTuple):
-    """The first and the last eliminated pose of a stream, at the state in which they were
-    eliminated.
+    """The eliminated poses of a stream, first to last, at the state in which they were eliminated.
 
+    blocks: runs of them. All but the last have PATH_BLOCK poses, and every later path of the stream
+        has the same arrays, so that a checkpoint does not store them again.
     is_fixed: whether the first pose is a constant.
     """
 
-    poses: Float[np.ndarray, "K 3"]
+    blocks: tuple[Float[np.ndarray, "_ 3"], ...]
     is_fixed: bool
+
+    @property
+    def poses(self) -> Float[np.ndarray, "K 3"]:
+        """All of them."""
+        return np.concatenate([np.zeros((0, 3)), *self.blocks])
+
+    def longer(self, poses: Float[np.ndarray, "K 3"]) -> "EliminatedPath":
+        """The path with more poses behind it."""
+        whole = [each for each in self.blocks if len(each) == PATH_BLOCK]
+        rest = np.concatenate([np.zeros((0, 3)), *self.blocks[len(whole) :], poses])
+        runs = (rest[k : k + PATH_BLOCK].copy() for k in range(0, len(rest), PATH_BLOCK))
+        return self._replace(blocks=(*whole, *runs))
 
 
 class Departed(NamedTuple):
@@ -95,6 +111,8 @@ def nobody_rests(numbers: int) -> Resting:
 class Condensed:
     """The quadratic cost of the module's equation over `nodes`, ascending, none of them fixed.
 
+    Its methods take the indices in the state of the numbers of these nodes (`Graph.boundary`).
+
     headings: which of its numbers are headings.
     submaps: the number of submaps that it replaces.
     redundancy: the number of measured quantities less the number of eliminated unknowns.
@@ -112,43 +130,27 @@ class Condensed:
     departed: Departed = field(default=NOBODY)
     resting: Resting | None = None
 
-    def moved(self, state: Values, offset: Indices) -> Values:
+    def moved(self, state: Values, numbers: Indices) -> Values:
         """Difference d = state − at, headings wrapped: the distance from the linearisation
         point.
         """
-        d: Values = state[places(offset, self.nodes)] - self.at
+        d: Values = state[numbers] - self.at
         turn = d[self.headings]
         d[self.headings] = turn + 2.0 * np.pi * np.floor((np.pi - turn) / (2.0 * np.pi))
         return d
 
-    def cost_at(self, state: Values, offset: Indices) -> float:
+    def cost_at(self, state: Values, numbers: Indices) -> float:
         """cost(x)."""
-        d = self.moved(state, offset)
+        d = self.moved(state, numbers)
         return self.cost + float(
             2.0 * (dense.product(self.slope, d))
             + dense.product(d, dense.product(self.information, d))
         )
 
-    def gradient_at(self, state: Values, offset: Indices) -> Values:
+    def gradient_at(self, state: Values, numbers: Indices) -> Values:
         """Half of the cost's derivative: slope + information d."""
-        gradient: Values = self.slope + dense.product(self.information, self.moved(state, offset))
+        gradient: Values = self.slope + dense.product(self.information, self.moved(state, numbers))
         return gradient
-
-    def add(
-        self,
-        values: Values,
-        gradient: Values,
-        state: Values,
-        offset: Indices,
-        entry: Indices,
-        value_start: Indices,
-    ) -> None:
-        """Adds the factor to the normal equations; `entry`: the pattern's entries of each pair of
-        `nodes`.
-        """
-        gradient[places(offset, self.nodes)] += self.gradient_at(state, offset)
-        sizes = np.diff(offset)[self.nodes]
-        add_blocks(values, self.information, sizes, entry, value_start)
 
 
 def places(offset: Indices, nodes: Indices) -> Indices:

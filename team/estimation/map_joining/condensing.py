@@ -181,8 +181,8 @@ def _quadratic(
             np.concatenate([place[union], [total]]), np.searchsorted(union, before.nodes)
         )
         H[np.ix_(within, within)] += before.information
-        g[within] += before.gradient_at(state, graph.offset)
-        cost = before.cost_at(state, graph.offset)
+        g[within] += before.gradient_at(state, graph.boundary)
+        cost = before.cost_at(state, graph.boundary)
     weights = island.weight / island.settings.covariance_factor
     at_work = np.flatnonzero(leaving)
     add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)
@@ -250,11 +250,8 @@ def _paths(
     for stream, count in counts.items():
         nodes = graph.streams[stream][:count]
         poses = np.array([island.state[graph.offset[n] : graph.offset[n] + 3] for n in nodes])
-        old = paths.get(stream)
-        if old is None:
-            paths[stream] = EliminatedPath(poses, bool(graph.fixed[nodes[0]]))
-        else:
-            paths[stream] = old._replace(poses=np.vstack([old.poses, poses]))
+        old = paths.get(stream, EliminatedPath((), bool(graph.fixed[nodes[0]])))
+        paths[stream] = old.longer(poses)
     return paths
 
 

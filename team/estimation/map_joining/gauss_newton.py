@@ -26,6 +26,7 @@ from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import least_squares
+from team.estimation.map_joining.condensing_kernel import add_blocks
 from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
 from team.estimation.map_joining.priors_kernel import prior_terms
 from team.estimation.map_joining.resting_kernel import own_blocks, symmetric_of
@@ -248,7 +249,7 @@ class Island(least_squares.Iterate):
         seen = float((self.sighting_weight * other.sighting_chi2).sum())
         seen += float((self.prior_weight * other.prior_chi2).sum())
         old = self.graph.condensed
-        return chi2 + seen if old is None else chi2 + seen + old.cost_at(state, offset)
+        return chi2 + seen if old is None else chi2 + seen + old.cost_at(state, self.graph.boundary)
 
     @cached_property
     def cost(self) -> float:
@@ -258,7 +259,7 @@ class Island(least_squares.Iterate):
         submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
         cost = self.cost_of_factors(submaps, seen, priors)
         old = graph.condensed
-        return cost if old is None else cost + old.cost_at(self.state, graph.offset)
+        return cost if old is None else cost + old.cost_at(self.state, graph.boundary)
 
     def cost_of_factors(
         self,
@@ -318,14 +319,10 @@ class Island(least_squares.Iterate):
             pattern.value_start,
         )
         if graph.condensed is not None:
-            graph.condensed.add(
-                values,
-                gradient,
-                self.state,
-                graph.offset,
-                graph.condensed_entry,
-                pattern.value_start,
-            )
+            old = graph.condensed
+            gradient[graph.boundary] += old.gradient_at(self.state, graph.boundary)
+            sizes = np.diff(graph.offset)[old.nodes]
+            add_blocks(values, old.information, sizes, graph.condensed_entry, pattern.value_start)
         for k, prior in enumerate(graph.priors):
             slope = self.prior_slope(k)
             begin = graph.offset[prior.node]
@@ -369,7 +366,7 @@ class Island(least_squares.Iterate):
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
-        moved = old.moved(self.state, self.graph.offset)
+        moved = old.moved(self.state, self.graph.boundary)
         points: Values = old.resting.means + dense.product(old.resting.gain, moved)
         return points.reshape(-1, 2)
 

@@ -6,6 +6,7 @@ All values are in the frame of an island: the main one, or the one that a stream
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -256,8 +257,19 @@ class Terms(NamedTuple):
     sightings: list[tuple[str, float, float]]
 
 
+_TERMS: WeakKeyDictionary[Island, Terms] = WeakKeyDictionary()
+"""The terms of islands that are still there: a broadcast and the next tick ask for the same."""
+
+
 def terms(island: Island) -> Terms:
     """How well each factor of an island agrees with the rest."""
+    found = _TERMS.get(island)
+    if found is None:
+        found = _TERMS[island] = _terms(island)
+    return found
+
+
+def _terms(island: Island) -> Terms:
     graph = island.graph
     explained = kernel.explained(
         island.state,

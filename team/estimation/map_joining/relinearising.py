@@ -113,7 +113,7 @@ def _raw(
         return island.state[graph.offset[node] : graph.offset[node + 1]]
 
     for stream, nodes in graph.streams.items():
-        left = paths.get(stream, EliminatedPath(np.zeros((0, 3)), bool(graph.fixed[nodes[0]])))
+        left = paths.get(stream, EliminatedPath((), bool(graph.fixed[nodes[0]])))
         fixed[full.streams[stream][0]] = left.is_fixed
         path = [*left.poses, *(value(node) for node in nodes)]
         for node, pose in zip(full.streams[stream], path, strict=True):

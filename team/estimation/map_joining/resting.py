@@ -90,7 +90,7 @@ def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Rest
     if old is not None:
         first = np.concatenate([[0], np.cumsum(sizes)])
         gain[:, places(first, np.searchsorted(union, old.nodes))] = before.gain
-        means = means + dense.product(before.gain, old.moved(island.state, graph.offset))
+        means = means + dense.product(before.gain, old.moved(island.state, graph.boundary))
     on_out = np.ascontiguousarray(gain[:, parts.out])
     gain = np.ascontiguousarray(gain[:, ~parts.out])
     add_product(on_out, parts.gain, gain, (0, 0), False, False)
@@ -134,7 +134,7 @@ def woken(island: Island, ids: Collection[int]) -> Island:
     add_product(-share, np.ascontiguousarray(gain), remaining, (0, 0), False, False)
     upper = upper_of(rest.covariance, left, len(left))
     add_product(-share, np.ascontiguousarray(cross.T), upper, (0, 0), True, False)
-    points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.offset))
+    points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.boundary))
     grown, nodes = with_landmarks(graph, rest.ids[wakes].tolist())
     condensed = replace(
         old,

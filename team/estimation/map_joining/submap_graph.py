@@ -19,7 +19,7 @@ from team.estimation import elementary
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.condensed_factor import Condensed
+from team.estimation.map_joining.condensed_factor import Condensed, places
 from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
 from team.estimation.map_joining.priors_kernel import PriorFactors
@@ -213,6 +213,12 @@ class Graph:
     def entry(self) -> Indices:
         """Entry of the pattern for each pair of members of each factor (see `block_pattern`)."""
         return self._pattern_and_entry[1]
+
+    @cached_property
+    def boundary(self) -> Indices:
+        """Indices in the state of the numbers of the condensed factor's nodes."""
+        nodes = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
+        return places(self.offset, nodes)
 
     @property
     def condensed_entry(self) -> Indices:
