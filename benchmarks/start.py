@@ -3,11 +3,15 @@
     python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. Only
-ratios of the two launches are held against benchmarks/start.json: the machine is in both halves.
+measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone:
+router, recorder and robot started by hand, when they are ready and nothing comes: their resident
+memory, that without pages of files, and their CPU. Of times only ratios are held against
+benchmarks/start.json: the machine is in both halves.
 """
 
 import argparse
+import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -19,7 +23,7 @@ from typing import Any
 from benchmarks.baseline import concluded
 from sim.launch.launch import launch
 from sim.launch.plan import Plan
-from sim.launch.processes import Starter
+from sim.launch.processes import PROGRAM, Starter
 from sim.scenarios.scenario import Scenario, load, with_options
 from team.recording.reader import open_log
 from team.wire.channels import SENSORS
@@ -51,6 +55,64 @@ def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> 
     }
 
 
+def alone(folder: Path) -> dict[str, dict[str, float]]:
+    """The resources of a router, a recorder and a robot, each started by hand, ready and idle."""
+    folder.mkdir()
+    log = str(folder / "log.mcap")
+    words = {
+        "router": ["router", "--listen", "tcp/127.0.0.1:0"],
+        "recorder": ["record", "waypoints", "--output", log],
+        "robot": ["robot", "waypoints", "r1"],
+    }
+    running: dict[str, subprocess.Popen[str]] = {}
+    connect: list[str] = []
+    try:
+        for name, own in words.items():
+            running[name] = subprocess.Popen(
+                [*PROGRAM, *own, *connect],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            line = said(running[name], "listening at" if name == "router" else "connected")
+            connect = connect or ["--connect", line.split()[-1]]
+        return {name: settled(process.pid) for name, process in running.items()}
+    finally:
+        for process in running.values():
+            process.terminate()
+            process.communicate()
+
+
+def said(process: "subprocess.Popen[str]", words: str) -> str:
+    """The line with these words of what a process says."""
+    assert process.stdout is not None
+    return next(line for line in process.stdout if words in line)
+
+
+def settled(pid: int) -> dict[str, float]:
+    """The memory and the CPU of a process that has come to rest: a tenth of a core, for a second."""
+    ticks = [-100]
+    while ticks[-1] - ticks[0] > 10 or len(ticks) < 2:
+        time.sleep(1.0)
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        ticks = [ticks[-1], int(fields[11]) + int(fields[12])]
+    rows = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+    kb = {name: int(size) for name, size, *_ in (row.replace(":", "").split() for row in rows)}
+    cpu_s = ticks[-1] / os.sysconf("SC_CLK_TCK")
+    return {"rss_mb": kb["Rss"] / 1024, "anonymous_mb": kb["Anonymous"] / 1024, "cpu_s": cpu_s}
+
+
+def bare_cpu_s() -> float:
+    """The least CPU of three starts of Python with NumPy."""
+    took = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, "-c", "import numpy"], check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        took.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(took)
+
+
 def bare_s() -> float:
     """The least wall time of three starts of Python with NumPy."""
     took = []
@@ -68,10 +130,14 @@ def measured(scenario: Scenario) -> dict[str, Any]:
         forked = launched(scenario, Path(folder) / "forked", pair)
         scratch = launched(scenario, Path(folder) / "scratch", None)
         bare = bare_s()
+        by_hand = alone(Path(folder) / "alone")
     return {
         "robots": len(scenario.robots),
         "forked": forked,
         "scratch": scratch,
+        "alone": by_hand,
+        **{f"{name}_alone_mb": used["rss_mb"] for name, used in by_hand.items()},
+        "robot_alone_in_bare_starts": by_hand["robot"]["cpu_s"] / bare_cpu_s(),
         "first_in_bare_starts": forked["first_s"] / bare,
         "cpu_ratio": forked["cpu_s"] / scratch["cpu_s"],
         "robot_cpu_ratio": forked["robot_cpu_s"] / scratch["robot_cpu_s"],

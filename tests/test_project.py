@@ -1,6 +1,7 @@
 """The project around the code: what is shipped, under which licences, what the texts promise."""
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -263,10 +264,11 @@ def test_the_readme_names_the_commands_of_a_team() -> None:
 
 HEAVY = (
     "asyncio", "cryptography", "foxglove", "gtsam", "jaxtyping", "llvmlite", "matplotlib", "mcap",
-    "numba", "pandas", "rich", "scipy", "scipy.optimize", "scipy.sparse", "scipy.stats", "zenoh",
+    "numba", "numpy", "pandas", "pydantic", "rich", "scipy", "scipy.linalg", "scipy.optimize",
+    "scipy.sparse", "scipy.special", "scipy.stats", "ssl", "zenoh",
 )  # fmt: skip
 """What takes time or memory to import."""
-COMPUTES = {"asyncio", "jaxtyping", "llvmlite", "numba", "scipy"}
+COMPUTES = {"asyncio", "jaxtyping", "llvmlite", "numba", "numpy", "scipy", "ssl"}
 PROCESSES: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "any command": (("sim.cli.main",), set()),
     "router": ((), {"zenoh"}),
@@ -300,6 +302,33 @@ def test_no_process_waits_for_what_it_does_not_use(process: str) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     ).stdout.split()
     assert set(found) - allowed == set()
+
+
+def test_texts_and_paths_of_a_command_line_are_converted_without_pydantic(tmp_path: Path) -> None:
+    words = ["router", "--listen", "nowhere", "--keys", str(tmp_path)]
+    code = (
+        f"import sys; from sim.cli.main import main; sys.argv[1:] = {words!r}\n"
+        "try: main()\n"
+        "finally: print('pydantic' in sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stdout) == (2, "False\n")
+    assert "not an endpoint" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("world", "thesis", "--robots", "many"), "--robots"),
+        (("world", "thesis", "--seed", "-1"), "--seed"),
+        (("view", "no.mcap", "--port", "1.5"), "--port"),
+    ],
+)
+def test_values_that_need_a_check_are_checked(words: tuple[str, ...], complaint: str) -> None:
+    command = [sys.executable, "-m", "sim", *words]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ran.returncode == 2
+    assert f"'{complaint}'" in ran.stderr
 
 
 def always_true(node: ast.AST) -> bool:
@@ -350,6 +379,21 @@ def test_linear_algebra_has_one_thread() -> None:
     np.linalg.inv(np.eye(64))  # the library is loaded and has made its threads
     pools = threadpoolctl.threadpool_info()
     assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} == {1}
+
+
+def test_linear_algebra_that_is_loaded_after_estimation_has_one_thread_too() -> None:
+    code = (
+        "import sys, threadpoolctl, team.estimation\n"
+        "assert 'scipy.linalg' not in sys.modules\n"
+        "import numpy, scipy.linalg\n"
+        "for library in numpy, scipy: library.linalg.inv(numpy.eye(64))\n"
+        "print([pool['num_threads'] for pool in threadpoolctl.threadpool_info()])"
+    )
+    bare = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=bare, capture_output=True, text=True, timeout=60
+    )
+    assert ran.stdout == "[1, 1]\n", ran.stderr
 
 
 def test_each_long_module_and_function_has_its_reason() -> None:

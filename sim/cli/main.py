@@ -4,6 +4,8 @@ import os
 import sys
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 # Before NumPy: one BLAS thread per process, for the same bits everywhere and no fight for cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -57,7 +59,46 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
 @cache
 def command() -> Callable[[], None]:
     """All commands, built from their functions; a launch's template does it once for all."""
-    return typer.main.get_command(app)
+    whole = typer.main.get_command(app)
+    _convert_plainly(whole)
+    return whole
+
+
+def _convert_plainly(command: Any) -> None:
+    """Let values of a command and of its parts that need no check be converted without Pydantic."""
+    for parameter in command.get_params(typer.Context(command)):
+        parameter._runtime_param = _Plain()
+    for part in getattr(command, "commands", {}).values():
+        _convert_plainly(part)
+
+
+class _Plain:
+    """Converts the value of a parameter: none, a text or a path by itself, any other as Typer does.
+
+    Typer imports Pydantic to convert even these, which takes 12 MB and 0.1 s of each process of a
+    team. A version of Typer that knows no `_runtime_param` converts all by itself.
+    """
+
+    def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
+        """The value with which the command's function is called."""
+        kind, checks = param.type_descriptor.annotation, param.type_descriptor.parameter_info
+        is_single = param.nargs == 1 and not param.multiple and checks.parser is None
+        if is_single and (value is None or kind is str):
+            return value
+        if not is_single and value is None:
+            return ()
+        if is_single and kind is Path and not _is_checked(value, checks):
+            return Path(value)
+        param._runtime_param = None
+        return param.get_runtime_param().coerce(value, param=param, ctx=ctx)
+
+
+def _is_checked(path: Any, checks: Any) -> bool:
+    """Whether Typer would do more with a path than to take it."""
+    restricted = checks.exists or checks.writable or not (checks.file_okay and checks.dir_okay)
+    return (
+        restricted or checks.resolve_path or (os.path.exists(path) and not os.access(path, os.R_OK))
+    )
 
 
 def main() -> None:

@@ -9,7 +9,6 @@ from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtri, gammaincinv
 
 from team.estimation import dense
 from team.estimation.gaussian import cholesky_factor
@@ -43,6 +42,8 @@ def chi2_limit(dof: int, tail: float) -> float:
 
     Rounded to twelve digits: the last ones of the library's differ from processor to processor.
     """
+    from scipy.special import chdtri  # 25 MB that a robot needs for landmarks without names only
+
     return float(f"{chdtri(dof, tail):.12g}")
 
 
@@ -55,6 +56,8 @@ def chi2_quantile(
     it, whose import would add half a second to every process's start. Rounded to 36 bits: the last
     ones of the library's differ from processor to processor.
     """
+    from scipy.special import gammaincinv
+
     mantissa, exponent = np.frexp(2.0 * gammaincinv(0.5 * dof, probability))
     quantile = np.ldexp(np.rint(mantissa * 2.0**36) * 2.0**-36, exponent)
     return cast(Float[np.ndarray, " n"] | float, quantile)

@@ -9,22 +9,20 @@ from importlib import metadata
 from pathlib import Path
 from platform import libc_ver, machine, platform, python_version
 
-import numpy as np
-
 ESTIMATION = Path(__file__).parents[1] / "estimation"
 _PACKAGES = ("teamslam", "numpy", "scipy", "numba", "llvmlite", "eclipse-zenoh", "msgpack", "mcap")
 
 
 def provenance() -> dict[str, str]:
     """Versions, BLAS, CPU and kernels of this process, as they are stored in a log's metadata."""
-    cpu_name, cpu_features = _cpu()
+    cpu_name, cpu_features, blas = _computer()
     versions = {f"version.{package}": _version(package) for package in _PACKAGES}
     return {
         **versions,
         "version.python": python_version(),
         "platform": platform(),
         "arithmetic": arithmetic(),
-        "blas": _blas(),
+        "blas": blas,
         "cpu.name": cpu_name,
         "cpu.features": cpu_features,
         "kernels": kernel_fingerprint(),
@@ -64,23 +62,28 @@ def git_commit() -> str:
     return commit + ("+" if changes else "")
 
 
-def cpu() -> tuple[str, str]:
-    """The processor and its features, as the kernels' compiler determines them."""
+def computer() -> tuple[str, str, str]:
+    """The processor and its features, as the kernels' compiler names them, and NumPy's BLAS."""
+    import numpy as np
     from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
 
     features = binding.get_host_cpu_features()
-    return binding.get_host_cpu_name(), " ".join(sorted(n for n, has in features.items() if has))
+    names = " ".join(sorted(name for name, has in features.items() if has))
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
+    return binding.get_host_cpu_name(), names, f"{blas['name']} {blas['version']}"
 
 
-def _cpu() -> tuple[str, str]:
-    """Determined in a separate process, unless this one has the compiler, which takes 110 MB."""
+def _computer() -> tuple[str, str, str]:
+    """Determined in a separate process, unless this one has the compiler: it takes 110 MB, and
+    NumPy 14.
+    """
     if "llvmlite.binding" in sys.modules:
-        return cpu()
-    code = f"from {__name__} import cpu; print(*cpu(), sep='\\n')"
+        return computer()
+    code = f"from {__name__} import computer; print(*computer(), sep='\\n')"
     asked = [sys.executable, "-P", "-c", code]
     output = subprocess.run(asked, capture_output=True, check=True, text=True).stdout  # noqa: S603 - our own program
-    name, features = output.splitlines()
-    return name, features
+    name, features, blas = output.splitlines()
+    return name, features, blas
 
 
 def _version(package: str) -> str:
@@ -88,8 +91,3 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "unknown"
-
-
-def _blas() -> str:
-    found = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
-    return f"{found['name']} {found['version']}"

@@ -1,9 +1,22 @@
-"""Arrays on the wire: little-endian `bin` fields, and the checks of their contents."""
+"""Arrays on the wire: little-endian `bin` fields, and the checks of their contents.
 
-from typing import Any
+NumPy is imported at the first array: a router and a recorder see none, and it takes 14 MB.
+"""
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+
+    class _NumPy:
+        def __getattr__(self, name: str) -> object:
+            global np
+            import numpy as np  # in place of this object
+
+            return getattr(np, name)
+
+    np = _NumPy()
 
 Floats = bytes
 """float64, little-endian."""
@@ -16,29 +29,29 @@ LARGEST_JOINT = 4096
 """Number of rows of the largest covariance that is accepted."""
 
 
-def _array(data: bytes, dtype: str, what: str) -> NDArray[Any]:
+def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
     size = np.dtype(dtype).itemsize
     if len(data) % size:
         raise ValueError(f"wrong length: {what} has {len(data)} bytes, not a multiple of {size}")
     return np.frombuffer(data, dtype=dtype)
 
 
-def floats(data: Floats, what: str) -> NDArray[np.float64]:
+def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
     """A read-only float64 view."""
     return _array(data, "<f8", what)
 
 
-def ids(data: Ids, what: str) -> NDArray[np.uint32]:
+def ids(data: Ids, what: str) -> "np.typing.NDArray[np.uint32]":
     """A read-only uint32 view."""
     return _array(data, "<u4", what)
 
 
-def stamps(data: Stamps, what: str) -> NDArray[np.int64]:
+def stamps(data: Stamps, what: str) -> "np.typing.NDArray[np.int64]":
     """A read-only int64 view."""
     return _array(data, "<i8", what)
 
 
-def octets(data: bytes, what: str) -> NDArray[np.uint8]:
+def octets(data: bytes, what: str) -> "np.typing.NDArray[np.uint8]":
     """A read-only uint8 view."""
     return _array(data, "u1", what)
 
@@ -133,7 +146,9 @@ def check_blocks(data: Floats, count: int, what: str) -> None:
         raise ValueError(f"not positive definite: {what}")
 
 
-def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+def _unit_diagonal(
+    matrix: "np.typing.NDArray[np.float64]", what: str
+) -> "np.typing.NDArray[np.float64]":
     """D⁻¹ P D⁻¹ with D = √diag P, so that units and scale do not influence the conditioning."""
     with np.errstate(over="ignore", invalid="ignore"):  # √ of what is negative is judged below
         sigmas = np.sqrt(np.diag(matrix))
@@ -142,7 +157,7 @@ def _unit_diagonal(matrix: NDArray[np.float64], what: str) -> NDArray[np.float64
         return np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
 
 
-def _check_positive(scaled: NDArray[np.float64], what: str) -> None:
+def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
     """Raises ValueError unless each pivot of a matrix with a unit diagonal exceeds its rounding
     error n ε.
     """

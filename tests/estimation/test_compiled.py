@@ -70,6 +70,54 @@ def computed(folder: Path, processes: int = 1) -> list[tuple[float, int]]:
     return sorted((float(value), int(hits)) for value, hits in told)
 
 
+ALLOCATING = """
+import sys
+import numpy as np
+from team.estimation.compiled import compiled
+
+@compiled
+def row(x: float):
+    made = np.zeros(3)
+    made[1:] = np.sort(np.array([x, 1.0]))
+    return made, made.sum()
+
+@compiled
+def rows(x: float):
+    made = np.empty((2, 3))
+    for k in range(2):
+        made[k], total = row(x + k)
+    if total < 0.0:
+        raise ValueError("negative")
+    return made
+
+for kernel in {}:
+    value = getattr(sys.modules[__name__], kernel)(4.0)
+    print(np.sum(value[0]), end=" ")
+try:
+    print(kernel, rows(-9.0) if kernel == "rows" else "positive", end=" ")
+except ValueError as error:
+    print(kernel, error, end=" ")
+print("numba.core.boxing" in sys.modules, "scipy.linalg" in sys.modules)
+"""
+
+
+def test_cached_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path) -> None:
+    """Also where a kernel is compiled that calls one whose code came from the cache."""
+
+    def run(*kernels: str) -> list[str]:
+        (tmp_path / "allocating.py").write_text(ALLOCATING.format(list(kernels)))
+        environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{Path.cwd()}"}
+        command = [sys.executable, "-m", "allocating"]
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
+        assert ran.returncode == 0, ran.stderr
+        return ran.stdout.split()
+
+    assert run("row") == ["5.0", "row", "positive", "True", "True"]
+    assert run("row") == ["5.0", "row", "positive", "False", "False"]
+    assert run("row", "rows") == ["5.0", "5.0", "rows", "negative", "True", "True"]
+    assert run("row", "rows") == ["5.0", "5.0", "rows", "negative", "False", "False"]
+
+
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     folder = tmp_path / "kernels"

@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from team.estimation.consistency import chi2_interval, coverage, nees, state_error
+from team.estimation.consistency import (
+    chi2_interval,
+    chi2_limit,
+    chi2_quantile,
+    coverage,
+    nees,
+    state_error,
+)
 from team.estimation.gaussian import NotACovarianceError
+from team.estimation.map_joining.conditioning import GATE
+from team.estimation.map_joining.nonlinearity import UNLIKELY
 
 L = np.array([[0.5, 0.0, 0.0], [0.3, 0.2, 0.0], [-0.1, 0.4, 0.1]])
 
@@ -57,3 +66,8 @@ def test_the_error_of_a_heading_is_the_short_way_round():
 def test_what_is_no_covariance_is_named():
     with pytest.raises(NotACovarianceError, match="an estimation error"):
         nees(np.ones(2), np.diag([1.0, -1.0]))
+
+
+def test_quantiles_that_are_written_as_numbers_are_those_of_the_library() -> None:
+    assert chi2_limit(1, 1e-3) == UNLIKELY
+    assert chi2_quantile(0.9999, 2) == GATE

@@ -20,6 +20,7 @@ from team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from team.wire.zenoh import bus as zenoh_bus
 from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.recovery import Recovery
 from team.wire.zenoh.router import router
 from team.wire.zenoh.session import client
 from tests.support import (
@@ -306,6 +307,41 @@ def test_a_publication_without_its_attachment_is_dropped_and_logged(
             stranger.put("team/t/source/alpha/odometry", encoded(odometry(0)))
         wait_until(lambda: sink.receive(0.02) == [] and bool(caplog.records))
     assert "team/t/source/alpha/odometry: dropped" in caplog.text
+
+
+def test_a_heartbeat_on_half_a_key_is_nobodys(
+    endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As Zenoh passed one on when links of fifty robots had been cut: two robots died of it."""
+    caplog.set_level("INFO")
+    with ZenohBus("t", endpoint) as bus, client(endpoint, 5.0, None) as stranger:
+        bus.subscribe(c.HEAD)
+
+        def heard() -> bool:  # a sample without attachment is logged, and came after the heartbeat
+            stranger.put("team/t/source/alpha/head/@adv/pub", (30).to_bytes(4, "little"))
+            stranger.put("team/t/source/alpha/head", b"")
+            bus.receive(0.02)
+            return "attachment" in caplog.text
+
+        wait_until(heard)
+        until = time.monotonic() + 1.0  # what is missing is asked for after half a second
+        while time.monotonic() < until:
+            bus.receive(0.05)
+        assert bus.lacking() == {}
+    assert "asked for" not in caplog.text
+
+
+def test_on_a_key_of_no_channel_nothing_is_missing(endpoint: str) -> None:
+    """As Zenoh composed it of two when links had been cut: it is handed on, and that is all."""
+    with client(endpoint, 5.0, None) as session:
+        publisher = zenoh.SourceInfo(session.declare_publisher("any").id, 390)
+        recovery = Recovery(session, "team/t/", lambda item: None)
+        mixed = Sample("recorder/progress/r46/r13/status", b"", 0, 0, 390)
+        assert recovery.arrived(mixed, publisher) == [mixed]
+        assert recovery.lacking() == {}
+        own = Sample("robot/r13/submap", b"", 0, 0, 390)
+        assert recovery.arrived(own, publisher) == []
+        assert recovery.lacking() == {"robot/r13/submap": [(0, 389)]}
 
 
 def test_receive_waits_for_the_first_and_no_longer(endpoint: str) -> None:

@@ -3,7 +3,6 @@
 from typing import Annotated, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from team.wire.arrays import (
@@ -49,7 +48,7 @@ def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: 
 def check_counts(count_bytes: bytes, groups: int, total: int) -> None:
     """Raise ValueError unless there is a count for each group and they sum to the total."""
     counts = ids(count_bytes, "counts")
-    if len(counts) != groups or int(counts.sum(dtype=np.int64)) != total:
+    if len(counts) != groups or int(counts.sum(dtype="int64")) != total:
         raise ValueError(f"wrong length: counts, {groups} groups of together {total} expected")
 
 

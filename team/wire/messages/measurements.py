@@ -1,9 +1,9 @@
 """What a robot's sensors say, and where its stream ends."""
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from team.wire.arrays import (
@@ -70,7 +70,7 @@ class Increment(Measurement, frozen=True, kw_only=True, tag="increment/1"):
 
     def check(self) -> None:  # noqa: D102
         check_finite(self.increment, "increment", 3)
-        if not abs(float(floats(self.increment, "increment")[2])) <= np.pi:
+        if not abs(float(floats(self.increment, "increment")[2])) <= math.pi:
             raise ValueError("out of bounds: increment turns outside (−π, π]")
         if self.covariance:
             check_semidefinite(self.covariance, 3, "covariance")
@@ -88,7 +88,7 @@ class Steering(Measurement, frozen=True, kw_only=True, tag="steering/1"):
     steering: Real
 
     def check(self) -> None:  # noqa: D102
-        if not abs(self.steering) < 0.5 * np.pi:
+        if not abs(self.steering) < 0.5 * math.pi:
             raise ValueError("out of bounds: steering is not within a quarter turn")
 
 

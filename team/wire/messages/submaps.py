@@ -1,8 +1,7 @@
 """What robots send in for fusion: submaps and inter-robot factors."""
 
+import math
 from itertools import pairwise
-
-import numpy as np
 
 from team.config import UNNAMED
 from team.wire.arrays import (
@@ -134,7 +133,7 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
 
     def check(self) -> None:  # noqa: D102
         check_packed_covariance(self.covariance, 2, "covariance")
-        if self.range <= 0.0 or abs(self.bearing) > np.pi:
+        if self.range <= 0.0 or abs(self.bearing) > math.pi:
             raise ValueError("out of bounds: the range is not positive or the bearing not an angle")
         if not self.measurements or any(a >= b for a, b in pairwise(self.measurements)):
             raise ValueError("not ascending: measurements, or none")

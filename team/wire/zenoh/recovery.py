@@ -22,6 +22,7 @@ ADVANCED = "/@adv/pub/"
 _BEAT = struct.Struct("<I")  # a heartbeat's payload: the number of the last publication
 _LOOK_S = 0.1  # between two looks at what is missing
 _ANSWER_S = 10.0
+_NEVER = 2**63
 _LOG = logging.getLogger(__name__)
 
 
@@ -87,7 +88,8 @@ class Recovery:
             self._beats[name] = beat
             key, _, rest = name.removeprefix(self._prefix).partition(ADVANCED)
             publisher = "/".join(rest.split("/")[:2])
-            self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
+            if publisher:
+                self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
 
     def take_heartbeat(self, beat: Heartbeat) -> None:
         """Records a publisher's last number."""
@@ -114,13 +116,17 @@ class Recovery:
 
     def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample]:
         """The arrivals of one publisher on one key; on a `latest` channel nothing older than the
-        first known number is requested.
+        first known number is requested, on a key of no channel nothing.
+
+        After a link was cut, Zenoh may hand over samples on keys that are composed of parts of
+        others: docs/decisions/0121.
         """
         found = self._arrivals.get((key, publisher))
         if found is None:
             row = row_of(key)
-            whole = row is None or row.delivery == "all" or row.name in self._whole
-            found = Arrivals(0 if whole else first_known, in_order=whole)
+            whole = row is not None and (row.delivery == "all" or row.name in self._whole)
+            first = _NEVER if row is None else 0 if whole else first_known
+            found = Arrivals(first, in_order=whole)
             self._arrivals[key, publisher] = found
         return found
 

@@ -14,7 +14,6 @@ from zenoh.handlers import Callback
 
 from team.wire.bus import BusError
 from team.wire.codec import LARGEST_PAYLOAD
-from team.wire.zenoh.handshake import router_ends, why_refused
 
 if TYPE_CHECKING:  # a node without keys needs none of it
     from team.keys.credentials import Credentials
@@ -71,6 +70,8 @@ def client(connect: str, patience_s: float, keys: "Credentials | None") -> zenoh
         try:
             return opened(settings | {"connect/timeout_ms": max(1, round(1e3 * wait_s))})
         except zenoh.ZError as error:
+            from team.wire.zenoh.handshake import why_refused  # ssl: only here
+
             refused = why_refused(connect, keys)
             if refused is not None:
                 raise BusError(refused) from error
@@ -106,11 +107,14 @@ class RouterAccess:
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials") -> None:
+        from team.wire.zenoh import handshake
+
+        self._handshake = handshake
         self._session = session
         self._connect = connect
         self._keys = keys
         self._due = self._answered_at = 0.0
-        self._router_ends = router_ends(connect, keys)
+        self._router_ends = self._handshake.router_ends(connect, keys)
         self._answered = True
         self._deaf = 0
 
@@ -125,10 +129,10 @@ class RouterAccess:
         # A link that comes up again just before the end Zenoh may keep behind it.
         ended = self._router_ends is not None and time.time() > self._router_ends
         if ended or now_s - self._answered_at > FIRST_LOOK_S:
-            refused = why_refused(self._connect, self._keys)
+            refused = self._handshake.why_refused(self._connect, self._keys)
             if refused is not None:
                 raise BusError(refused)
-            self._router_ends = router_ends(self._connect, self._keys)
+            self._router_ends = self._handshake.router_ends(self._connect, self._keys)
         if self._deaf > DEAF:
             raise BusError(
                 f"{self._connect}: the router gives {self._keys.certificate} a link, but lets it "
