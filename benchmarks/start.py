@@ -90,7 +90,7 @@ def said(process: "subprocess.Popen[str]", words: str) -> str:
 
 
 def settled(pid: int) -> dict[str, float]:
-    """The memory and the CPU of a process that has come to rest: a tenth of a core, for a second."""
+    """The memory and the CPU of a process at rest: a tenth of a core at most, for a second."""
     ticks = [-100]
     while ticks[-1] - ticks[0] > 10 or len(ticks) < 2:
         time.sleep(1.0)

@@ -13,6 +13,7 @@ docs/decisions/0029.
 
 import dis
 import hashlib
+import importlib
 import inspect
 import pickle
 import sys
@@ -28,7 +29,6 @@ import numpy as np
 from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
 from numba.core import environment
 from numba.core.caching import IndexDataCacheFile
-from numba.core.runtime import _nrt_python as runtime
 
 from team.estimation.compiled_once import compile_once
 from team.sources import sources_of
@@ -108,7 +108,7 @@ class _Unpickler(pickle.Unpickler):
 
 def _environment(module: str, constants: Sequence[object], name: str) -> Any:
     """A compiled function's constants; its module's names are for interpreted code only."""
-    found = environment.lookup_environment(name)
+    found = environment.lookup_environment(name)  # type: ignore[no-untyped-call] # Numba's
     if found is None:
         known = sys.modules.get(module)
         names = {"__name__": module} if known is None else vars(known)
@@ -140,6 +140,7 @@ def _load_alone(files: Any, signature: Any, target: Any) -> Any:
 @cache
 def _name_runtime() -> None:
     """Tells the linker where the functions of Numba's runtime are, which cached code calls."""
+    runtime: Any = importlib.import_module("numba.core.runtime._nrt_python")
     for name, address in runtime.c_helpers.items():
         binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
