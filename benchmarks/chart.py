@@ -4,6 +4,7 @@
 
 FOLDER/benchmarks.png: each figure and what it may be at worst, in units of its committed value.
 FOLDER/growth.png: a tick of the centre over the submaps that it has, before and since 0074.
+FOLDER/growth_large.png: the same of ten robots among a thousand landmarks, before and since 0117.
 """
 
 import argparse
@@ -34,15 +35,15 @@ def draw_baselines(picture: Path) -> None:
     figure.savefig(picture, dpi=110)
 
 
-def draw_growth(picture: Path) -> None:
-    """CPU of a tick with its broadcast, five robots among fifty landmarks."""
-    curves = baselines()["growth"]["curves"]
+def draw_growth(name: str, goal_ms: float, picture: Path) -> None:
+    """CPU of a tick with its broadcast, by the curves of this baseline."""
+    curves = baselines()[name]["curves"]
     figure = Figure(figsize=(6.5, 3.4), layout="constrained")
     axes = figure.add_subplot()
     for label, points in curves.items():
         submaps, took = zip(*points, strict=True)
         axes.plot(submaps, took, "o-", label=label)
-    axes.axhline(10.0, color="grey", linestyle=":", label="the goal")
+    axes.axhline(goal_ms, color="grey", linestyle=":", label="the goal")
     axes.set_xlabel("submaps at the centre")
     axes.set_ylabel("CPU of a tick [ms]")
     axes.set_ylim(bottom=0.0)
@@ -56,7 +57,8 @@ def main() -> None:
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     draw_baselines(folder / "benchmarks.png")
-    draw_growth(folder / "growth.png")
+    draw_growth("growth", 10.0, folder / "growth.png")
+    draw_growth("growth-large", 60.0, folder / "growth_large.png")
 
 
 if __name__ == "__main__":

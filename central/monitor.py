@@ -170,8 +170,7 @@ def _worst(agreement: Agreement) -> list[str]:
     wrong = [
         (each.chi2 / each.dof, each)
         for each in agreement.submaps
-        if each.dof > 1.0
-        and each.chi2 > FAIL * each.dof
+        if each.chi2 > FAIL * each.dof > FAIL
         and each.chi2 / each.dof > max(FAIL, _bound(round(each.dof, 1), quantile))
     ]
     wrong.sort(key=lambda pair: (-pair[0], pair[1].stream, pair[1].sequence))

@@ -13,12 +13,17 @@ STEPS = ("", "track", "near", "sweep", "closure", "merge", "verdict")
 DECISIONS = 100
 """Most decisions in a map, and most that wait."""
 LARGEST = 1e300
+SHOWN = 12
+"""Most members of a landmark in a running map; it may have as many as the run has submaps."""
 
 
-def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
-    """The table of unnamed landmarks: member, identity, step."""
+def memberships_of(landmarks: Landmarks, most: int | None = None) -> tuple[m.Membership, ...]:
+    """The table of unnamed landmarks: member, identity, step; of each landmark at most so many
+    members, its first and its last ones.
+    """
     streams: dict[tuple[str, int], list[LocalLandmark]] = {}
-    for member in sorted(landmarks.number):
+    named = landmarks.number if most is None else _few(landmarks, most)
+    for member in sorted(named):
         streams.setdefault((member.robot, member.incarnation), []).append(member)
     table = []
     for (robot, incarnation), members in streams.items():
@@ -38,6 +43,15 @@ def memberships_of(landmarks: Landmarks) -> tuple[m.Membership, ...]:
             )
         )
     return tuple(table)
+
+
+def _few(landmarks: Landmarks, most: int) -> list[LocalLandmark]:
+    """The first and the last members of each landmark, `most` in all."""
+    return [
+        member
+        for members in landmarks.sets.values()
+        for member in (*members[:1], *members[1:][1 - most :])
+    ]
 
 
 def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:

@@ -1,15 +1,13 @@
 """The members of a map's unnamed landmarks, and the step by which each was associated."""
 
-from central.unnamed_landmarks import STEPS
+from central.unnamed_landmarks import SHOWN, STEPS
 from team.wire import messages as m
 from team.wire.arrays import floats, ids
 
-MOST = 12
-"""Most members of a landmark that are listed; a landmark may have hundreds."""
-
 
 def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
-    """For each landmark with unnamed members: its number of submaps, and its members in words.
+    """For each landmark with unnamed members: its number of submaps, in a running map no more than
+    SHOWN, and its members in words.
 
     `r1/1/12/7` is robot, incarnation, submap, local landmark: the form that `teamslam verdict`
     reads.
@@ -36,4 +34,4 @@ def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
                 f"{name}: {STEPS[step]}, log-likelihood ratio {min(llr, 1e6):.1f}{against}, "
                 f"sd {sd:.2f} m"
             )
-    return {number: (len(submaps), words[:MOST]) for number, (submaps, words) in found.items()}
+    return {number: (len(submaps), words[:SHOWN]) for number, (submaps, words) in found.items()}

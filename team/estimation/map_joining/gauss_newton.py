@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int64
 from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
 from team.estimation import dense, elementary, elementwise
+from team.estimation.dense_kernel import add_product
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
@@ -384,13 +385,23 @@ class Island(least_squares.Iterate):
         )
 
     @cached_property
+    def resting_spread(self) -> Float[np.ndarray, "r n"]:
+        """G R of the landmarks at rest, with their gain G and R Rᵀ of what they depend on."""
+        old = self.graph.condensed
+        assert old is not None
+        assert old.resting is not None
+        spread = np.zeros(old.resting.gain.shape)
+        root = dense.cholesky(self.boundary_covariance)
+        add_product(old.resting.gain, root, spread, (0, 0), False, True)
+        return spread
+
+    @cached_property
     def resting_blocks(self) -> Float[np.ndarray, "L 2 2"]:
         """The covariance [m²] of each landmark at rest; for islands that have some."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
-        root = dense.cholesky(self.boundary_covariance)
-        return own_blocks(old.resting.covariance, old.resting.gain, root)
+        return own_blocks(old.resting.covariance, self.resting_spread)
 
 
 def aged(island: Island, iterations: int | None) -> Island:

@@ -62,27 +62,56 @@ def joint(
     island: Island, nodes: Sequence[int], ids: Sequence[int]
 ) -> tuple[Values, Float[np.ndarray, "n n"]]:
     """Mean and joint covariance of some nodes and of these landmarks, in this order."""
-    awake, own, at = _sorted_out(island, ids)
-    if not len(at):
-        return joint_marginal(island, [*nodes, *own.tolist()])
-    graph, rest = island.graph, resting_of(island)
-    first = np.concatenate([np.array(nodes, np.int64), own])
-    covariance, with_boundary = _beside_boundary(island, first)
-    resting = places(2 * np.arange(len(rest.ids) + 1), at)
-    gain = rest.gain[resting]
-    cross = dense.product(gain, with_boundary.T)
-    among = dense.product(dense.product(gain, island.boundary_covariance), gain.T)
-    among = 0.5 * (among + among.T) + between(rest.covariance, resting, resting)
-    whole = np.block([[covariance, cross.T], [cross, among]])
-    mean = np.concatenate(
-        [island.state[places(graph.offset, first)], island.resting_points[at].ravel()]
-    )
-    start = len(covariance) - 2 * len(own)
-    order = np.empty(len(ids), np.int64)
-    order[awake], order[~awake] = np.arange(len(own)), len(own) + np.arange(len(at))
-    chosen = np.arange(len(mean))
-    chosen[start:] = (start + 2 * order[:, None] + np.arange(2)).ravel()
-    return mean[chosen], whole[np.ix_(chosen, chosen)]
+    return joints(island, [(nodes, ids)])[0]
+
+
+def joints(
+    island: Island, groups: Sequence[tuple[Sequence[int], Sequence[int]]]
+) -> list[tuple[Values, Float[np.ndarray, "n n"]]]:
+    """`joint` of each of several groups, with one solution for all their nodes."""
+    parts = [_sorted_out(island, ids) for _, ids in groups]
+    members = [
+        np.concatenate([np.array(nodes, np.int64), own])
+        for (nodes, _), (_, own, _) in zip(groups, parts, strict=True)
+    ]
+    union = np.unique(np.concatenate(members))
+    sizes = np.diff(island.graph.offset)[union]
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    if any(len(at) for *_, at in parts):
+        covariance, with_boundary = _beside_boundary(island, union)
+    else:
+        covariance, with_boundary = joint_marginal(island, union.tolist())[1], None
+    found = []
+    for (awake, own, at), of_group in zip(parts, members, strict=True):
+        rows = places(first, np.searchsorted(union, of_group))
+        mean = island.state[places(island.graph.offset, of_group)]
+        matrix = covariance[np.ix_(rows, rows)]
+        if with_boundary is not None and len(at):
+            mean = np.concatenate([mean, island.resting_points[at].ravel()])
+            matrix = _with_resting(island, matrix, with_boundary[rows], at)
+            start = len(rows) - 2 * len(own)
+            order = np.empty(len(awake), np.int64)
+            order[awake], order[~awake] = np.arange(len(own)), len(own) + np.arange(len(at))
+            chosen = np.arange(len(mean))
+            chosen[start:] = (start + 2 * order[:, None] + np.arange(2)).ravel()
+            mean, matrix = mean[chosen], matrix[np.ix_(chosen, chosen)]
+        found.append((mean, matrix))
+    return found
+
+
+def _with_resting(
+    island: Island, covariance: Matrix, with_boundary: Float[np.ndarray, "n b"], at: Indices
+) -> Float[np.ndarray, "m m"]:
+    """The joint covariance of some numbers, extended by landmarks at rest.
+
+    with_boundary: their covariance with the nodes of the condensed factor.
+    """
+    rest = resting_of(island)
+    numbers = places(2 * np.arange(len(rest.ids) + 1), at)
+    cross = dense.product(rest.gain[numbers], with_boundary.T)
+    spread = island.resting_spread[numbers]
+    among = dense.product(spread, spread.T) + between(rest.covariance, numbers, numbers)
+    return np.block([[covariance, cross.T], [cross, 0.5 * (among + among.T)]])
 
 
 def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.ndarray, "n b"]]:

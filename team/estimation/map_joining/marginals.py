@@ -19,7 +19,7 @@ from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrectio
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from team.estimation.map_joining.inter_robot_kernel import explained_by_sightings
 from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.landmark_view import blocks_of, joint, known, points_of
+from team.estimation.map_joining.landmark_view import blocks_of, joint, joints, known, points_of
 
 BELIEVED = 0.5
 """A submap is believed as to a landmark whose weight in it is at least this."""
@@ -202,22 +202,17 @@ def _priors_in(
     island: Island, landmarks_of: Mapping[Stream, Sequence[int]]
 ) -> dict[Stream, RobotPrior]:
     """A prior of each stream with the given landmarks, ascending; one solve for all of them."""
-    chosen = sorted({id_ for ids in landmarks_of.values() for id_ in ids})
-    poses = [island.graph.streams[stream][-1] for stream in landmarks_of]
-    mean, covariance = joint(island, poses, chosen)
-    place = {id_: 3 * len(poses) + 2 * k for k, id_ in enumerate(chosen)}
+    streams = island.graph.streams
+    found = joints(island, [([streams[of][-1]], ids) for of, ids in landmarks_of.items()])
     biases = _biases_in(island)
     priors = {}
-    for k, (stream, ids) in enumerate(landmarks_of.items()):
-        points = np.array([place[id_] for id_ in ids], dtype=np.int64)
-        shared = (points[:, None] + np.arange(2)).ravel()
-        columns = np.concatenate([np.arange(3 * k, 3 * k + 3), shared])
+    for (stream, ids), (mean, covariance) in zip(landmarks_of.items(), found, strict=True):
         own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
         priors[stream] = RobotPrior(
-            mean[columns[:3]],
+            mean[:3],
             np.array(ids, dtype=np.uint32),
-            mean[shared].reshape(-1, 2),
-            covariance[np.ix_(columns, columns)],
+            mean[3:].reshape(-1, 2),
+            covariance,
             SubmapCorrection(island.settings.covariance_factor, own),
         )
     return priors

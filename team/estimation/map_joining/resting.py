@@ -85,28 +85,30 @@ def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Rest
     if not len(nodes) and (old is None or old.resting is None):
         return None
     before, sizes = resting_of(island), np.diff(graph.offset)[union]
-    rests = np.repeat(np.isin(union, nodes), sizes)[parts.out]
+    kept = np.isin(union, nodes if old is None else np.concatenate([old.nodes, nodes]))
+    kept, rests = (np.repeat(each, sizes)[parts.out] for each in (kept, np.isin(union, nodes)))
     gain, means = np.zeros((len(before.means), len(parts.out))), before.means
     if old is not None:
         first = np.concatenate([[0], np.cumsum(sizes)])
         gain[:, places(first, np.searchsorted(union, old.nodes))] = before.gain
         means = means + dense.product(before.gain, old.moved(island.state, graph.boundary))
-    on_out = np.ascontiguousarray(gain[:, parts.out])
+    on_out = np.ascontiguousarray(gain[:, parts.out][:, kept])
     gain = np.ascontiguousarray(gain[:, ~parts.out])
-    add_product(on_out, parts.gain, gain, (0, 0), False, False)
-    covariance = dense.inverse_of_factored(parts.factor)
+    add_product(on_out, np.ascontiguousarray(parts.gain[kept]), gain, (0, 0), False, False)
+    root = dense.forward(parts.factor, np.eye(len(kept))[:, kept])
+    covariance = dense.product(root.T, root)
     spread = dense.product(on_out, covariance)
     n, total = len(means), len(means) + 2 * len(nodes)
     upper = upper_of(before.covariance, np.arange(n), total)
     add_product(spread, np.ascontiguousarray(on_out.T), upper, (0, 0), True, False)
-    upper[:n, n:] = spread[:, rests]
-    upper[n:, n:] = covariance[np.ix_(rests, rests)]
+    upper[:n, n:] = spread[:, rests[kept]]
+    upper[n:, n:] = covariance[np.ix_(rests[kept], rests[kept])]
     id_of = {node: id_ for id_, node in graph.landmarks.items()}
     ids = np.array([id_of[node] for node in nodes.tolist()], np.int64)
     points = island.state[places(graph.offset, nodes)] + parts.step[rests]
     return Resting(
         np.concatenate([before.ids, ids]),
-        np.concatenate([means + dense.product(on_out, parts.step), points]),
+        np.concatenate([means + dense.product(on_out, parts.step[kept]), points]),
         np.concatenate([gain, parts.gain[rests]]),
         upper,
     )

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.estimation.compiled import compiled
-from team.estimation.dense_kernel import add_product
+from team.estimation.dense_kernel import inner
 
 Indices = Int64[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
@@ -66,22 +66,14 @@ def symmetric_of(
 
 
 @compiled
-def own_blocks(
-    upper: Matrix, gain: Float[np.ndarray, "r n"], root: Matrix
-) -> Float[np.ndarray, "L 2 2"]:
-    """The 2 × 2 diagonal blocks of C + G R Rᵀ Gᵀ; R is lower triangular."""
-    spread = np.zeros(gain.shape)
-    add_product(gain, root, spread, (0, 0), False, True)
-    result = np.empty((len(gain) // 2, 2, 2))
+def own_blocks(upper: Matrix, spread: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "L 2 2"]:
+    """The 2 × 2 diagonal blocks of C + S Sᵀ."""
+    result = np.empty((len(spread) // 2, 2, 2))
     for k in range(len(result)):
         x, y = spread[2 * k], spread[2 * k + 1]
-        xx, xy, yy = 0.0, 0.0, 0.0
-        for i in range(len(x)):
-            xx += x[i] * x[i]
-            xy += x[i] * y[i]
-            yy += y[i] * y[i]
-        result[k, 0, 0] = upper[2 * k, 2 * k] + xx
-        result[k, 0, 1] = upper[2 * k, 2 * k + 1] + xy
+        cross = inner(x, y)
+        result[k, 0, 0] = upper[2 * k, 2 * k] + inner(x, x)
+        result[k, 0, 1] = upper[2 * k, 2 * k + 1] + cross
         result[k, 1, 0] = result[k, 0, 1]
-        result[k, 1, 1] = upper[2 * k + 1, 2 * k + 1] + yy
+        result[k, 1, 1] = upper[2 * k + 1, 2 * k + 1] + inner(y, y)
     return result

@@ -112,7 +112,8 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     provisional. heard: how many submaps and orders to withdraw a robot the centre had, in the map
     or not: of two maps that with more is the newer one, and of equals that with more members.
     memberships: by robot and incarnation, where landmarks have no names: a landmark with members of
-    one submap is tentative. decisions: the newest closures and merges of robots, then what waits.
+    one submap is tentative; a running map names the first and the last few members of each.
+    decisions: the newest closures and merges of robots, then what waits.
     verdicts: an operator's that the map rests on.
     """
 
