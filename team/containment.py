@@ -98,7 +98,7 @@ class Boundary:
 
     def give(self, node: Handler, message: m.Message) -> list[Outgoing]:
         """As `take`, of a message that came in before: a log's."""
-        return self.hand(node, message, reply_sample(m.tag_of(type(message)), encoded(message)))
+        return self.hand(node, message)
 
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
         """The valid message of a sample; otherwise what to publish: nothing, or a fault."""
@@ -110,29 +110,39 @@ class Boundary:
             return [self.note(error, sample, "")]
         return []
 
-    def hand(self, node: Handler, message: m.Message, sample: Sample) -> list[Outgoing]:
+    def hand(
+        self, node: Handler, message: m.Message, sample: Sample | None = None
+    ) -> list[Outgoing]:
         """Hand a message to the node; returns its answer, or the fault and what the node
         continues with.
+
+        sample: as which it arrived; without one it is encoded only where somebody looks at it.
         """
-        if self.aside and _name(sample) in self.aside:
+        if self.aside and _name(sample or _sample_of(message)) in self.aside:
             return []
-        tag = m.tag_of(type(message))
         try:
             refused = node.refusal(message) if _guarded(type(node)) else None  # type: ignore[attr-defined]
             if refused is not None:
-                self.refuse(sample, refused)
+                self.refuse(sample or _sample_of(message), refused)
                 return []
             if _takes_samples(type(node)):
-                return node.handle_sample(message, sample)  # type: ignore[attr-defined, no-any-return]
-            return node.handle(message, sample.stamp_ns)
+                return node.handle_sample(message, sample or _sample_of(message))  # type: ignore[attr-defined, no-any-return]
+            return node.handle(message, 0 if sample is None else sample.stamp_ns)
         except Exception as error:
-            out = [self.note(error, sample, tag)]
+            return self._set_aside(node, message, sample or _sample_of(message), error)
+
+    def _set_aside(
+        self, node: Handler, message: m.Message, sample: Sample, error: Exception
+    ) -> list[Outgoing]:
+        """The fault of a message whose handling raised, and what the node continues with."""
+        tag = m.tag_of(type(message))
+        out = [self.note(error, sample, tag)]
         self.aside.add(_name(sample))
         for _ in range(MOST_ANSWERS if isinstance(node, Recovers) else 0):
             try:
                 return [*out, *node.set_aside(message, self.last)]  # type: ignore[attr-defined]
-            except Exception as error:
-                out.append(self.note(error, sample, tag))
+            except Exception as again:
+                out.append(self.note(again, sample, tag))
         return out
 
     def refuse(self, sample: Sample, why: str) -> None:
@@ -195,6 +205,10 @@ def _guarded(kind: type) -> bool:
 def reply_sample(key: str, payload: bytes) -> Sample:
     """A reply as a sample: it has neither stamp nor counter."""
     return Sample(key, payload, 0, 0, -1)
+
+
+def _sample_of(message: m.Message) -> Sample:
+    return reply_sample(m.tag_of(type(message)), encoded(message))
 
 
 def reply_of(payload: bytes, expected: type[M]) -> M:

@@ -1,11 +1,14 @@
 """Gaussians as (mean, covariance), and the checks and packings of covariance matrices."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.estimation import dense
+from team.estimation.compiled import compiled
+from team.estimation.dense_kernel import factored
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -47,22 +50,41 @@ def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
     Symmetry is judged by the diagonal's scale, and so is rank: a pivot that is no more than n ε of
     its diagonal entry is what rounding leaves of a singular matrix.
     """
-    if not np.isfinite(covariance).all():
-        raise NotACovarianceError(what, "not finite")
-    diagonal = np.diag(covariance)
-    if not (diagonal > 0.0).all():
-        raise NotACovarianceError(what, "not positive definite")
-    sigmas = np.sqrt(diagonal)
-    if (np.abs(covariance - covariance.T) > 1e-9 * sigmas * sigmas[:, None]).any():
-        raise NotACovarianceError(what, "not symmetric")
-    try:
-        factor = dense.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        raise NotACovarianceError(what, "not positive definite") from None
-    pivots = np.diag(factor) / sigmas
-    if (pivots * pivots <= len(covariance) * EPSILON).any():
-        raise NotACovarianceError(what, "not positive definite")
+    factor, fault = factor_or_fault(np.array(covariance, np.float64, order="C"))
+    if fault:
+        raise NotACovarianceError(what, FAULTS[fault])
     return factor
+
+
+FAULTS = ("", "not finite", "not positive definite", "not symmetric")
+NOT_FINITE, NOT_POSITIVE, NOT_SYMMETRIC = 1, 2, 3
+
+
+@compiled
+def factor_or_fault(P: Matrix) -> tuple[Matrix, int]:
+    """The factor of `cholesky_factor`, and the index in FAULTS of why there is none."""
+    n = len(P)
+    for i in range(n):
+        for j in range(n):
+            if not math.isfinite(P[i, j]):
+                return P, NOT_FINITE
+    sigmas = np.empty(n)
+    for i in range(n):
+        if not P[i, i] > 0.0:
+            return P, NOT_POSITIVE
+        sigmas[i] = math.sqrt(P[i, i])
+    for i in range(n):
+        for j in range(i):
+            if abs(P[i, j] - P[j, i]) > 1e-9 * sigmas[i] * sigmas[j]:
+                return P, NOT_SYMMETRIC
+    factor, definite = factored(P.T.copy())
+    if not definite:
+        return P, NOT_POSITIVE
+    for i in range(n):
+        pivot = factor[i, i] / sigmas[i]
+        if pivot * pivot <= n * EPSILON:
+            return P, NOT_POSITIVE
+    return factor, 0
 
 
 def whitened(L: Matrix, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -19,6 +19,9 @@ def driven(
     at = 0
     while at < block.size:
         count, answer = node.drive_on(block.part(at, block.size))
-        out += answer if count else give(block.message(at))
-        at += max(count, 1)
+        out += answer
+        at += count
+        if at < block.size:  # this one leads to more than motion, or is taken like all others
+            out += give(block.message(at))
+            at += 1
     return out

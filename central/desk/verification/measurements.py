@@ -21,6 +21,7 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         self._messages: dict[int, tuple[m.Measurement, int]] = {}
         self._parts: list[tuple[OdometryTable, Int64[np.ndarray, " n"]]] = []
         self._last_row = -1
+        self._other_odometry: Int64[np.ndarray, " n"] | None = None
         self.contradicted: list[int] = []
 
     def put(self, message: m.Measurement, place: int) -> None:
@@ -39,6 +40,7 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
             others = np.arange(len(self._places)) != row
             self._parts = [(self._rows.only(others), self._places[others])]
         self._messages[number] = message, place
+        self._other_odometry = None
 
     def put_rows(self, table: OdometryTable, places: Int64[np.ndarray, " n"]) -> None:
         """Add plain odometry in the order of the log, as `put` adds each."""
@@ -87,10 +89,11 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
 
     def intervals(self, begin: int, end: int) -> int:
         """Number of odometry intervals of any kind with numbers begin … end − 1."""
-        rows = self._rows.numbers
-        others = (each for n, (each, _) in self._messages.items() if begin <= n < end)
-        count = int(rows.searchsorted(end) - rows.searchsorted(begin))
-        return count + sum(isinstance(each, m.AnyOdometry) for each in others)
+        if self._other_odometry is None:
+            others = (n for n, (x, _) in self._messages.items() if isinstance(x, m.AnyOdometry))
+            self._other_odometry = np.array(sorted(others), np.int64)
+        both = self._rows.numbers, self._other_odometry
+        return sum(int(each.searchsorted(end) - each.searchsorted(begin)) for each in both)
 
     def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement | OdometryBlock]:
         """The measurements begin … end − 1, up to the first gap; odometry in blocks."""

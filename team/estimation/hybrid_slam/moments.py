@@ -1,12 +1,15 @@
 """Moment matching: a mixture of particles becomes one Gaussian, headings on the circle."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64, UInt32
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled
+from team.estimation.gaussian import factor_or_fault
 from team.estimation.geometry import wrapped
 
+POSE_JITTER = (1e-6, 1e-6, 1e-8)
+"""Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
 POSE_DEGREES = 5.0
 """q + 2 of a pose's q = 3 numbers; see `sample_factor`."""
 MOST_SQUARE = 0.1
@@ -93,3 +96,59 @@ def moments(
         for k in range(j):
             P[k, j] = P[j, k]
     return mean, P
+
+
+@compiled
+def submap_moments(
+    poses: Float[np.ndarray, "M p"],
+    weights: Float[np.ndarray, " M"],
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+    between: float,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"], int]:
+    """`moments` with POSE_JITTER on each pose; and the index in `gaussian.FAULTS` of why they are
+    no Gaussian.
+    """
+    mean, P = moments(poses, weights, means, covariances, between)
+    for i in range(poses.shape[1]):
+        P[i, i] += POSE_JITTER[i % 3]
+    _, fault = factor_or_fault(P)
+    return mean, P, fault
+
+
+@compiled
+def by_landmark(
+    ids: UInt32[np.ndarray, " L"],
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
+    """The particles' landmarks by ascending id."""
+    order = np.argsort(ids)
+    sorted_means, sorted_covariances = np.empty_like(means), np.empty_like(covariances)
+    for i in range(len(means)):
+        for k in range(len(order)):
+            for j in range(2):
+                sorted_means[i, k, j] = means[i, order[k], j]
+            for j in range(3):
+                sorted_covariances[i, k, j] = covariances[i, order[k], j]
+    return ids[order], sorted_means, sorted_covariances
+
+
+@compiled
+def by_slot(
+    ids: UInt32[np.ndarray, " L"], seen: UInt32[np.ndarray, " N"]
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L+1"]]:
+    """The measurements by the place of their landmark in the ascending `ids`, those of one in their
+    order; and where those of each begin.
+    """
+    slots = np.searchsorted(ids, seen)
+    bounds = np.zeros(len(ids) + 1, np.int64)
+    for slot in slots:
+        bounds[slot + 1] += 1
+    for slot in range(len(ids)):
+        bounds[slot + 1] += bounds[slot]
+    behind, order = bounds[:-1].copy(), np.empty(len(slots), np.int64)
+    for k in range(len(slots)):
+        order[behind[slots[k]]] = k
+        behind[slots[k]] += 1
+    return order, bounds

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.config import Bias
-from team.estimation import dense, elementary, elementwise
+from team.estimation import elementary
 from team.estimation.compiled import compiled
-from team.estimation.gaussian import cholesky_factor
+from team.estimation.dense_kernel import solve_lower, solve_stack, solve_upper
+from team.estimation.gaussian import FAULTS, NotACovarianceError, factor_or_fault
 from team.estimation.geometry import adjoint, between
 from team.estimation.models import NEAREST_M
 
@@ -76,21 +77,59 @@ def columns(
     the error: a bearing reads b too much, a range b too much or (1 + b) times itself, and the way
     driven is (1 + b) times the odometry's.
     """
-    size = 3 * len(path) + 2 * len(landmarks)
-    A, right = np.zeros((size, size)), np.zeros((size, len(BIASES)))
     covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 3, 3)
-    metrics = dense.inverse(covariances + np.diag(MOTION_JITTER)) if len(path) else covariances
     shifts = np.array([motion.forward for motion in motions]).reshape(-1, 3)
-    rows = _measurement_rows(path, landmarks, *measurements, own, noise)
-    _add_motions(A, right, path, metrics, shifts)
-    _add_measurements(A, right, rows, *measurements, 3 * len(path))
-    moved = dense.solve_factored(cholesky_factor(A, "the smoother of a window"), right).T
-    twists = np.ascontiguousarray(moved[:, : 3 * len(path)]).reshape(len(BIASES), len(path), 3)
-    points = _landmarks_given(twists, rows, *measurements, len(landmarks), noise)
-    s, c = elementwise.sin_and_cos(path[:, 2])
-    x, y = c * twists[..., 0] - s * twists[..., 1], s * twists[..., 0] + c * twists[..., 1]
+    poses, points, fault = _columns(path, covariances, shifts, landmarks, *measurements, own, noise)
+    if fault == SINGULAR:
+        raise np.linalg.LinAlgError("Singular matrix")
+    if fault:
+        raise NotACovarianceError("the smoother of a window", FAULTS[fault])
     chosen = [BIASES.index(bias) for bias in biases]
-    return np.stack([x, y, twists[..., 2]], axis=-1)[chosen], points[chosen]
+    return poses[chosen], points[chosen]
+
+
+SINGULAR = -1
+
+
+@compiled
+def _columns(
+    path: Float[np.ndarray, "P 3"],
+    covariances: Float[np.ndarray, "P 3 3"],
+    shifts: Float[np.ndarray, "P 3"],
+    landmarks: Float[np.ndarray, "L 2"],
+    at: Int64[np.ndarray, " N"],
+    slots: Int64[np.ndarray, " N"],
+    own: Float[np.ndarray, "N own"],
+    noise: Noise,
+) -> tuple[Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"], int]:
+    """`columns` by all biases; and why there are none: SINGULAR, or an index in FAULTS."""
+    count, biases = len(path), len(BIASES)
+    poses, none = np.zeros((biases, count, 3)), np.zeros((biases, len(landmarks), 2))
+    metrics, noises = np.zeros((count, 3, 3)), covariances.copy()
+    for k in range(count):
+        for i in range(3):
+            metrics[k, i, i] = 1.0
+            noises[k, i, i] += MOTION_JITTER[i]
+    if not solve_stack(noises, metrics):
+        return poses, none, SINGULAR
+    size = 3 * count + 2 * len(landmarks)
+    A, right = np.zeros((size, size)), np.zeros((size, biases))
+    rows = _measurement_rows(path, landmarks, at, slots, own, noise)
+    _add_motions(A, right, path, metrics, shifts)
+    _add_measurements(A, right, rows, at, slots, 3 * count)
+    L, fault = factor_or_fault(A)
+    if fault:
+        return poses, none, fault
+    solve_lower(L, right)
+    solve_upper(L, right)
+    twists = right[: 3 * count].T.copy().reshape(biases, count, 3)
+    for k in range(count):
+        s, c = elementary.sin_and_cos(path[k, 2])
+        for b in range(biases):
+            x, y = twists[b, k, 0], twists[b, k, 1]
+            poses[b, k, 0], poses[b, k, 1] = c * x - s * y, s * x + c * y
+            poses[b, k, 2] = twists[b, k, 2]
+    return poses, _landmarks_given(twists, rows, at, slots, len(landmarks), noise), 0
 
 
 @compiled

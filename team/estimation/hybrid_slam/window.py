@@ -15,13 +15,20 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import FrontEnd, Sensor
 from team.estimation import dense, elementary, elementwise
-from team.estimation.gaussian import NotACovarianceError, cholesky_factor
+from team.estimation.gaussian import FAULTS, NotACovarianceError
 from team.estimation.geometry import inverse, tangent
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
-from team.estimation.hybrid_slam.moments import mean_path, moments, sample_factor
+from team.estimation.hybrid_slam.moments import (
+    POSE_JITTER,
+    by_landmark,
+    by_slot,
+    mean_path,
+    sample_factor,
+    submap_moments,
+)
 from team.estimation.hybrid_slam.sensitivity import Motion, Noise, columns
 from team.estimation.models import Increment
 from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
@@ -29,8 +36,6 @@ from team.estimation.scans import Own, together, unclaimed
 from team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)
-POSE_JITTER = (1e-6, 1e-6, 1e-8)
-"""Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
 
 
 @dataclass(frozen=True)
@@ -199,23 +204,23 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
     hundredth and costs a third of the time. The particles do not model a landmark's constant error.
     """
     particles = window.particles
-    order = np.argsort(particles.ids)
-    ids, means = particles.ids[order], particles.means[:, order]
-    covariances = particles.covariances[:, order]
+    # One layout, whatever the indexing left: each would be a form of the kernel of its own.
+    ids, means, covariances = by_landmark(
+        particles.ids,
+        np.ascontiguousarray(particles.means),
+        np.ascontiguousarray(particles.covariances),
+    )
     if running and window.sensor.range_white == window.sensor.bearing_white == 1.0:
         return ParticleLandmarks(ids, means, covariances)
-    slots = np.searchsorted(ids, window.ids)
-    by_slot = np.argsort(slots, kind="stable")
-    bounds = np.searchsorted(slots[by_slot], np.arange(len(ids) + 1))
-    # One layout, whatever the indexing left: each would be a form of the kernel of its own.
+    order, bounds = by_slot(ids, window.ids)
     means, covariances = landmarks_along_paths(
-        np.ascontiguousarray(means),
-        np.ascontiguousarray(covariances),
+        means,
+        covariances,
         np.ascontiguousarray(window.paths),
         bounds,
-        window.keyframes[by_slot],
-        window.measurements[by_slot],
-        own=window.own[by_slot],
+        window.keyframes[order],
+        window.measurements[order],
+        own=window.own[order],
         noise=noise_of(window.sensor),
     )
     return ParticleLandmarks(ids, means, covariances)
@@ -240,16 +245,15 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
         of_nodes = base_poses(of_nodes, mount)
     poses = np.concatenate((particles.poses, *of_nodes), axis=1)
     weights = elementwise.exp(particles.log_weights)
-    mean, covariance = moments(
+    mean, covariance, fault = submap_moments(
         poses,
         weights,
         np.ascontiguousarray(means),
         np.ascontiguousarray(covariances),
         sample_factor(weights),
     )
-    numbers = np.arange(poses.shape[1])
-    covariance[numbers, numbers] += np.tile(POSE_JITTER, len(numbers) // 3)
-    cholesky_factor(covariance, "the submap of a window")
+    if fault:
+        raise NotACovarianceError("the submap of a window", FAULTS[fault])
     local = LocalMap(ids, mean, covariance, window.node_stamps)
     return _with_sensitivity(window, local) if window.front_end.biases else local
 

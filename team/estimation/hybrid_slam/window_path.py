@@ -13,8 +13,8 @@ from jaxtyping import Float, Int64
 
 from team.estimation import dense, elementwise
 from team.estimation.geometry import Pose, wrapped
-from team.estimation.hybrid_slam.moments import mean_direction, sample_factor
-from team.estimation.hybrid_slam.window import POSE_JITTER, Window
+from team.estimation.hybrid_slam.moments import POSE_JITTER, mean_direction, sample_factor
+from team.estimation.hybrid_slam.window import Window
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 from team.config import Bias
-from team.estimation import dense
+from team.estimation.compiled import compiled
 from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Contribution
+from team.estimation.dense_kernel import matrix_product
 from team.estimation.gaussian import PoseGaussian
 from team.estimation.geometry import tangent
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
@@ -228,8 +229,7 @@ def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
     """
     if open_window is None:
         return Posed(PoseGaussian(whole.mean[:3], whole.covariance[:3, :3]))
-    pose, refused = end_pose(whole, open_window, GATE)
-    return Posed(pose, int(np.isin(open_window.ids, whole.ids).sum()), refused)
+    return Posed(*end_pose(whole, open_window, GATE))
 
 
 def curved(pose: PoseGaussian) -> PoseGaussian:
@@ -240,12 +240,22 @@ def curved(pose: PoseGaussian) -> PoseGaussian:
     f, and so on (moments of a Gaussian; Isserlis 1918). Far from where the heading was known this
     exceeds σ_f². The mean stays the most likely pose.
     """
-    T = tangent(float(pose.mean[2]))
-    S = dense.product(dense.product(T.T, pose.covariance), T)
-    turn = S[:2, 2]
-    of_squares = S[2, 2] * S[:2, :2] + 2.0 * np.outer(turn, turn)
-    (ff, fl), (_, ll) = 0.25 * of_squares
-    spread = np.array([[ll, -fl], [-fl, ff]])
-    covariance = pose.covariance.copy()
-    covariance[:2, :2] += dense.product(dense.product(T[:2, :2], spread), T[:2, :2].T)
-    return PoseGaussian(pose.mean, covariance)
+    return PoseGaussian(pose.mean, _curved(float(pose.mean[2]), np.array(pose.covariance)))
+
+
+@compiled
+def _curved(heading: float, covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    T = tangent(heading)
+    S = matrix_product(matrix_product(T.T.copy(), covariance), T)
+    of_squares = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            of_squares[i, j] = S[2, 2] * S[i, j] + 2.0 * (S[i, 2] * S[j, 2])
+    ff, fl, ll = 0.25 * of_squares[0, 0], 0.25 * of_squares[0, 1], 0.25 * of_squares[1, 1]
+    turn = T[:2, :2].copy()
+    added = matrix_product(matrix_product(turn, np.array([[ll, -fl], [-fl, ff]])), turn.T.copy())
+    result = covariance.copy()
+    for i in range(2):
+        for j in range(2):
+            result[i, j] += added[i, j]
+    return result

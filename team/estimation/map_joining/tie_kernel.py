@@ -6,10 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64, UInt32
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled
+from team.estimation.dense_kernel import solve_stack
 from team.estimation.geometry import wrapped
 
 
@@ -71,6 +72,167 @@ def tied(
         _step(mean, U, z, state)
         _step(seen, V, z, local)
     return Constraints(c, s, lever, z, S), True
+
+
+ITERATIONS = 3
+INDEFINITE, SINGULAR = 1, 2
+"""Why there are no constraints: the covariance of their innovation is not positive definite, or
+that of one of them is singular.
+"""
+
+
+class Agreed(NamedTuple):
+    """The landmarks that a map and a local map share, without those that the gate leaves out.
+
+    mean, covariance: of the map's pose and of these landmarks. in_whole, in_local: their indices in
+    both maps; sights: the indices of their coordinates in the local mean. known: number of shared
+    landmarks, also of those left out. fault: 0, INDEFINITE or SINGULAR.
+    """
+
+    in_whole: Int64[np.ndarray, " k"]
+    in_local: Int64[np.ndarray, " k"]
+    sights: Int64[np.ndarray, " m"]
+    mean: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    tie: Constraints
+    known: int
+    fault: int
+
+
+@compiled
+def agreed(
+    whole_ids: UInt32[np.ndarray, " L"],
+    whole_mean: Float[np.ndarray, " n"],
+    whole_covariance: Float[np.ndarray, "n n"],
+    ids: UInt32[np.ndarray, " K"],
+    local_mean: Float[np.ndarray, " q"],
+    local_covariance: Float[np.ndarray, "q q"],
+    gate: float,
+) -> Agreed:
+    """The constraints of two maps, of which the worst is left out until all are within the gate.
+
+    Ids ascend; landmarks are the last entries of a mean.
+    """
+    in_whole, in_local = _shared(whole_ids, ids)
+    known = len(in_whole)
+    behind = len(local_mean) - 2 * len(ids)
+    while True:
+        place, sights = _coordinates(in_whole, 3, 3), _coordinates(in_local, behind, 0)
+        mean, covariance = _part(whole_mean, whole_covariance, place)
+        seen, spread = _part(local_mean, local_covariance, sights)
+        tie, sound = tied(mean, covariance, seen, spread, ITERATIONS)
+        worst, fault = (-1, 0) if sound else (-1, INDEFINITE)
+        if sound and gate < math.inf:
+            worst, fault = _worst(tie, gate)
+        if worst < 0:
+            return Agreed(in_whole, in_local, sights, mean, covariance, tie, known, fault)
+        others = np.arange(len(in_whole)) != worst
+        in_whole, in_local = in_whole[others], in_local[others]
+
+
+@compiled
+def _shared(
+    one: UInt32[np.ndarray, " L"], other: UInt32[np.ndarray, " K"]
+) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+    """The indices of the numbers that two ascending rows share."""
+    first, second = np.empty(len(other), np.int64), np.empty(len(other), np.int64)
+    i, k = 0, 0
+    for j in range(len(other)):
+        while i < len(one) and one[i] < other[j]:
+            i += 1
+        if i < len(one) and one[i] == other[j]:
+            first[k], second[k] = i, j
+            k += 1
+    return first[:k].copy(), second[:k].copy()
+
+
+@compiled
+def _coordinates(
+    index: Int64[np.ndarray, " k"], behind: int, before: int
+) -> Int64[np.ndarray, " m"]:
+    """The entries 0 … before − 1 and those of the points with these indices, behind `behind`."""
+    entries = np.empty(before + 2 * len(index), np.int64)
+    for j in range(before):
+        entries[j] = j
+    for k in range(len(index)):
+        entries[before + 2 * k] = behind + 2 * index[k]
+        entries[before + 2 * k + 1] = behind + 2 * index[k] + 1
+    return entries
+
+
+@compiled
+def _part(
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+    entries: Int64[np.ndarray, " m"],
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
+    """The marginal over these entries."""
+    m = len(entries)
+    of_mean, of_covariance = np.empty(m), np.empty((m, m))
+    for i in range(m):
+        of_mean[i] = mean[entries[i]]
+        for j in range(m):
+            of_covariance[i, j] = covariance[entries[i], entries[j]]
+    return of_mean, of_covariance
+
+
+@compiled
+def _worst(tie: Constraints, gate: float) -> tuple[int, int]:
+    """Index of the constraint that the others contradict most, −1 where all are within the gate;
+    and the fault.
+    """
+    z, worst, most = tie.multiplier, -1, gate
+    for k in range(len(z) // 2):
+        i, j = 2 * k, 2 * k + 1
+        own = tie.inverse[i : j + 1, i : j + 1].copy().reshape(1, 2, 2)
+        weighted = z[i : j + 1].copy().reshape(1, 2, 1)
+        if not solve_stack(own, weighted):
+            return -1, SINGULAR
+        gain = z[i] * weighted[0, 0, 0] + z[j] * weighted[0, 1, 0]
+        if math.isnan(gain):
+            return -1, 0
+        if gain > most:
+            worst, most = k, gain
+    return worst, 0
+
+
+class TiedPose(NamedTuple):
+    """N(pose, covariance) of `tied_pose`; known, refused: numbers of shared landmarks, and of
+    those among them that the gate left out; fault: as `Agreed`.
+    """
+
+    pose: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"]
+    known: int
+    refused: int
+    fault: int
+
+
+@compiled
+def end_pose_of(
+    whole_ids: UInt32[np.ndarray, " L"],
+    whole_mean: Float[np.ndarray, " n"],
+    whole_covariance: Float[np.ndarray, "n n"],
+    ids: UInt32[np.ndarray, " K"],
+    local_mean: Float[np.ndarray, " q"],
+    local_covariance: Float[np.ndarray, "q q"],
+    gate: float,
+) -> TiedPose:
+    """The end pose of a local map on a map, in one call: `agreed`, then `tied_pose`."""
+    found = agreed(whole_ids, whole_mean, whole_covariance, ids, local_mean, local_covariance, gate)
+    refused = found.known - len(found.in_whole)
+    if found.fault:
+        return TiedPose(np.zeros(3), np.zeros((3, 3)), found.known, refused, found.fault)
+    end = np.arange(3)
+    of_end, spread = _part(local_mean, local_covariance, end)
+    end_of_seen = np.empty((3, len(found.sights)))
+    for i in range(3):
+        for j in range(len(found.sights)):
+            end_of_seen[i, j] = local_covariance[i, found.sights[j]]
+    pose, covariance = tied_pose(
+        found.tie, found.mean, found.covariance, of_end, spread, end_of_seen
+    )
+    return TiedPose(pose, covariance, found.known, refused, 0)
 
 
 @compiled

@@ -8,6 +8,7 @@ linearised again, so the map is overconfident after many joins.
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -15,10 +16,19 @@ from jaxtyping import Float, Int64, UInt32
 from team.estimation import dense, elementwise
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
 from team.estimation.geometry import wrapped
-from team.estimation.map_joining.tie_kernel import Constraints, tied, tied_pose
+from team.estimation.map_joining.tie_kernel import INDEFINITE, SINGULAR, agreed, end_pose_of
 from team.estimation.submap import LocalMap
 
-ITERATIONS = 3
+Maps = tuple[
+    UInt32[np.ndarray, " L"],
+    Float[np.ndarray, " n"],
+    Float[np.ndarray, "n n"],
+    UInt32[np.ndarray, " K"],
+    Float[np.ndarray, " q"],
+    Float[np.ndarray, "q q"],
+]
+"""Ids, mean and covariance of a map, then those of a local map."""
+A = TypeVar("A", bound=np.ndarray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,20 +48,18 @@ def initial_map(
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
 
 
-def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap:
+def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
     """The local map composed onto the current pose: known landmarks fused, new ones added.
 
     With s = (whole, local) and the constraint h(s) = pose ∘ local landmark − whole landmark = 0 for
     each known landmark: the iterated EKF update of s, then (pose ∘ end pose, landmarks, pose ∘ new
     landmarks) with its Jacobian. The update has rank 2k for k known landmarks and the Jacobian is
     the identity for the landmarks of the whole map: O(n²k) for its n numbers.
-
-    gate: the known landmarks whose constraints the others contradict by more than this are left out
-        of the local map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹
-        zₗ with the multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is
-        χ²-distributed with two degrees of freedom.
     """
-    local, in_whole, in_local, tie = _agreeing(whole, local.without_nodes, gate)
+    local = local.without_nodes
+    found = agreed(*_parts(whole, local), math.inf)
+    _refuse(found.fault)
+    in_whole, in_local, tie = found.in_whole, found.in_local, found.tie
     n, m = len(whole.mean), len(local.mean)
     sights, known = 3 + _points(in_local), 3 + _points(in_whole)
     k = len(in_whole)
@@ -88,66 +96,44 @@ def joined(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> WholeMap
     return _by_id(np.concatenate([whole.ids, local.ids[fresh]]), mean, covariance)
 
 
-def end_pose(whole: WholeMap, local: LocalMap, gate: float = math.inf) -> tuple[PoseGaussian, int]:
-    """The pose of `joined`, without the landmarks, and the number of landmarks that the gate left
-    out.
+def end_pose(
+    whole: WholeMap, local: LocalMap, gate: float = math.inf
+) -> tuple[PoseGaussian, int, int]:
+    """The pose of `joined`, without the landmarks; the number of landmarks that both maps have,
+    and of those among them that the gate left out.
+
+    gate: the known landmarks whose constraints the others contradict by more than this are left out
+        of the local map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹
+        zₗ with the multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is
+        χ²-distributed with two degrees of freedom.
     """
-    seen = len(local.ids)
-    local, in_whole, in_local, tie = _agreeing(whole, local, gate)
-    place, sights = _entries(in_whole), _sights(local, in_local)
-    pose, covariance = tied_pose(
-        tie,
-        whole.mean[place],
-        whole.covariance[place[:, None], place],
-        local.end_pose,
-        np.ascontiguousarray(local.covariance[:3, :3]),
-        np.ascontiguousarray(local.covariance[:3, sights]),
+    pose, covariance, known, refused, fault = end_pose_of(*_parts(whole, local), gate)
+    _refuse(fault)
+    return PoseGaussian(pose, covariance), known, refused
+
+
+def _parts(whole: WholeMap, local: LocalMap) -> Maps:
+    """Both maps as the kernels take them: one layout, since each would be a form of its own."""
+    return (
+        _alone(whole.ids),
+        _alone(whole.mean),
+        _alone(whole.covariance),
+        _alone(local.ids),
+        _alone(local.mean),
+        _alone(local.covariance),
     )
-    return PoseGaussian(pose, covariance), seen - len(local.ids)
 
 
-def _agreeing(
-    whole: WholeMap, local: LocalMap, gate: float
-) -> tuple[LocalMap, Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Constraints]:
-    """The local map without the landmarks that the gate leaves out; the indices of its known
-    landmarks in both maps; their constraints.
-    """
-    while True:
-        _, in_whole, in_local = np.intersect1d(
-            whole.ids, local.ids, assume_unique=True, return_indices=True
-        )
-        place, sights = _entries(in_whole), _sights(local, in_local)
-        tie, sound = tied(
-            whole.mean[place],
-            whole.covariance[place[:, None], place],
-            local.mean[sights],
-            local.covariance[sights[:, None], sights],
-            ITERATIONS,
-        )
-        if not sound:
-            raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
-        worst = _worst(tie, gate)
-        if worst is None:
-            return local, in_whole, in_local, tie
-        local = without(local, int(in_local[worst]))
+def _alone(values: A) -> A:
+    return values if values.flags.carray else values.copy()
 
 
-def _worst(tie: Constraints, gate: float) -> int | None:
-    """Index of the constraint that the others contradict most; None where all are within the
-    gate.
-    """
-    if not len(tie.multiplier) or gate == math.inf:
-        return None
-    z = tie.multiplier.reshape(-1, 2)
-    at = np.arange(len(z))
-    own = tie.inverse.reshape(len(z), 2, len(z), 2)[at, :, at]
-    try:
-        weighted = dense.solve(own, z[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError as error:
-        raise NotACovarianceError("a known landmark's innovation", "singular") from error
-    gain = np.einsum("ki,ki->k", z, weighted)
-    worst = int(gain.argmax())
-    return worst if gain[worst] > gate else None
+def _refuse(fault: int) -> None:
+    """Raise NotACovarianceError where there is a fault."""
+    if fault == INDEFINITE:
+        raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
+    if fault == SINGULAR:
+        raise NotACovarianceError("a known landmark's innovation", "singular")
 
 
 def without(local: LocalMap, place: int) -> LocalMap:

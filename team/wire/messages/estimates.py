@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.wire.arrays import Floats, Ids, check_covariance, check_finite, floats
+from team.wire.arrays import Floats, Ids, check_finite, check_pose_covariance, floats
 from team.wire.messages.base import Count, Digest, Message, Name, Text, check_landmarks
 
 
@@ -46,7 +46,7 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
 
     def check(self) -> None:  # noqa: D102
         check_finite(self.pose, "pose", 3)
-        check_covariance(self.covariance, 3, "covariance")
+        check_pose_covariance(self.covariance, "covariance")
 
 
 class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):

@@ -11,9 +11,9 @@ from team.wire.arrays import (
     Ids,
     Stamps,
     check_ascending,
-    check_covariance,
     check_finite,
     check_packed_covariance,
+    check_pose_covariance,
     ids,
     stamps,
 )
@@ -213,7 +213,7 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
         check_finite(self.poses, "poses", 3 * k)
         check_finite(self.covariances, "covariances", 9 * k)
         for i in range(k):
-            check_covariance(self.covariances[72 * i : 72 * (i + 1)], 3, "covariances")
+            check_pose_covariance(self.covariances[72 * i : 72 * (i + 1)], "covariances")
 
 
 class FinalMapRequest(Message, frozen=True, kw_only=True, tag="final_wanted/1"):

@@ -11,8 +11,8 @@ from team.wire.arrays import (
     Ids,
     check_angles,
     check_blocks,
-    check_covariance,
     check_finite,
+    check_pose_covariance,
     check_semidefinite,
     floats,
     ids,
@@ -45,7 +45,7 @@ class InitialPose(Measurement, frozen=True, kw_only=True, tag="start/1"):
             raise ValueError("wrong length: pose has neither 0 nor 3 numbers")
         check_finite(self.pose, "pose")
         if self.covariance:
-            check_covariance(self.covariance, 3, "covariance")
+            check_pose_covariance(self.covariance, "covariance")
 
 
 class Odometry(Measurement, frozen=True, kw_only=True, tag="odometry/1"):

@@ -4,6 +4,7 @@ import numpy as np
 
 from team.config import FrontEnd, Sensor
 from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.moments import POSE_JITTER
 from team.estimation.models import Increment
 from tests.estimation.submap_world import wrap
 
@@ -50,7 +51,7 @@ def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
     expected = (weights[:, None] * deviations).T @ deviations
     effective = 1.0 / np.sum(weights**2)
     expected *= effective / (effective - 5.0)  # what a sample's inverse is too large by
-    expected += np.diag(np.tile(windows.POSE_JITTER, 3))
+    expected += np.diag(np.tile(POSE_JITTER, 3))
     np.testing.assert_allclose(local.covariance[:9, :9], expected, atol=1e-12)
 
 
@@ -66,4 +67,4 @@ def test_a_node_at_the_windows_end_is_the_end_pose_up_to_the_jitter():
     local = windows.gaussian(driven({3}))
     assert local.nodes[0].tolist() == local.end_pose.tolist()
     same = local.covariance[:3, :3] - local.covariance[:3, 3:6]
-    np.testing.assert_allclose(same, np.diag(windows.POSE_JITTER), atol=1e-15)
+    np.testing.assert_allclose(same, np.diag(POSE_JITTER), atol=1e-15)

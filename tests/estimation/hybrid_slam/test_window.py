@@ -17,7 +17,7 @@ from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from team.estimation.geometry import compose, exponential
 from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.moments import moments, sample_factor
+from team.estimation.hybrid_slam.moments import POSE_JITTER, moments, sample_factor
 from team.estimation.models import Increment, increment_of
 from team.estimation.randomness import generator
 
@@ -187,7 +187,7 @@ def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_measurement
             particles.means[:, order],
             particles.covariances[:, order],
         )
-        P[np.arange(3), np.arange(3)] += windows.POSE_JITTER
+        P[np.arange(3), np.arange(3)] += POSE_JITTER
         with_ekf.append(nees(state_error(mean, truth), P))
         again.append(nees(state_error(local.mean, truth), local.covariance))
     assert np.mean(again) < 0.98 * np.mean(with_ekf)
@@ -332,7 +332,7 @@ def test_a_landmark_seen_once_from_the_start_is_its_measurement_and_its_noise():
     G = np.array([[c, -8.0 * s], [s, 8.0 * c]])
     R = np.diag([ACCURATE.range_sigma**2, ACCURATE.bearing_sigma**2])
     np.testing.assert_allclose(local.covariance[3:, 3:], G @ R @ G.T)
-    np.testing.assert_allclose(np.diag(local.covariance)[:3], windows.POSE_JITTER)
+    np.testing.assert_allclose(np.diag(local.covariance)[:3], POSE_JITTER)
 
 
 def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_scatter_is_not():
@@ -343,7 +343,7 @@ def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_
     information = {"window": 0.0, "scatter": 0.0}
     for seed in range(runs):
         window = windows.moved(empty, motion, generator(seed, "a", 0, 0))
-        P = windows.gaussian(window).covariance - np.diag(windows.POSE_JITTER)
+        P = windows.gaussian(window).covariance - np.diag(POSE_JITTER)
         scatter = np.cov((window.particles.poses / sigmas).T, bias=True)
         np.testing.assert_allclose(P / np.outer(sigmas, sigmas), 4.0 / 3.0 * scatter, rtol=1e-6)
         for name, each in (("window", P / np.outer(sigmas, sigmas)), ("scatter", scatter)):
