@@ -32,7 +32,7 @@ from central.fold_inputs import FoldInputs
 from central.withdrawal import convicted, suspects
 from team.config import UNNAMED
 from team.estimation.contribution import Stream
-from team.estimation.hybrid_slam.sensitivity import BIASES
+from team.estimation.hybrid_slam.sensitivity_kernel import BIASES
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.association.landmarks import Verdict
 from team.estimation.map_joining.auditing import taken

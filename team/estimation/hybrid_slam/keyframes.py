@@ -14,7 +14,7 @@ from team.estimation.geometry import adjoint, inverse
 from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
-from team.estimation.hybrid_slam.sensitivity import carried_on
+from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, acceptable, corrected
 from team.estimation.mount import of_sensor
 from team.estimation.odometry import STANDING, Intervals, OdometryInterval

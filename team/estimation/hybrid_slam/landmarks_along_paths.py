@@ -9,7 +9,7 @@ from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam.landmark_kernel import innovation_of
-from team.estimation.hybrid_slam.sensitivity import Noise
+from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import NEAREST_M
 
 SOLVED = 1e-6

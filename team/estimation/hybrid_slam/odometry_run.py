@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 from team.config import MotionModel
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Pose, compose
-from team.estimation.hybrid_slam.sensitivity import carried_on
+from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import (
     CourseModel,
     Increment,

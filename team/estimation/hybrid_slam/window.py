@@ -29,7 +29,8 @@ from team.estimation.hybrid_slam.moments import (
     sample_factor,
     submap_moments,
 )
-from team.estimation.hybrid_slam.sensitivity import Motion, Noise, columns
+from team.estimation.hybrid_slam.sensitivity import Motion, columns
+from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import Increment
 from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
 from team.estimation.scans import Own, together, unclaimed

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
-from team.estimation.hybrid_slam.sensitivity import Noise
+from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import landmark_jacobian, predicted
 from team.estimation.scans import unclaimed
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.sensitivity import carried_on
+from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, increment_of
 from team.estimation.odometry import OdometryInterval, forward_column
 

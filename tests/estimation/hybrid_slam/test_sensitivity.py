@@ -16,7 +16,7 @@ from team.estimation import geometry
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.sensitivity import BIASES, carried_on
+from team.estimation.hybrid_slam.sensitivity_kernel import BIASES, carried_on
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
 from team.estimation.map_joining.submap_factor import biased_normal
