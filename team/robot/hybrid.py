@@ -26,6 +26,7 @@ from team.rejection import Rejection
 from team.robot.estimator import (
     AT_ORIGIN,
     NOTHING_KNOWN,
+    NOTHING_NEW,
     Estimates,
     InitialPose,
     KnownMap,
@@ -90,7 +91,7 @@ class HybridEstimator:
         if closed is not None:
             return self._with_submap(closed)
         now_ns = self._slam.last_keyframe_ns
-        return Estimates(pose_ns=now_ns if now_ns != before_ns else None)
+        return NOTHING_NEW if now_ns == before_ns else Estimates(pose_ns=now_ns)
 
     def drive_on(self, intervals: Intervals) -> int:
         """Take the first of some measured intervals at once, those that lead to nothing else;

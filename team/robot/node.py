@@ -23,7 +23,7 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.submap import LocalMap
 from team.pairs import FEEDBACK, PAIRS
 from team.rejection import UNMEASURED, Rejection
-from team.robot.estimator import Estimates
+from team.robot.estimator import NOTHING_NEW, Estimates
 from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition, no_listener
 from team.robot.maps import RunningMaps
@@ -392,13 +392,12 @@ class RobotNode:
         out.
         """
         measurements = self._inbox.taken()
-        while not self._blocked:
-            measurement = next(measurements, None)
-            if measurement is None:
-                break
+        blocked = self._blocked
+        while not blocked and (measurement := next(measurements, None)) is not None:
             self._pending += self._take(measurement)
+            blocked = self._blocked
         self._stream_end.end_without_driver()
-        if not self._done and not self._blocked and self._stream_end.reached:
+        if not self._done and not blocked and self._stream_end.reached:
             self._pending += self._finish()
         self._pending += self._credit()
         out, self._pending = self._pending, []
@@ -460,6 +459,9 @@ class RobotNode:
 
     def _messages_of(self, estimates: Estimates) -> list[Outgoing]:
         """The messages for what the estimator has produced."""
+        if estimates is NOTHING_NEW:
+            self._taken()
+            return []
         closed, writer = estimates.closed, self._writer
         if closed is not None:
             return [*writer.cloud(closed.end_ns, estimates.cloud), *self._send(closed)]
