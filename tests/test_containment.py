@@ -304,3 +304,31 @@ def test_who_is_refused_without_end_does_not_fill_the_log(caplog: pytest.LogCapt
     assert 100 < len(caplog.records) < 300
     assert "one of 100 is logged" in caplog.text
     assert "10000 dropped" in boundary.warnings[0]
+
+
+def test_a_message_of_a_log_is_encoded_only_where_somebody_looks_at_its_bytes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked: list[m.Message] = []
+
+    def noted(message: m.Message) -> bytes:
+        looked.append(message)
+        return encoded(message)
+
+    monkeypatch.setattr("team.containment.encoded", noted)
+    boundary, node = Boundary("robot/r1"), RobotNode(config("r1"))
+    measurements = published(stream("r1", 4))
+    last = max(k for k, each in enumerate(measurements) if isinstance(each, m.Odometry))
+    for message in measurements[:last]:
+        boundary.give(node, message)
+    assert not looked
+    monkeypatch.setattr(HybridEstimator, "drive", _raising)
+    out = boundary.give(node, measurements[last])
+    assert looked == [measurements[last]]
+    assert [each.message.error for each in out if isinstance(each.message, m.Fault)] == [
+        "RuntimeError"
+    ]
+
+
+def _raising(*_: object, **__: object) -> None:
+    raise RuntimeError("it can not")

@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
 from team.estimation.map_joining.marginals import prior_for
-from team.estimation.map_joining.whole_map import absorbed, initial_map, joined
+from team.estimation.map_joining.whole_map import (
+    absorbed,
+    end_pose,
+    initial_map,
+    joined,
+    without,
+)
 from tests.estimation.submap_world import correlated, team
 
 LINEAR = (0.1, 1e-5, 0.2)
@@ -104,3 +111,29 @@ def test_absorbing_adds_unknown_landmarks_and_keeps_their_ties():
     gain = whole.covariance[:3, 3:5] @ np.linalg.inv(whole.covariance[3:5, 3:5])
     np.testing.assert_allclose(after.covariance[:3, -2:], gain @ spread[:2, 2:], atol=1e-12)
     assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
+
+
+def test_the_end_pose_is_that_of_joining_without_the_landmark_that_the_gate_leaves_out():
+    world = team(6, robots=1, submaps=4, landmarks=12, reach=30.0)
+    whole, local = whole_of(world, 3), world.submaps[3].local
+    known = np.intersect1d(whole.ids, local.ids)
+    assert len(known) >= 4
+    bad = int(np.searchsorted(local.ids, known[1]))
+    entry = len(local.mean) - 2 * len(local.ids) + 2 * bad
+    moved = local.mean.copy()
+    moved[entry] += 40.0 * np.sqrt(local.covariance[entry, entry] + whole.covariance.max())
+    pose, seen, refused = end_pose(whole, replace(local, mean=moved), gate=30.0)
+    expected = joined(whole, without(local, bad))
+    assert (seen, refused) == (len(known), 1)
+    np.testing.assert_allclose(pose.mean, expected.mean[:3], rtol=1e-12)
+    np.testing.assert_allclose(pose.covariance, expected.covariance[:3, :3], rtol=1e-9)
+    all_of_it, seen, refused = end_pose(whole, local, gate=30.0)
+    assert (seen, refused) == (len(known), 0)
+    np.testing.assert_allclose(all_of_it.mean, joined(whole, local).mean[:3], rtol=1e-12)
+
+
+def test_a_map_whose_shared_landmarks_have_no_covariance_has_no_end_pose():
+    world = team(6, robots=1, submaps=4, landmarks=12, reach=30.0)
+    whole, local = whole_of(world, 3), world.submaps[3].local
+    with pytest.raises(NotACovarianceError, match="not positive definite"):
+        end_pose(replace(whole, covariance=-2.0 * whole.covariance), local)
