@@ -18,10 +18,13 @@ def driven(
     out: list[Outgoing] = []
     at = 0
     while at < block.size:
-        count, answer = node.drive_on(block.part(at, block.size))
-        out += answer
-        at += count
-        if at < block.size:  # this one leads to more than motion, or is taken like all others
-            out += give(block.message(at))
-            at += 1
+        # The first one behind another measurement, and the one that stops a run, lead to more.
+        out += give(block.message(at))
+        at += 1
+        reports = True
+        while reports and at < block.size:
+            count, answer = node.drive_on(block.part(at, block.size))
+            out += answer
+            at += count
+            reports = bool(answer)  # it stopped to report its progress, and can go on
     return out
