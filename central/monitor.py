@@ -121,7 +121,8 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
     robots = np.array([each.stream[0] for each in submaps])
     chosen = {"": np.ones(len(submaps), dtype=np.bool_)}
     chosen |= {str(robot): robots == robot for robot in np.unique(robots)}
-    found = {who: covariance_scale(chi2[own], dof[own]) for who, own in chosen.items()}
+    half = np.asarray(chi2_quantile(0.5, dof))
+    found = {who: covariance_scale(chi2[own], dof[own], half[own]) for who, own in chosen.items()}
     return {
         who: Scale(each.value / normal, each.log_sigma)
         for who, each in found.items()

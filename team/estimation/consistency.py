@@ -92,19 +92,23 @@ class Scale(NamedTuple):
 
 
 def covariance_scale(
-    squared: Float[np.ndarray, " K"], dof: Float[np.ndarray, " K"]
+    squared: Float[np.ndarray, " K"],
+    dof: Float[np.ndarray, " K"],
+    medians: Float[np.ndarray, " K"] | None = None,
 ) -> Scale | None:
     """The scale s where half of the terms, by degrees of freedom, lie below s times their median.
 
     Each term is s χ² with dof degrees of freedom, so median_k(squared_k / median χ²(dof_k)) is s.
     It changes with all covariances alike and is insensitive to a few outliers, however large. None
     where no term has one degree of freedom or more; terms with fewer are left out.
+
+    medians: median χ²(dof) of each term, where the caller has it.
     """
     judged = dof >= 1.0
     if not judged.any():
         return None
     squared, dof = squared[judged], dof[judged]
-    ratio = squared / chi2_quantile(0.5, dof)
+    ratio = squared / (chi2_quantile(0.5, dof) if medians is None else medians[judged])
     order = np.argsort(ratio, kind="stable")
     middle = np.cumsum(dof[order]) - 0.5 * dof[order]
     total = float(dof.sum())

@@ -246,7 +246,10 @@ class Island(least_squares.Iterate):
         """
         state = other.state
         factor, offset = self.settings.covariance_factor, self.graph.offset
-        chi2 = float((self.weight * kernel.costs(state, offset, self.factors, factor)).sum())
+        costs = self.chi2
+        if other is not self:
+            costs = kernel.costs(state, offset, self.factors, factor)
+        chi2 = float((self.weight * costs).sum())
         seen = float((self.sighting_weight * other.sighting_chi2).sum())
         seen += float((self.prior_weight * other.prior_chi2).sum())
         old = self.graph.condensed
