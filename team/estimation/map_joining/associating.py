@@ -59,8 +59,6 @@ class IslandView:
     def __init__(self, island: Island, landmarks: Landmarks) -> None:
         self.island = island
         graph = island.graph
-        around = Crowd(each.contribution.local for each in graph.submaps)
-        self.profile = around.bounded(island.settings.association)
         ordered = sorted(graph.landmarks.items(), key=lambda each: each[1])
         self.ids = [id_ for id_, _ in ordered]
         nodes = np.array([node for _, node in ordered], np.int64)
@@ -71,6 +69,12 @@ class IslandView:
         self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
         apart = _apart(graph, self.seen_by, self.ids, landmarks, self.place_of)
         points = mean.reshape(-1, 2)
+        counts = np.bincount(
+            np.concatenate([np.zeros(0, np.int64), *map(np.unique, self.seen_by)]),
+            minlength=len(points),
+        )
+        around = Crowd((each.contribution.local for each in graph.submaps), points[counts > 1])
+        self.profile = around.bounded(island.settings.association)
         unseen = overlooked(points, self.seen_by, self.profile.same)
         self.joint = Joint(points, covariance, apart, around, unseen)
         self.gone = np.zeros(len(nodes), np.bool_)

@@ -4,8 +4,10 @@ Landmarks observed by one keyframe are different ones, whatever else is unknown.
 give the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976,
 J. Appl. Prob. 13). Where landmarks stand in groups it is far above the mean density of the map: a
 pair whose difference is no better known than the spacing within a group may be either of its
-members. The distances also bound the lengths of a profile: two landmarks that are farther apart
-than their neighbours are not one landmark that was split.
+members. What one keyframe observes together says nothing of neighbours that hide each other: these
+are counted in the map, among the landmarks that several submaps have observed. The distances also
+bound the lengths of a profile: two landmarks that are farther apart than their neighbours are not
+one landmark that was split.
 """
 
 from collections.abc import Iterable
@@ -16,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.association import AssociationProfile
-from team.estimation import elementary
+from team.estimation import elementary, elementwise
 from team.estimation.submap import LocalMap
 
 CLOSE = 0.1
@@ -28,9 +30,14 @@ SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
 
 
 class Crowd:
-    """The spacings of the unnamed landmarks of some submaps."""
+    """The spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
-    def __init__(self, submaps: Iterable[LocalMap]) -> None:
+    confirmed: positions of the landmarks that several submaps have observed [m].
+    """
+
+    def __init__(
+        self, submaps: Iterable[LocalMap], confirmed: Float[np.ndarray, "n 2"] | None = None
+    ) -> None:
         each = [local.spacings for local in submaps]
         self.landmarks = sum(len(away) for away in each)
         nearest = np.concatenate(
@@ -38,6 +45,7 @@ class Crowd:
         )
         self.nearest: Float[np.ndarray, " m"] = np.sort(nearest[np.isfinite(nearest)])
         self._each = each
+        self.confirmed = np.zeros((0, 2)) if confirmed is None else confirmed
 
     @cached_property
     def _distances(self) -> Float[np.ndarray, " n"]:
@@ -51,6 +59,23 @@ class Crowd:
         within = np.searchsorted(self._distances, radius) + 1.0
         found: Float[np.ndarray, " k"] = within / (
             max(self.landmarks, 1) * np.pi * elementary.squared(radius)
+        )
+        return found
+
+    @cached_property
+    def _in_map(self) -> Float[np.ndarray, " p"]:
+        one, two = np.triu_indices(len(self.confirmed), 1)
+        return np.sort(elementwise.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
+
+    def density_in_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """The same of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
+
+        Two that are one and wait are counted as neighbours, so that it is too large, never too
+        small, while association is incomplete.
+        """
+        pairs = np.searchsorted(self._in_map, radius, side="right")
+        found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (
+            max(len(self.confirmed), 1) * np.pi * elementary.squared(radius)
         )
         return found
 

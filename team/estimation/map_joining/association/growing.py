@@ -38,6 +38,8 @@ class Joint(NamedTuple):
     apart: which two can not be one, symmetric: they were observed in one scan, have different
         names, or an operator declared them to be two.
     crowd: their local density; None: the density of the profile.
+    unseen: of one map's landmarks, the probability that all windows which saw each of them missed
+        another one beside it; the density of the profile is then an upper bound of the map's own.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -106,6 +108,7 @@ def likelihoods(
         crowded = joint.crowd.density(radius)
         if joint.unseen is not None:
             crowded *= joint.unseen[second]
+            density = np.minimum(density, joint.crowd.density_in_map(radius))
         density = np.maximum(density, crowded)
     llr = -0.5 * chi2 - 0.5 * elementwise.log(determinant) - elementwise.log(2.0 * np.pi * density)
     return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))

@@ -6,7 +6,7 @@ import pytest
 from team.association import AssociationProfile
 from team.config import UNNAMED
 from team.estimation.map_joining.association.crowding import Crowd
-from team.estimation.map_joining.association.growing import Joint, grow
+from team.estimation.map_joining.association.growing import Joint, grow, likelihoods
 from team.estimation.map_joining.association.hypotheses import jointly
 from team.estimation.submap import LocalMap, Unnamed
 
@@ -66,3 +66,20 @@ def test_a_profiles_lengths_are_bounded_by_the_spacing_of_what_is_seen_together(
     nobody = Crowd([_submap(groups, together=False)])
     assert nobody.bounded(PROFILE) == PROFILE
     assert nobody.density(np.array([0.3]))[0] < 0.1 * within
+
+
+def test_two_places_are_one_landmark_sooner_where_the_maps_landmarks_stand_far_apart() -> None:
+    apart = np.zeros((2, 2), np.bool_)
+    places = np.array([(0.0, 0.0), (0.25, 0.0)])  # 2.5 standard deviations of their difference
+    strangers = Joint(places, 0.005 * np.eye(4), apart)
+    pair = np.array([0]), np.array([1])
+    llr = {"the profile's density": float(likelihoods(strangers, *pair, PROFILE).llr[0])}
+    for name, spacing in (("far apart", 2.0), ("close", 0.3)):
+        at = spacing * np.array([(i, j) for i in range(10) for j in range(10)], float)
+        crowd = Crowd([_submap(at, together=True)], at)
+        of_one_map = strangers._replace(crowd=crowd, unseen=np.ones(2))
+        llr[name] = float(likelihoods(of_one_map, *pair, PROFILE).llr[0])
+        between = likelihoods(strangers._replace(crowd=crowd), *pair, PROFILE).llr[0]
+        assert between <= llr["the profile's density"]  # of two maps nothing is known
+    assert llr["close"] < llr["the profile's density"] < PROFILE.llr_tight < llr["far apart"]
+    assert llr["far apart"] - llr["the profile's density"] == pytest.approx(3.8, abs=0.1)
