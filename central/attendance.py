@@ -27,7 +27,9 @@ class TeamAttendance:
     now_ns: int = 0
     withdrawn: frozenset[str] = frozenset()
     ordered: bool = False
-    _names: tuple[str, ...] = field(default=(), init=False)
+    _has_head: bool = field(default=False, init=False)
+    _ended: m.End | None = field(default=None, init=False)
+    _last: dict[str, int] = field(default_factory=dict, init=False)
 
     @classmethod
     def of(cls, robots: Sequence[str]) -> "TeamAttendance":
@@ -81,6 +83,7 @@ class TeamAttendance:
         robot.began = max(robot.began, message.incarnation)
         if isinstance(message, m.StreamHead):
             robot.head = later_head(message, robot.head)
+            self._has_head = True
             self.now_ns = max(self.now_ns, message.stamp_ns)
 
     def _named(self, node: str) -> Attendance | None:
@@ -92,7 +95,7 @@ class TeamAttendance:
         """True where drivers, each with its own end, publish the measurements, and no world
         does.
         """
-        return self.ordered or any(robot.head is not None for robot in self.robots.values())
+        return self.ordered or self._has_head
 
     @property
     def end(self) -> m.End | None:
@@ -180,8 +183,10 @@ class TeamAttendance:
         end = self.end
         if end is None:
             return False
-        ends = [s for s in end.streams if s.robot == name]
-        return not ends or incarnation >= ends[0].incarnation
+        if end is not self._ended:
+            self._ended = end
+            self._last = {s.robot: s.incarnation for s in reversed(end.streams)}
+        return incarnation >= self._last.get(name, incarnation)
 
     def concluded(self, dealt: Dealt) -> bool:
         """True once the streams have ended and no robot is waited for."""

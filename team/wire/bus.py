@@ -259,6 +259,36 @@ class MemoryNetwork:
     stored: dict[str, deque[tuple["MemoryBus", Sample]]] = field(default_factory=dict)
     answers: list[tuple[Channel, str, Answer]] = field(default_factory=list)
     alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
+    _requests: dict[str, tuple[Channel, dict[str, set["MemoryBus"]]]] = field(default_factory=dict)
+    _receivers: dict[str, list["MemoryBus"]] = field(default_factory=dict)
+
+    def enter(self, bus: "MemoryBus") -> None:
+        """Adds a bus, the last one to which a sample is delivered."""
+        self.buses.append(bus)
+
+    def leave(self, bus: "MemoryBus") -> None:
+        """Removes a bus."""
+        self.buses.remove(bus)
+        self._receivers.clear()
+
+    def want(self, bus: "MemoryBus", channel: Channel, name: str) -> None:
+        """Adds the subscription of a bus."""
+        _, buses = self._requests.setdefault(channel.name, (channel, {}))
+        buses.setdefault(name, set()).add(bus)
+        self._receivers.clear()
+
+    def receivers(self, key: str) -> list["MemoryBus"]:
+        """The buses that subscribed to a key, in the order in which they were added."""
+        found = self._receivers.get(key)
+        if found is None:
+            wanting: set[MemoryBus] = set()
+            for channel, buses in self._requests.values():
+                owner = channel.owner(key)
+                if owner is not None:
+                    names = buses if owner == "" else ("*", "**", owner)
+                    wanting.update(*(buses.get(name, ()) for name in names))
+            found = self._receivers[key] = [bus for bus in self.buses if bus in wanting]
+        return found
 
     def deliver(self, source: "MemoryBus", sample: Sample) -> None:
         """Delivers a sample to every other bus that subscribed, and stores it for late joiners."""
@@ -266,9 +296,9 @@ class MemoryNetwork:
         if found is not None and found[0].delivery != "stream":
             stored = self.stored.setdefault(sample.key, deque(maxlen=cache_size(found[0])))
             stored.append((source, sample))
-        for bus in self.buses:
+        for bus in self.receivers(sample.key):
             if bus is not source:
-                bus.offer(sample)
+                bus.queue(sample)
 
 
 class MemoryBus:
@@ -277,11 +307,9 @@ class MemoryBus:
     def __init__(self, network: MemoryNetwork) -> None:
         self._network = network
         self._arrived: deque[Sample] = deque()
-        self._requested: list[tuple[Channel, str]] = []
         self._whole: set[str] = set()
-        self._known: dict[str, bool] = {}
         self._counters: dict[str, int] = defaultdict(int)
-        network.buses.append(self)
+        network.enter(self)
 
     def publish(self, out: Outgoing) -> int:
         """Encodes and delivers at once; the wall clock of a memory bus is always zero."""
@@ -303,23 +331,14 @@ class MemoryBus:
                 self._arrived.extend(sample for source, sample in requested if source is not self)
         if whole:
             self._whole.add(channel.name)
-        self._want(channel, name)
-
-    def _want(self, channel: Channel, name: str) -> None:
-        self._requested.append((channel, name))
-        self._known.clear()
+        self._network.want(self, channel, name)
 
     def _subscribed(self, key: str) -> bool:
-        known = self._known.get(key)
-        if known is None:
-            known = any(_is_of(channel, name, key) for channel, name in self._requested)
-            self._known[key] = known
-        return known
+        return self in self._network.receivers(key)
 
-    def offer(self, sample: Sample) -> None:
-        """Queues the sample if this bus subscribed to its key."""
-        if self._subscribed(sample.key):
-            self._arrived.append(sample)
+    def queue(self, sample: Sample) -> None:
+        """Queues a sample, which `receive` returns."""
+        self._arrived.append(sample)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """All samples received since the last call; a memory bus never waits."""
@@ -365,10 +384,10 @@ class MemoryBus:
 
     def watch_alive(self, node: str = "**") -> None:
         """Receives changes of tokens, the present ones first."""
-        self._want(ALIVE, node)
+        self._network.want(self, ALIVE, node)
         for source, sample in self._network.alive.values():
-            if source is not self:
-                self.offer(sample)
+            if source is not self and self._subscribed(sample.key):
+                self.queue(sample)
 
     def is_alive(self, node: str) -> bool:
         """Whether anyone holds the token."""
@@ -382,13 +401,13 @@ class MemoryBus:
             self._network.alive[node] = (self, sample)
         else:
             self._network.alive.pop(node, None)
-        for bus in self._network.buses:
+        for bus in self._network.receivers(sample.key):
             if bus is not self:
-                bus.offer(sample)
+                bus.queue(sample)
 
     def close(self) -> None:
         """Leaves the network; the tokens are withdrawn."""
-        self._network.buses.remove(self)
+        self._network.leave(self)
         own = [node for node, (source, _) in self._network.alive.items() if source is self]
         for node in own:
             self._token(node, alive=False)

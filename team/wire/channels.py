@@ -13,7 +13,7 @@ observation.
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 from team.wire import messages as m
@@ -73,12 +73,16 @@ class Channel:
         """The robot or node that `key` belongs to on this channel; None where the key is of another
         channel.
         """
+        match = self._pattern.fullmatch(key)
+        return None if match is None else match.groupdict().get("name", "")
+
+    @cached_property
+    def _pattern(self) -> re.Pattern[str]:
         parts = _PLACE.split(self.template)
         pattern = re.escape(parts[0])
         if len(parts) > 1:
             pattern += f"(?P<name>{_PATTERNS[parts[1]]}){re.escape(parts[2])}"
-        match = re.fullmatch(pattern, key)
-        return None if match is None else match.groupdict().get("name", "")
+        return re.compile(pattern)
 
 
 START = Channel(name="start", template="source/{robot}/start", message=m.InitialPose, rate="once per incarnation", delivery="all", recorded=True, recomputable=False,
