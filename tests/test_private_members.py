@@ -9,7 +9,10 @@ from tests.support import ROOT
 WINGS = ("team", "central", "sim", "benchmarks", "examples")
 OFFICIAL = {"_replace", "_asdict", "_fields", "_exit"}
 """Named so by the language's own library, and meant for all: named tuples, `os._exit`."""
-NUMBAS = {"_cache", "_cache_file", "_cache_path", "_impl"}
+NUMBAS = {
+    *("_cache", "_cache_file", "_cache_path", "_impl", "_data_path", "_load_overload", "_memo"),
+    "_guard_against_spurious_io_errors",
+}
 """What team/estimation/compiled.py has to ask numba for: it has no public way."""
 
 

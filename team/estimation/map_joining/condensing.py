@@ -66,9 +66,9 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
     if not leaving.any():
         return fold
     others = (each for at, each in fold.islands.items() if at != key)
-    elsewhere = {id_ for each in others for id_ in each.graph.landmarks}
+    apart = {id_ for each in others for id_ in each.graph.landmarks}
     try:
-        smaller = _condensed(island, leaving, elsewhere, first)
+        smaller = _condensed(island, leaving, apart, first)
     except UNSOLVABLE:
         return fold
     gone = smaller.graph.gone
@@ -102,10 +102,10 @@ def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
 
 
 def _condensed(
-    island: Island, leaving: Bool[np.ndarray, " F"], elsewhere: Collection[int], first: int
+    island: Island, leaving: Bool[np.ndarray, " F"], apart: Collection[int], first: int
 ) -> Island:
     graph, before = island.graph, island.graph.condensed
-    rests = idle(graph, ~leaving, elsewhere, first)
+    rests = idle(graph, ~leaving, apart, first)
     eliminated = _eliminated(graph, leaving)
     eliminated[rests] = True
     seen = np.array(

@@ -63,18 +63,18 @@ def split(H: Matrix, g: Values, out: Marks) -> Split:
     return Split(out, lowered, slope, symmetric, factor, -solved[:, -1], -solved[:, :-1])
 
 
-def idle(graph: Graph, stays: Marks, elsewhere: Collection[int], first: int) -> Indices:
+def idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indices:
     """The nodes of landmarks that come to rest, ascending: no submap that stays contains them, nor
-    another island.
+    another island, whose landmarks are `apart`.
 
     None, while nothing rests yet and there are fewer than `first`.
     """
     seen = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(stays):
         seen[graph.submaps[f].nodes] = True
-    found = sorted(n for id_, n in graph.landmarks.items() if not seen[n] and id_ not in elsewhere)
-    begun = graph.condensed is not None and graph.condensed.resting is not None
-    return np.array(found if begun or len(found) >= first else [], np.int64)
+    found = sorted(n for id_, n in graph.landmarks.items() if not seen[n] and id_ not in apart)
+    some_rest = graph.condensed is not None and graph.condensed.resting is not None
+    return np.array(found if some_rest or len(found) >= first else [], np.int64)
 
 
 def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Resting | None:
@@ -85,30 +85,32 @@ def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Rest
     if not len(nodes) and (old is None or old.resting is None):
         return None
     before, sizes = resting_of(island), np.diff(graph.offset)[union]
-    kept = np.isin(union, nodes if old is None else np.concatenate([old.nodes, nodes]))
-    kept, rests = (np.repeat(each, sizes)[parts.out] for each in (kept, np.isin(union, nodes)))
+    at_rest = np.isin(union, nodes if old is None else np.concatenate([old.nodes, nodes]))
+    at_rest, rests = (
+        np.repeat(each, sizes)[parts.out] for each in (at_rest, np.isin(union, nodes))
+    )
     gain, means = np.zeros((len(before.means), len(parts.out))), before.means
     if old is not None:
         first = np.concatenate([[0], np.cumsum(sizes)])
         gain[:, places(first, np.searchsorted(union, old.nodes))] = before.gain
         means = means + dense.product(before.gain, old.moved(island.state, graph.boundary))
-    on_out = np.ascontiguousarray(gain[:, parts.out][:, kept])
+    on_out = np.ascontiguousarray(gain[:, parts.out][:, at_rest])
     gain = np.ascontiguousarray(gain[:, ~parts.out])
-    add_product(on_out, np.ascontiguousarray(parts.gain[kept]), gain, (0, 0), False, False)
-    root = dense.forward(parts.factor, np.eye(len(kept))[:, kept])
+    add_product(on_out, np.ascontiguousarray(parts.gain[at_rest]), gain, (0, 0), False, False)
+    root = dense.forward(parts.factor, np.eye(len(at_rest))[:, at_rest])
     covariance = dense.product(root.T, root)
     spread = dense.product(on_out, covariance)
     n, total = len(means), len(means) + 2 * len(nodes)
     upper = upper_of(before.covariance, np.arange(n), total)
     add_product(spread, np.ascontiguousarray(on_out.T), upper, (0, 0), True, False)
-    upper[:n, n:] = spread[:, rests[kept]]
-    upper[n:, n:] = covariance[np.ix_(rests[kept], rests[kept])]
+    upper[:n, n:] = spread[:, rests[at_rest]]
+    upper[n:, n:] = covariance[np.ix_(rests[at_rest], rests[at_rest])]
     id_of = {node: id_ for id_, node in graph.landmarks.items()}
     ids = np.array([id_of[node] for node in nodes.tolist()], np.int64)
     points = island.state[places(graph.offset, nodes)] + parts.step[rests]
     return Resting(
         np.concatenate([before.ids, ids]),
-        np.concatenate([means + dense.product(on_out, parts.step[kept]), points]),
+        np.concatenate([means + dense.product(on_out, parts.step[at_rest]), points]),
         np.concatenate([gain, parts.gain[rests]]),
         upper,
     )

@@ -189,7 +189,7 @@ def test_a_clique_is_big_from_the_threshold_on_and_right_on_either_side(beyond):
         np.testing.assert_array_equal(block, 0.5 * (columns + columns.T))
 
 
-@pytest.mark.parametrize("bad", [0, 15, 16, 100, 170, 171])
+@pytest.mark.parametrize("bad", [0, 15, 16, 50, 84, 85])
 def test_an_indefinite_big_matrix_names_the_variable_of_its_pivot(bad):
     n = products.ROWS
     pattern = clique(n)
