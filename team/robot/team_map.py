@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from team import translate
 from team.estimation.map_joining.conditioning import (
     Followed,
@@ -13,6 +15,7 @@ from team.estimation.map_joining.conditioning import (
     pose_now,
 )
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.map_joining.whole_map import initial_map
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
 
@@ -29,6 +32,8 @@ class TeamMap:
         self._prior: m.Prior | None = None
         self._submaps = 0
         self._shared = SubmapCorrection()
+        self._whole = initial_map(np.zeros(3), None)
+        self._pending: list[LocalMap] = []
         self._followed: Followed | Exception | None = None
         self.known = 0
         self.refused = 0
@@ -69,14 +74,15 @@ class TeamMap:
         submaps have no joint solution, that is found once and raised again at every keyframe.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
-            robot_prior = translate.prior_of(prior)
-            pending = [
-                robot_prior.shared.taken(each.named)
-                for each in submaps[max(0, prior.sequence + 1) :]
-            ]
-            self._prior, self._shared, self._submaps = prior, robot_prior.shared, len(submaps)
+            if prior is not self._prior or len(submaps) < self._submaps:
+                self._prior, self._submaps, self._pending = prior, 0, []
+                decoded = translate.prior_of(prior)
+                self._whole, self._shared = decoded.whole, decoded.shared
+            later = submaps[max(self._submaps, prior.sequence + 1) :]
+            self._pending += [self._shared.taken(each.named) for each in later]
+            self._submaps = len(submaps)
             try:
-                self._followed = followed(robot_prior.whole, pending)
+                self._followed = followed(self._whole, self._pending)
             except UNSOLVABLE as error:
                 self._followed = error
         if isinstance(self._followed, Exception):

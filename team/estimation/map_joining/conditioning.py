@@ -14,21 +14,32 @@ message that is fused.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
+from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.config import Bias
 from team.estimation.compiled import compiled
 from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Contribution
 from team.estimation.dense_kernel import matrix_product
-from team.estimation.gaussian import PoseGaussian
+from team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from team.estimation.geometry import tangent
-from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
+from team.estimation.map_joining.chain_kernel import (
+    NO_COVARIANCE,
+    Chain,
+    SolvedChain,
+    solved_chain,
+)
+from team.estimation.map_joining.gauss_newton import (
+    Island,
+    JoinSettings,
+    NotDeterminedError,
+    joint_marginal,
+    settled,
+)
 from team.estimation.map_joining.joining_kernel import landmark_chi2
 from team.estimation.map_joining.merging import ages
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
@@ -152,36 +163,64 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     submaps = [each.without_nodes for each in pending]
     if not submaps:
         return Followed(whole)
-    island, _, _ = settled(_island(whole, submaps, TRUSTING))
-    known, refused = tuple(_shared(whole, submaps)), tuple(0 for _ in submaps)
-    if any(beyond.any() for beyond in _beyond_gate(island)):
-        doubted, _, _ = settled(replace(island, settings=DOUBTING))
+    found = _solved(whole, submaps)
+    known, refused = tuple(found.known.tolist()), tuple(0 for _ in submaps)
+    if found.beyond.any():
+        doubted, _, _ = settled(_island(whole, submaps, DOUBTING))
         beyond = _beyond_gate(doubted)
         refused = tuple(int(each.sum()) for each in beyond)
         if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
-            reduced = [_without(*pair) for pair in zip(submaps, beyond, strict=True)]
-            island, _, _ = settled(_island(whole, reduced, TRUSTING))
-    cost, dof = float(island.chi2.sum()), _degrees(island)
-    disputed = cost > _most(dof) or any(
+            found = _solved(whole, [_without(*pair) for pair in zip(submaps, beyond, strict=True)])
+    joint = WholeMap(found.ids, found.mean, found.covariance)
+    disputed = found.cost > _most(found.dof) or any(
         is_majority(*pair) for pair in zip(refused, known, strict=True)
     )
     if disputed:
-        island, _, _ = settled(_island(whole, submaps, DISPUTED))
+        joint = _disputed(whole, submaps)
+    return Followed(joint, known, refused, found.cost, found.dof, disputed)
+
+
+def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> SolvedChain:
+    """The map and the submaps by plain least squares, with all their landmarks.
+
+    Raises NotACovarianceError, NotDeterminedError.
+    """
+    ids = [whole.ids, *(each.ids for each in submaps)]
+    means = [whole.mean, *(each.mean for each in submaps)]
+    covariances = [whole.covariance.ravel(), *(each.covariance.ravel() for each in submaps)]
+    chain = Chain(
+        np.concatenate(ids),
+        _starts(ids),
+        np.concatenate(means),
+        _starts(means),
+        np.concatenate(covariances),
+    )
+    found = solved_chain(chain, GATE, TRUSTING.max_iterations, TRUSTING.step_tolerance)
+    if found.fault == NO_COVARIANCE:
+        what = f"the robot's submap {found.of} behind the prior" if found.of else "the prior"
+        raise NotACovarianceError(what, "not positive definite")
+    if found.fault:
+        raise NotDeterminedError("the robot's map")
+    return found
+
+
+def _starts(parts: Sequence[np.ndarray]) -> Int64[np.ndarray, " _"]:
+    """Where each of these rows begins in all of them, and where the last one ends."""
+    return np.cumsum([0, *map(len, parts)], dtype=np.int64)
+
+
+def _disputed(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
+    """The map after submaps, of which one as a whole may be wrong, or the map itself."""
+    island, _, _ = settled(_island(whole, submaps, DISPUTED))
     graph = island.graph
     ids = sorted(graph.landmarks)
     nodes = [graph.streams[SELF][-1], *(graph.landmarks[id_] for id_ in ids)]
-    mean, covariance = joint_marginal(island, nodes)
-    joint = WholeMap(np.array(ids, dtype=np.uint32), mean, covariance)
-    return Followed(joint, known, refused, cost, dof, disputed)
+    return WholeMap(np.array(ids, dtype=np.uint32), *joint_marginal(island, nodes))
 
 
 def is_majority(refused: int, known: int) -> bool:
     """Whether so many known landmarks are refused that the fault is not with single landmarks."""
     return refused >= FEWEST and 2 * refused > known
-
-
-def _degrees(island: Island) -> int:
-    return int(island.graph.dimensions.sum()) - island.graph.unknowns
 
 
 def _most(dof: int) -> float:
@@ -210,15 +249,6 @@ def _without(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
     for place in np.flatnonzero(beyond)[::-1]:
         local = without(local, int(place))
     return local
-
-
-def _shared(whole: WholeMap, submaps: Sequence[LocalMap]) -> Iterator[int]:
-    """For each submap, how many of its landmarks the map or another submap contains, too."""
-    ids, counts = np.unique(
-        np.concatenate([whole.ids, *(each.ids for each in submaps)]), return_counts=True
-    )
-    for each in submaps:
-        yield int(np.isin(each.ids, ids[counts > 1]).sum())
 
 
 def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:

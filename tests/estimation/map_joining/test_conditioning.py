@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.gaussian import PoseGaussian
+from team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from team.estimation.geometry import compose, exponential, tangent
 from team.estimation.map_joining import conditioning, whole_map
 from team.estimation.map_joining.conditioning import (
+    TRUSTING,
     RobotPrior,
     SubmapCorrection,
     curved,
     followed,
     pose_now,
 )
-from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
+from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.estimation.map_joining.marginals import prior_for, trajectory
 from team.estimation.map_joining.whole_map import without
@@ -62,6 +63,47 @@ def test_conditioning_equals_the_full_join_in_the_linear_case(seed, known):
         path.covariances[-1] / np.outer(sigma, sigma),
         atol=1e-3,
     )
+
+
+def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
+    """The kernel has the graph's iterations, dense and in one call; the answers differ by rounding.
+
+    Large errors of the first guess, so that steps are shortened.
+    """
+    away = 0.0
+    for seed in range(4):
+        world = team(seed, submaps=8, landmarks=10, size=60.0, reach=20.0, sigmas=(0.3, 0.5, 2.0))
+        before, after = later(world, "r0", 3)
+        prior = prior_for(joined(before, world.starts), "r0", 0)
+        pending = [each.local for each in after]
+        found = conditioning._solved(prior.whole, pending)
+        island, _, _ = settled(conditioning._island(prior.whole, pending, TRUSTING))
+        graph = island.graph
+        nodes = [graph.streams[conditioning.SELF][-1]]
+        nodes += [graph.landmarks[id_] for id_ in found.ids.tolist()]
+        mean, covariance = joint_marginal(island, nodes)
+        sigma = np.sqrt(np.diag(covariance))
+        away = max(away, np.abs((found.mean - mean) / sigma).max())
+        away = max(away, np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max())
+        assert found.cost == pytest.approx(island.chi2.sum(), rel=1e-9)
+        assert found.dof == int(graph.dimensions.sum()) - graph.unknowns
+        beyond = np.concatenate(conditioning._beyond_gate(island))
+        np.testing.assert_array_equal(found.beyond, beyond)
+    assert away < 1e-9
+
+
+def test_a_prior_or_a_submap_without_a_covariance_has_no_solution():
+    world = team(1, submaps=4)
+    before, after = later(world, "r0", 2)
+    prior = prior_for(joined(before, world.starts), "r0", 0)
+    submap = after[0].local
+    flat = LocalMap(submap.ids, submap.mean, np.zeros_like(submap.covariance))
+    for whole, pending in (
+        (prior._replace(covariance=0.0 * prior.covariance).whole, [submap]),
+        (prior.whole, [submap, flat]),
+    ):
+        with pytest.raises(NotACovarianceError):
+            followed(whole, pending)
 
 
 def test_an_open_window_is_one_more_submap():
