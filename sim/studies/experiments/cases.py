@@ -62,6 +62,9 @@ class Cases:
         of a Dask scheduler whose workers can read the folder; then as many run at a time as it has
         workers.
         """
+        # An idle worker may end just as it gets a case; joblib warns and starts another.
+        # Where warnings are errors its thread would end instead, and nobody would start one.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         waiting = {task.name: task for task in sorted(tasks, key=lambda task: -task.cost)}
         with ExitStack() as stack:
             for each in _backend(scheduler):
