@@ -54,6 +54,7 @@ class IslandView:
 
     ids, nodes: the identity and the node of each landmark, in the order of the nodes.
     seen_by: for each submap of the graph, the indices of its landmarks in `ids`.
+    sees: which landmarks each submap has; where some are merged, those that they are now.
     """
 
     def __init__(self, island: Island, landmarks: Landmarks) -> None:
@@ -78,7 +79,10 @@ class IslandView:
         unseen = overlooked(points, self.seen_by, self.profile.same)
         self.joint = Joint(points, covariance, apart, around, unseen)
         self.gone = np.zeros(len(nodes), np.bool_)
-        self._now = np.arange(len(nodes))
+        self.sees = np.zeros((len(self.seen_by), len(nodes)), np.bool_)
+        for row, places in zip(self.sees, self.seen_by, strict=True):
+            row[places] = True
+        self._seen, self._now = self.sees.copy(), np.arange(len(nodes))
         self.ties: list[tuple[int, MergeRecord]] = []
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
 
@@ -98,10 +102,12 @@ class IslandView:
             self.ties.append((self.ids[pair.first], tie))
             self.gone[pair.first] = True
             self._now[self._now == pair.first] = pair.second
+            self.sees[:, pair.second] |= self.sees[:, pair.first]
+            self.sees[:, pair.first] = False
 
-    def current(self, k: int) -> Indices:
-        """The landmarks of submap k, where some are merged the ones that they are now."""
-        return np.unique(self._now[self.seen_by[k]])
+    def now(self, places: Indices) -> Indices:
+        """These landmarks, where some are merged the ones that they are now."""
+        return np.unique(self._now[places])
 
     def step(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
         """Merges pairs out of two lists of landmarks, growing from the most certain pair
@@ -118,10 +124,11 @@ class IslandView:
         """Merges the pairs of submap k and one other submap after the other on which all likely
         joint assignments of the two agree.
         """
-        own = np.unique(self._now[_unnamed(self, k)])
-        submaps = [self.current(each) for each in range(len(self.seen_by)) if each != k]
-        for candidates in comparable(self.joint, own, submaps, self.profile, most_sd):
-            first, second = own[~self.gone[own]], np.unique(self._now[candidates])
+        own = self.now(_unnamed(self, k))
+        others = self.sees.copy()
+        others[k] = False
+        for candidates in comparable(self.joint, own, others, self.profile, most_sd):
+            first, second = own[~self.gone[own]], self.now(candidates)
             one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
             different = one != two
             found = jointly(self.joint, one[different], two[different], self.profile, most_sd)
@@ -152,9 +159,8 @@ class IslandView:
         """Marks pairs that one window observed and kept apart, unless the evidence now favours one
         landmark.
         """
-        own = np.zeros((len(self.ids), len(self.ids)), np.bool_)
-        for places in self.seen_by:
-            own[np.ix_(places, places)] = True
+        seen = self._seen.astype(np.float32)
+        own = seen.T @ seen > 0.0  # exact: sums of ones
         at = likelihoods(self.joint, one, two, self.profile)
         return np.asarray(own[one, two] & (at.llr < self.profile.odds))
 
@@ -234,15 +240,15 @@ def _again(
     pair that was undecided may be decidable now.
     """
     fresh = [k for each in arrived if (k := order.get(id(each))) is not None]
-    near = union(view.current(k) for k in fresh)
+    near = np.flatnonzero(view.sees[fresh].any(axis=0))
     if not len(near):
         return []
     away = np.abs(view.joint.mean[:, None] - view.joint.mean[near][None]).max(axis=2).min(axis=1)
     around = np.flatnonzero((away < AGAIN_WITHIN * view.profile.same) & ~view.gone)
     loose = np.zeros(len(view.ids), np.bool_)
     loose[undecided(view.joint, around, view.profile)] = True
-    found = [k for k in range(len(view.seen_by)) if k not in fresh and loose[view.current(k)].any()]
-    return by_turns(found, len(view.seen_by))
+    found = np.setdiff1d(np.flatnonzero(view.sees[:, loose].any(axis=1)), fresh)
+    return by_turns(found.tolist(), len(view.seen_by))
 
 
 def applied(fold: Fold, key: Stream, view: IslandView) -> Fold:

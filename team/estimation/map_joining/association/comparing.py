@@ -9,6 +9,7 @@ at a time, beside what is known to be different from these.
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from team.association import AssociationProfile
 from team.estimation.map_joining.association.growing import Indices, Joint, likelihoods
@@ -28,7 +29,7 @@ a landmark that the tick brings.
 def comparable(
     joint: Joint,
     own: Indices,
-    submaps: Sequence[Indices],
+    sees: Bool[np.ndarray, "K n"],
     profile: AssociationProfile,
     most_sd: float,
 ) -> list[Indices]:
@@ -38,11 +39,10 @@ def comparable(
     may be, and that are known to be none of those of the submap that it may be. Without them a
     landmark that the submap missed would be taken for its neighbour.
 
-    submaps: the landmarks of each submap. most_sd: candidates with a larger standard deviation of
+    sees: which landmarks each submap has. most_sd: candidates with a larger standard deviation of
         the difference are left out.
     """
-    filled = [each for each in submaps if len(each)]
-    others = np.setdiff1d(np.concatenate([own[:0], *filled]), own)
+    others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
     one, two = (each.ravel() for each in np.meshgrid(own, others, indexing="ij"))
     at = likelihoods(joint, one, two, profile)
     open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[one, two]
@@ -50,12 +50,12 @@ def comparable(
         return []
     fits = np.zeros((len(own), len(joint.mean)), np.bool_)
     fits[np.searchsorted(own, one[open_]), two[open_]] = True
-    begin = np.concatenate([[0], np.cumsum([len(each) for each in filled])[:-1]])
-    candidates = np.logical_or.reduceat(fits[:, np.concatenate(filled)], begin, axis=1).sum(axis=0)
+    common = fits.astype(np.float32) @ sees.T.astype(np.float32)  # exact: sums of ones
+    candidates = (common > 0.0).sum(axis=0)
     best = sorted(np.flatnonzero(candidates).tolist(), key=lambda k: (-int(candidates[k]), -k))
     found = []
     for k in best[:COMPARED]:
-        theirs = np.unique(filled[k])
+        theirs = np.flatnonzero(sees[k])
         rivals = np.zeros(len(joint.mean), np.bool_)
         for row in fits:
             mine = theirs[row[theirs]]

@@ -36,6 +36,10 @@ def _seen(submaps: list[list[int]], common: float) -> tuple[Joint, list[np.ndarr
     ]
 
 
+def _rows(submaps: list[np.ndarray], joint: Joint) -> Bool[np.ndarray, "K n"]:
+    return np.array([np.isin(np.arange(len(joint.mean)), each) for each in submaps])
+
+
 def _pairs(joint: Joint, own: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int]]:
     one, two = (each.ravel() for each in np.meshgrid(own, candidates, indexing="ij"))
     return sorted((p.first, p.second) for p in jointly(joint, one, two, PROFILE, 0.5).pairs)
@@ -45,20 +49,20 @@ def test_fragments_that_wait_do_not_keep_a_submap_from_being_told_apart():
     joint, (own, *others) = _seen([[0, 1, 2, 3]] * 5, common=0.15)
     assert not _pairs(joint, own, np.concatenate(others))
     found = set()
-    for candidates in comparable(joint, own, others, PROFILE, 0.5):
+    for candidates in comparable(joint, own, _rows(others, joint), PROFILE, 0.5):
         found |= {(one, two % 4) for one, two in _pairs(joint, own, candidates)}
     assert found == {(k, k) for k in range(4)}
 
 
 def test_what_the_other_submap_missed_is_a_rival_of_what_it_has():
     joint, (own, other, whole) = _seen([[1], [0], [0, 1]], common=0.04)
-    fits = comparable(joint, own, [other], PROFILE, 0.5)
+    fits = comparable(joint, own, _rows([other], joint), PROFILE, 0.5)
     assert [each.tolist() for each in fits] == [other.tolist()]
     apart = joint.apart.copy()
     apart[other, whole[1]] = apart[whole[1], other] = True  # one keyframe saw the two together
-    with_rival = comparable(joint._replace(apart=apart), own, [other], PROFILE, 0.5)
+    with_rival = comparable(joint._replace(apart=apart), own, _rows([other], joint), PROFILE, 0.5)
     assert [each.tolist() for each in with_rival] == [other.tolist()]
-    both = comparable(joint._replace(apart=apart), own, [other, whole], PROFILE, 0.5)
+    both = comparable(joint._replace(apart=apart), own, _rows([other, whole], joint), PROFILE, 0.5)
     assert [other[0], whole[1]] in [each.tolist() for each in both]
 
 
