@@ -14,13 +14,15 @@ of the age."""
 class Checkpoint:
     """The fold after a tick; tested: its number of submaps when suspects were last tested.
 
-    number: of the ticks that were taken, this one included.
+    number: of the ticks that were taken, this one included. raw: nothing was condensed in any of
+    them.
     """
 
     tick: int
     fold: Fold
     tested: int
     number: int
+    raw: bool
 
 
 class Checkpoints:
@@ -50,7 +52,8 @@ class Checkpoints:
     def push(self, tick: int, fold: Fold) -> None:
         """Add the fold after one more tick; older ones are compacted, and thinned by their age."""
         *before, last = self.taken or (None,)
-        new = Checkpoint(tick, fold, self.tested, 1 if last is None else last.number + 1)
+        number = 1 if last is None else last.number + 1
+        new = Checkpoint(tick, fold, self.tested, number, self.is_raw and not fold.departed)
         older = () if last is None else (*before, replace(last, fold=compacted(last.fold)))
         self.taken = thinned((*older, new))
 
@@ -64,7 +67,12 @@ class Checkpoints:
 
     def raw(self) -> "Checkpoints":
         """The checkpoints before anything was condensed."""
-        return Checkpoints(tuple(each for each in self.taken if not each.fold.departed))
+        return Checkpoints(tuple(each for each in self.taken if each.raw))
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether nothing has been condensed yet."""
+        return not self.taken or self.taken[-1].raw
 
 
 def thinned(taken: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
@@ -74,7 +82,7 @@ def thinned(taken: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
     folded from a checkpoint that is not much older than it, and there are a few tens in all.
     """
     last = taken[-1].number
-    raw = max((each.number for each in taken if not each.fold.departed), default=0)
+    raw = max((each.number for each in taken if each.raw), default=0)
     return tuple(
         each
         for each in taken

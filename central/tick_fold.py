@@ -228,6 +228,7 @@ class TickFold:
     def _with_tick(self, fold: Fold, tick: int) -> Fold:
         """The fold with all of a tick; members beyond the bounds are refused before the others.
 
+        A closure moves what is condensed too far for its linearisation: then nothing is condensed.
         Raises CondensedError where an island would have to be moved that is condensed, or comes to
         have unnamed landmarks.
         """
@@ -236,9 +237,14 @@ class TickFold:
         members = self._inputs.tick(tick, self._gone)
         submaps = members.contributions
         unnamed = (each.stream for each in submaps if (each.local.ids >= UNNAMED).any())
-        if fold.departed and (stream := next(unnamed, None)) is not None:
+        is_named = not fold.landmarks.number
+        if fold.departed and is_named and (stream := next(unnamed, None)) is not None:
             raise CondensedError(stream)
-        return taken(fold, members, self.settings)
+        after = taken(fold, members, self.settings)
+        if fold.departed and after.landmarks.opened:
+            fold = self._inputs.relinearised(fold, tick - 1, self._gone)
+            after = after if fold.departed else taken(fold, members, self.settings)
+        return after
 
     def _condensed(self, fold: Fold, tick: int) -> Fold:
         """The fold that a tick is added to; relinearised where that is due."""
@@ -308,10 +314,11 @@ class TickFold:
         while True:
             self.take_until(math.inf)
             fold = self.fold
-            if fold.departed and fold.size > FULL:
-                fold = self._inputs.relinearised(fold, math.inf, self._gone)
-            if fold.departed:
-                return self._solved_raw()
+            if not self.checkpoints.is_raw:
+                if fold.departed and fold.size > FULL:
+                    fold = self._inputs.relinearised(fold, math.inf, self._gone)
+                if fold.departed or fold.size <= FULL:
+                    return self._solved_raw()
             if not fold.contributions:
                 return fold
             fold = converged(fold, self.settings)

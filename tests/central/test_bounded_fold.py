@@ -1,6 +1,5 @@
 """The running fold of a long run: bounded, a pure function of the set, and the final map is not."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -120,11 +119,9 @@ def test_a_withdrawal_gives_the_fold_without_the_robot():
 
 
 def test_checkpoints_are_few_and_spaced_by_their_age():
-    raw, late = EMPTY_FOLD, replace(EMPTY_FOLD, departed=1)
     kept: tuple[Checkpoint, ...] = ()
     for number in range(1, 5001):
-        fold = raw if number <= 20 else late
-        kept = thinned((*kept, Checkpoint(number, fold, 0, number)))
+        kept = thinned((*kept, Checkpoint(number, EMPTY_FOLD, 0, number, raw=number <= 20)))
     numbers = [each.number for each in kept]
     assert len(numbers) < 90
     assert numbers[-8:] == list(range(4993, 5001))

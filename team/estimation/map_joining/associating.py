@@ -53,7 +53,7 @@ class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
     ids, nodes: the identity and the node of each landmark, in the order of the nodes.
-    seen_by: for each submap of the graph, the indices of its landmarks in `ids`.
+    seen_by: for each submap that is examined (`Graph.observed`), the indices of its landmarks in `ids`.
     sees: which landmarks each submap has; where some are merged, those that they are now.
     """
 
@@ -65,16 +65,19 @@ class IslandView:
         nodes = np.array([node for _, node in ordered], np.int64)
         self.place = np.full(len(graph.fixed), -1, np.int64)
         self.place[nodes] = np.arange(len(nodes))
-        self.seen_by = [self.place[each.landmarks] for each in graph.submaps]
+        self.seen_by = [self.place[each.landmarks] for each in graph.observed]
         mean, covariance = joint_marginal(island, nodes.tolist())
         self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
+        self._beside = self.place[graph.memory.pairs]
         apart = _apart(graph, self.seen_by, self.ids, landmarks, self.place_of)
+        one, two = self._beside[graph.memory.distinct].T
+        apart[one, two] = apart[two, one] = True
         points = mean.reshape(-1, 2)
         counts = np.bincount(
             np.concatenate([np.zeros(0, np.int64), *map(np.unique, self.seen_by)]),
             minlength=len(points),
         )
-        around = Crowd((each.contribution.local for each in graph.submaps), points[counts > 1])
+        around = Crowd((each.contribution.local for each in graph.observed), points[counts > 1])
         self.profile = around.bounded(island.settings.association)
         unseen = overlooked(points, self.seen_by, self.profile.same)
         self.joint = Joint(points, covariance, apart, around, unseen)
@@ -88,7 +91,7 @@ class IslandView:
 
     def views(self, k: int) -> list[Indices]:
         """Indices of the unnamed landmarks that each keyframe of submap k observed together."""
-        local = self.island.graph.submaps[k].contribution.local
+        local = self.island.graph.observed[k].contribution.local
         places = self.seen_by[k][local.ids >= UNNAMED]
         return [places[each] for each in local.unnamed.views]
 
@@ -161,6 +164,8 @@ class IslandView:
         """
         seen = self._seen.astype(np.float32)
         own = seen.T @ seen > 0.0  # exact: sums of ones
+        first, second = self._beside.T
+        own[first, second] = own[second, first] = True
         at = likelihoods(self.joint, one, two, self.profile)
         return np.asarray(own[one, two] & (at.llr < self.profile.odds))
 
@@ -188,7 +193,7 @@ def _apart(
     """
     named = np.array(ids) < UNNAMED
     apart = named[:, None] & named[None, :]
-    for submap, places in zip(graph.submaps, seen_by, strict=True):
+    for submap, places in zip(graph.observed, seen_by, strict=True):
         one, two = submap.contribution.local.distinct
         apart[places[one], places[two]] = True
     for first, second, same in landmarks.verdicts:
@@ -213,7 +218,7 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
     """Tracks, merges nearby landmarks and sweeps, for the new submaps of one island."""
     island = fold.islands[key]
     view = IslandView(island, fold.landmarks)
-    order = {id(each.contribution): k for k, each in enumerate(island.graph.submaps)}
+    order = {id(each.contribution): k for k, each in enumerate(island.graph.observed)}
     view.agreed(fold.landmarks)
     for contribution in arrived:
         k = order.get(id(contribution))
@@ -248,7 +253,7 @@ def _again(
     loose = np.zeros(len(view.ids), np.bool_)
     loose[undecided(view.joint, around, view.profile)] = True
     found = np.setdiff1d(np.flatnonzero(view.sees[:, loose].any(axis=1)), fresh)
-    return by_turns(found.tolist(), len(view.seen_by))
+    return by_turns(found.tolist(), view.island.graph.size)
 
 
 def applied(fold: Fold, key: Stream, view: IslandView) -> Fold:
@@ -269,14 +274,14 @@ def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]
     """Indices in the graph of the last `count` submaps of a stream before this sequence number."""
     return [
         k
-        for k, each in enumerate(graph.submaps)
+        for k, each in enumerate(graph.observed)
         if each.contribution.stream == stream
         and sequence - count <= each.contribution.sequence < sequence
     ]
 
 
 def _unnamed(view: IslandView, k: int) -> Int64[np.ndarray, " _"]:
-    ids = view.island.graph.submaps[k].contribution.local.ids
+    ids = view.island.graph.observed[k].contribution.local.ids
     places: Int64[np.ndarray, " _"] = view.seen_by[k][ids >= UNNAMED]
     return places
 

@@ -69,7 +69,7 @@ def share_now(fold: Fold, opened: Opened) -> float | None:
     graph, margin = island.graph, island.settings.association.recent
     newer = {stream: (first, last) for stream, first, last in opened.newer}
     sides = np.zeros((2, len(graph.fixed)), np.bool_)
-    for submap in graph.submaps:
+    for submap in graph.observed:
         of = submap.contribution
         first, last = newer.get(of.stream, (OPEN, -OPEN))
         if first <= of.sequence <= last:

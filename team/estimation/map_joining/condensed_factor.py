@@ -9,7 +9,7 @@ for the linearisation point, which stays `at`, and the robust weights, which kee
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -159,3 +159,49 @@ def places(offset: Indices, nodes: Indices) -> Indices:
     first = np.repeat(offset[nodes] - np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
     found: Indices = first + np.arange(len(first))
     return found
+
+
+def tied_nodes(
+    old: Condensed, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]
+) -> Condensed:
+    """The factor after landmarks have become one node, exactly: the same cost where they are equal.
+
+    sizes: how many numbers each node has had; node_of: its new node. becomes: the new number of
+    each landmark that gets one. Of those that become one the first one's linearisation point stays.
+    """
+    departed = old.departed
+    if any(id_ in departed.believed for id_ in becomes):
+        believed: dict[int, int] = {}
+        for id_, count in departed.believed.items():
+            now = becomes.get(id_, id_)
+            believed[now] = believed.get(now, 0) + count
+        departed = departed._replace(believed=believed)
+    now = node_of[old.nodes]
+    if (np.diff(now) > 0).all():
+        return replace(old, nodes=now, departed=departed)
+    nodes, at = np.unique(now, return_index=True)
+    own = sizes[old.nodes]
+    begin = np.concatenate([[0], np.cumsum(own[at])])
+    to = places(begin, np.searchsorted(nodes, now))
+    _, first = np.unique(to, return_index=True)
+    moved = old.at[first][to] - old.at
+    moved[old.headings] = 0.0
+    half = dense.product(old.information, moved)
+    others = np.setdiff1d(np.arange(len(to)), first)
+    information = old.information[np.ix_(first, first)]
+    np.add.at(information, to[others], old.information[np.ix_(others, first)])
+    np.add.at(information.T, to[others], old.information[np.ix_(others, first)])
+    corner = np.ix_(to[others], to[others])
+    np.add.at(information, corner, old.information[np.ix_(others, others)])
+    slope = np.zeros(len(first))
+    np.add.at(slope, to, old.slope + half)
+    return replace(
+        old,
+        nodes=nodes,
+        at=old.at[first],
+        headings=old.headings[first],
+        information=information,
+        slope=slope,
+        cost=old.cost + float(2.0 * dense.product(old.slope, moved) + dense.product(moved, half)),
+        departed=departed,
+    )

@@ -35,6 +35,7 @@ from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
 from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
+from team.estimation.map_joining.memory import Observed
 from team.estimation.map_joining.resting import FIRST, beside, idle, split
 from team.estimation.map_joining.submap_graph import Graph, without_nodes
 
@@ -47,6 +48,8 @@ LAG = 8
 """Number of submaps of each stream that are never condensed."""
 BEGIN = 128
 """A fold of fewer submaps than this is not condensed."""
+ALL_AWAKE = 2**62
+"""No island has so many landmarks."""
 HISTORY = 50
 """Number of condensed submaps of each stream whose costs are stored."""
 
@@ -55,22 +58,28 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
     """Condenses the old submaps of the fold's main island; returns the same fold where there are
     none.
 
-    Nothing is condensed whose poses can not be eliminated, or while the team has unnamed landmarks:
-    their data association examines the submaps themselves, at every tick.
+    Nothing is condensed whose poses can not be eliminated. While the team has unnamed landmarks,
+    all landmarks stay nodes, and the condensed submaps are remembered (`memory`); all of them until
+    the last closure can no longer be undone.
     """
     key = fold.main_key
-    if key is None or fold.size <= begin or fold.landmarks.number:
+    if key is None or fold.size <= begin:
         return fold
+    unnamed = bool(fold.landmarks.number)
     island = fold.islands[key]
+    if unnamed:
+        lag = max(lag, island.settings.association.recent)
     leaving = _leaving(island, lag)
     if not leaving.any():
         return fold
     others = (each for at, each in fold.islands.items() if at != key)
     apart = {id_ for each in others for id_ in each.graph.landmarks}
     try:
-        smaller = _condensed(island, leaving, apart, first)
+        smaller = _condensed(island, leaving, apart, ALL_AWAKE if unnamed else first)
     except UNSOLVABLE:
         return fold
+    if unnamed:
+        smaller = _remembering(smaller, island.graph, leaving, forgets=not fold.audits)
     gone = smaller.graph.gone
     return replace(
         fold,
@@ -81,6 +90,23 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
         waiting=tuple(each for each in fold.waiting if each.sequence >= gone.get(each.stream, 0)),
         departed=fold.departed + int(leaving.sum()),
     )
+
+
+def _remembering(
+    smaller: Island, before: Graph, leaving: Bool[np.ndarray, " F"], *, forgets: bool
+) -> Island:
+    """The condensed island with a memory of the submaps that it had before."""
+    graph = smaller.graph
+    node_of = np.full(len(before.fixed), -1, np.int64)
+    for id_, node in before.landmarks.items():
+        node_of[node] = graph.landmarks[id_]
+    taken = (before.submaps[f] for f in np.flatnonzero(leaving))
+    memory = graph.memory.longer(
+        [Observed(each.contribution, node_of[each.landmarks]) for each in taken]
+    )
+    if forgets:
+        memory = memory.shortened(len(graph.fixed))
+    return replace(smaller, graph=replace(graph, memory=memory))
 
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
@@ -226,13 +252,11 @@ def _departed(
     before = NOBODY if graph.condensed is None else graph.condensed.departed
     now = terms(island)
     believed = dict(before.believed)
+    id_of = {node: id_ for id_, node in graph.landmarks.items()}
     for f in np.flatnonzero(leaving):
         begin, end = graph.factors.block_start[f : f + 2]
-        for id_ in (
-            graph.submaps[f]
-            .contribution.local.ids[island.landmark_weight[begin:end] >= BELIEVED]
-            .tolist()
-        ):
+        nodes = graph.submaps[f].landmarks[island.landmark_weight[begin:end] >= BELIEVED]
+        for id_ in (id_of[node] for node in nodes.tolist()):
             believed[id_] = believed.get(id_, 0) + 1
     submaps = (*before.submaps, *_chosen(now.submaps, leaving))
     robots = _sums(before, now, leaving, seen, prior)

@@ -99,7 +99,7 @@ def _patch(view: IslandView, stream: Stream, last: int) -> list[int]:
     first = last - view.profile.recent
     return [
         k
-        for k, submap in enumerate(view.island.graph.submaps)
+        for k, submap in enumerate(view.island.graph.observed)
         if submap.contribution.stream == stream and first < submap.contribution.sequence <= last
     ]
 

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.contribution import Contribution, Stream
+from team.estimation.contribution import Contribution, Key, Stream
 from team.estimation.geometry import compose
 from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.map_joining.association.landmarks import Landmarks, members_of
 from team.estimation.map_joining.condensed_factor import EliminatedPath
 from team.estimation.map_joining.condensing import BEGIN
 from team.estimation.map_joining.gauss_newton import (
@@ -103,6 +104,7 @@ def _raw(
         fold.starts,
         settings.bias_sigma,
         settings.common_bias_sigma,
+        _numbers(fold.landmarks, contributions),
     )
     state, fixed = state.copy(), full.fixed.copy()
 
@@ -131,3 +133,18 @@ def _raw(
         put(node, value(own))
     age = np.full(len(full.submaps), FULL_AGE)
     return Island(replace(full, fixed=fixed), state, age, ages(0), settings)
+
+
+def _numbers(
+    landmarks: Landmarks, contributions: Sequence[Contribution]
+) -> dict[Key, list[int]]:
+    """For submaps with unnamed landmarks, the present identity of each of their landmarks."""
+    if not landmarks.number:
+        return {}
+    numbers = {}
+    for each in contributions:
+        members = zip(each.local.ids.tolist(), members_of(each), strict=True)
+        numbers[each.key] = [
+            id_ if member is None else landmarks.identity(member) or id_ for id_, member in members
+        ]
+    return numbers

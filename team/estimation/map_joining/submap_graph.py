@@ -19,9 +19,10 @@ from team.estimation import elementary
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.condensed_factor import Condensed, places
+from team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
 from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
+from team.estimation.map_joining.memory import NOTHING, Memory, Observed
 from team.estimation.map_joining.priors_kernel import PriorFactors
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
@@ -129,6 +130,7 @@ class Graph:
     submaps, sightings: in the order in which they were added.
     condensed: the quadratic that replaces older submaps, if some are condensed (`condensing`).
     gone: number of a stream's submaps that are in `condensed`; `streams` begins after them.
+    memory: what data association needs of the condensed submaps, where landmarks have no names.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -143,6 +145,15 @@ class Graph:
     common: Mapping[CommonError, int] = field(default_factory=dict)
     condensed: Condensed | None = None
     gone: Mapping[Stream, int] = field(default_factory=dict)
+    memory: Memory = NOTHING
+
+    @cached_property
+    def observed(self) -> tuple[Observed, ...]:
+        """The submaps that data association examines: the condensed ones that are remembered, then
+        the others.
+        """
+        own = (Observed(each.contribution, each.landmarks) for each in self.submaps)
+        return (*self.memory.submaps, *own)
 
     @cached_property
     def factors(self) -> SubmapFactors:
@@ -255,6 +266,11 @@ class Graph:
     def next_sequence(self, stream: Stream) -> int:
         """Sequence number of a stream's next submap."""
         return self.gone.get(stream, 0) + len(self.streams[stream]) - 1
+
+    @property
+    def size(self) -> int:
+        """Number of submaps, condensed ones included."""
+        return len(self.submaps) + (0 if self.condensed is None else self.condensed.submaps)
 
     @property
     def unknowns(self) -> int:
@@ -397,6 +413,7 @@ def extended(
         common=growth.common,
         condensed=graph.condensed,
         gone=graph.gone,
+        memory=graph.memory,
     )
     return grown, np.concatenate([state, *growth.values])
 
@@ -468,6 +485,7 @@ def without_nodes(
         ),
         common={bias: int(node_of[node]) for bias, node in graph.common.items()},
         gone=gone,
+        memory=graph.memory.renumbered(node_of),
     )
     return left, node_of
 
@@ -569,6 +587,7 @@ def merged(
         common={**of_team, **main.common},
         condensed=main.condensed,
         gone={**main.gone, **other.gone},
+        memory=main.memory,
     )
     return graph, np.concatenate([state, *values])
 
@@ -603,6 +622,10 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
             for seen, observer, teammate in graph.sightings
         ),
         priors=tuple(each._replace(node=int(node_of[each.node])) for each in graph.priors),
+        condensed=None
+        if graph.condensed is None
+        else tied_nodes(graph.condensed, sizes, node_of, becomes),
+        memory=graph.memory.renumbered(node_of),
     )
     return renamed, state[np.repeat(remaining, sizes)]
 

@@ -162,16 +162,14 @@ def founded(
             continue
         if number is None or sets is None:
             number, sets = dict(landmarks.number), dict(landmarks.sets)
-            used = set(number.values())
         given = []
         for id_, member in zip(ids.tolist(), members_of(contribution), strict=True):
             if member is None:
                 given.append(id_)
                 continue
             own = number_of(member)
-            while own in used:
+            while own in sets or own in landmarks.ties:  # each number ever given is in either
                 own = UNNAMED | (own + 1) % UNNAMED
-            used.add(own)
             number[member] = own
             sets[own] = (member,)
             given.append(own)

@@ -1,0 +1,97 @@
+"""What association needs of condensed submaps: landmarks seen together, places looked at.
+
+A condensed submap's measurements are in the quadratic. Association asks of it what no quadratic
+has: which landmarks it has, which of them a keyframe saw together, and by that where it looked. The
+newest MOST submaps of each landmark are remembered whole, and no others: how many they are depends
+on the landmarks, not on the duration of the run. Whatever counts submaps counts no farther than
+that. Of the forgotten ones the pairs of landmarks remain that they kept apart.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from team.estimation.contribution import Contribution
+
+Indices = Int64[np.ndarray, " _"]
+
+MOST = 8
+"""Number of newest condensed submaps of each landmark that are remembered."""
+
+
+class Observed(NamedTuple):
+    """A submap, and the node of each of its landmarks."""
+
+    contribution: Contribution
+    landmarks: Indices
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """The condensed submaps that are remembered, and the pairs of the forgotten ones.
+
+    submaps: oldest first.
+    pairs: two landmarks that one forgotten submap had, by their nodes, the smaller one first.
+    distinct: which of them are known to be two (`LocalMap.distinct`).
+    """
+
+    submaps: tuple[Observed, ...] = ()
+    pairs: Int64[np.ndarray, "P 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    distinct: Bool[np.ndarray, " P"] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    def renumbered(self, node_of: Indices) -> "Memory":
+        """The same with other numbers of nodes; two landmarks that become one are no pair."""
+        submaps = tuple(
+            each._replace(landmarks=node_of[each.landmarks]) for each in self.submaps
+        )
+        return replace(_unique(node_of[self.pairs], self.distinct), submaps=submaps)
+
+    def longer(self, submaps: Sequence[Observed]) -> "Memory":
+        """With these submaps behind the others."""
+        return replace(self, submaps=(*self.submaps, *submaps))
+
+    def shortened(self, nodes: int, most: int = MOST) -> "Memory":
+        """Without the submaps that are among the newest `most` of none of their landmarks.
+
+        nodes: number of nodes of the graph.
+        """
+        newer = np.zeros(nodes, np.int64)
+        remembered, forgotten = [], []
+        for each in reversed(self.submaps):
+            if (newer[each.landmarks] < most).any():
+                newer[each.landmarks] += 1
+                remembered.append(each)
+            else:
+                forgotten.append(each)
+        if not forgotten:
+            return self
+        pairs, distinct = [self.pairs], [self.distinct]
+        for each in forgotten:
+            one, two = each.contribution.local.distinct
+            marks = np.zeros((len(each.landmarks), len(each.landmarks)), np.bool_)
+            marks[one, two] = True
+            one, two = np.triu_indices(len(marks), 1)
+            pairs.append(np.column_stack([each.landmarks[one], each.landmarks[two]]))
+            distinct.append(marks[one, two])
+        found = _unique(np.concatenate(pairs), np.concatenate(distinct))
+        return replace(found, submaps=tuple(reversed(remembered)))
+
+
+NOTHING = Memory()
+
+
+def _unique(pairs: Int64[np.ndarray, "P 2"], distinct: Bool[np.ndarray, " P"]) -> Memory:
+    """Each pair once, ascending; it is distinct if it was once so."""
+    if not len(pairs):
+        return NOTHING
+    pairs = np.sort(pairs, axis=1)
+    two = pairs[:, 0] != pairs[:, 1]
+    pairs, distinct = pairs[two], distinct[two]
+    order = np.lexsort((~distinct, pairs[:, 1], pairs[:, 0]))
+    pairs, distinct = pairs[order], distinct[order]
+    first = np.ones(len(pairs), np.bool_)
+    first[1:] = (pairs[1:] != pairs[:-1]).any(axis=1)
+    return Memory((), pairs[first], distinct[first])
