@@ -53,7 +53,8 @@ class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
     ids, nodes: the identity and the node of each landmark, in the order of the nodes.
-    seen_by: for each submap that is examined (`Graph.observed`), the indices of its landmarks in `ids`.
+    seen_by: for each submap that is examined (`Graph.observed`), the indices in `ids` of its
+        landmarks.
     sees: which landmarks each submap has; where some are merged, those that they are now.
     """
 

@@ -8,7 +8,8 @@ where the poses that occur in no other factor are eliminated (Schur complement).
 for the linearisation point, which stays `at`, and the robust weights, which keep their values.
 """
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 
 
+HISTORY = 50
+"""Number of condensed submaps of each stream whose costs are stored."""
 PATH_BLOCK = 64
 """Number of poses in each run of an eliminated path."""
 
@@ -79,6 +82,17 @@ class Departed(NamedTuple):
     submaps: tuple[SubmapCost, ...]
     believed: Mapping[int, int]
     paths: Mapping[Stream, EliminatedPath]
+
+
+def newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
+    """The costs of the last HISTORY submaps of each stream, in their order."""
+    counts: dict[Stream, int] = defaultdict(int)
+    found = []
+    for each in reversed(submaps):
+        counts[each.stream] += 1
+        if counts[each.stream] <= HISTORY:
+            found.append(each)
+    return tuple(reversed(found))
 
 
 NOBODY = Departed({}, (), {}, {})

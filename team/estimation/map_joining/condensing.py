@@ -27,7 +27,7 @@ from team.estimation.map_joining.condensed_factor import (
     Condensed,
     Departed,
     EliminatedPath,
-    SubmapCost,
+    newest,
     places,
 )
 from team.estimation.map_joining.condensing_kernel import add_submaps
@@ -35,7 +35,7 @@ from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
 from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
-from team.estimation.map_joining.memory import Observed
+from team.estimation.map_joining.memory import MOST, Observed
 from team.estimation.map_joining.resting import FIRST, beside, idle, split
 from team.estimation.map_joining.submap_graph import Graph, without_nodes
 
@@ -49,18 +49,15 @@ LAG = 8
 BEGIN = 128
 """A fold of fewer submaps than this is not condensed."""
 ALL_AWAKE = 2**62
-"""No island has so many landmarks."""
-HISTORY = 50
-"""Number of condensed submaps of each stream whose costs are stored."""
 
 
 def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST) -> Fold:
     """Condenses the old submaps of the fold's main island; returns the same fold where there are
     none.
 
-    Nothing is condensed whose poses can not be eliminated. While the team has unnamed landmarks,
-    all landmarks stay nodes, and the condensed submaps are remembered (`memory`); all of them until
-    the last closure can no longer be undone.
+    Nothing is condensed whose poses can not be eliminated. Unnamed landmarks stay nodes: nothing is
+    condensed while a team that has some has fewer submaps than landmarks. What is condensed is then
+    remembered (`memory`), all of it until the last closure can no longer be undone.
     """
     key = fold.main_key
     if key is None or fold.size <= begin:
@@ -69,6 +66,8 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
     island = fold.islands[key]
     if unnamed:
         lag = max(lag, island.settings.association.recent)
+        if fold.size <= len(island.graph.landmarks):
+            return fold
     leaving = _leaving(island, lag)
     if not leaving.any():
         return fold
@@ -105,7 +104,7 @@ def _remembering(
         [Observed(each.contribution, node_of[each.landmarks]) for each in taken]
     )
     if forgets:
-        memory = memory.shortened(len(graph.fixed))
+        memory = memory.shortened(len(graph.fixed), MOST)
     return replace(smaller, graph=replace(graph, memory=memory))
 
 
@@ -260,7 +259,7 @@ def _departed(
             believed[id_] = believed.get(id_, 0) + 1
     submaps = (*before.submaps, *_chosen(now.submaps, leaving))
     robots = _sums(before, now, leaving, seen, prior)
-    return Departed(robots, _newest(submaps), believed, _paths(island, before, leaving))
+    return Departed(robots, newest(submaps), believed, _paths(island, before, leaving))
 
 
 def _paths(
@@ -299,14 +298,3 @@ def _sums(
 
 def _chosen(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
     return (items[k] for k in np.flatnonzero(which).tolist())
-
-
-def _newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
-    """The costs of the last HISTORY submaps of each stream, in their order."""
-    counts: dict[Stream, int] = defaultdict(int)
-    newest = []
-    for each in reversed(submaps):
-        counts[each.stream] += 1
-        if counts[each.stream] <= HISTORY:
-            newest.append(each)
-    return tuple(reversed(newest))

@@ -44,16 +44,14 @@ class Memory:
 
     def renumbered(self, node_of: Indices) -> "Memory":
         """The same with other numbers of nodes; two landmarks that become one are no pair."""
-        submaps = tuple(
-            each._replace(landmarks=node_of[each.landmarks]) for each in self.submaps
-        )
+        submaps = tuple(each._replace(landmarks=node_of[each.landmarks]) for each in self.submaps)
         return replace(_unique(node_of[self.pairs], self.distinct), submaps=submaps)
 
     def longer(self, submaps: Sequence[Observed]) -> "Memory":
         """With these submaps behind the others."""
         return replace(self, submaps=(*self.submaps, *submaps))
 
-    def shortened(self, nodes: int, most: int = MOST) -> "Memory":
+    def shortened(self, nodes: int, most: int) -> "Memory":
         """Without the submaps that are among the newest `most` of none of their landmarks.
 
         nodes: number of nodes of the graph.

@@ -135,9 +135,7 @@ def _raw(
     return Island(replace(full, fixed=fixed), state, age, ages(0), settings)
 
 
-def _numbers(
-    landmarks: Landmarks, contributions: Sequence[Contribution]
-) -> dict[Key, list[int]]:
+def _numbers(landmarks: Landmarks, contributions: Sequence[Contribution]) -> dict[Key, list[int]]:
     """For submaps with unnamed landmarks, the present identity of each of their landmarks."""
     if not landmarks.number:
         return {}

@@ -20,7 +20,7 @@ from tests.estimation.map_joining.association.unnamed_worlds import (
 )
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
-LAPS = 4
+LAPS = 5
 
 
 @pytest.fixture(scope="module")
