@@ -53,6 +53,7 @@ SIGMAS = (0.1, 0.02, 0.2)
 BASELINES: Mapping[tuple[int, int, int, str | None], str] = {
     (5, 50, 2500, None): "growth",
     (10, 1000, 2000, None): "growth-large",
+    (5, 50, 2000, "hidden"): "growth-hidden",
 }
 """The committed figures of robots, landmarks, largest number of submaps and identities."""
 
