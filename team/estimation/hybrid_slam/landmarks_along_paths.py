@@ -1,4 +1,8 @@
-"""The landmarks of a window solved again: by Gauss-Newton, given each particle's path."""
+"""The landmarks of a window solved again: by Gauss-Newton, given each particle's path.
+
+Sixteen particles at once, as `blocks` has them: one flat array of rows, a row is one quantity of
+sixteen particles. A particle that has come to its end repeats its last evaluation.
+"""
 
 import math
 
@@ -7,16 +11,31 @@ from jaxtyping import Float, Int64
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled
-from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam.landmark_kernel import innovation_of
 from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import NEAREST_M
 
 SOLVED = 1e-6
 """A Gauss-Newton step of squared Mahalanobis length below this changes nothing that matters."""
-
-
+STEPS = 3
+"""Gauss-Newton steps at most."""
 NO_SENSOR = (0.0, 0.0, 0.0)
+LANES = 16
+Block = Float[np.ndarray, " rows_lanes"]
+
+(
+    # Where the landmark is evaluated, its result, its least cost, and whether it goes on.
+    AT_X, AT_Y, MEAN_X, MEAN_Y, OF_XX, OF_XY, OF_YY, LEAST, GOES_ON,
+    # Of one measurement: the direction, both innovations and both weights.
+    DISTANCE, EX, EY, OF_RANGE, OF_BEARING, RANGE_INFORMATION, BEARING_INFORMATION,
+    # Sums over the measurements: the cost, its gradient and Hessian, …
+    COST, GX, GY, XX, XY, YY,
+    # … what range and bearing share with their constant errors, …
+    RX, RY, BX, BY, RANGE_SUM, BEARING_SUM, RANGE_WEIGHT, BEARING_WEIGHT, CROSS,
+    # … and the variances of the last measurement.
+    TOTAL, BEARING_TOTAL,
+    END,
+) = range(0, 34 * LANES, LANES)  # fmt: skip
 
 
 @compiled
@@ -53,86 +72,196 @@ def landmarks_along_paths(
     EKF's mean and covariance stay.
     """
     means, covariances = starts.copy(), start_covariances.copy()
-    range_information = np.empty(len(measurements))
-    for i in range(means.shape[0]):
+    block, weights = np.empty(END), np.empty((len(measurements), LANES))
+    for begin in range(0, len(means), LANES):
+        count = min(LANES, len(means) - begin)
         for landmark in range(means.shape[1]):
-            x, y = starts[i, landmark]
-            least = np.inf
-            for iteration in range(4):
-                cost, gx, gy, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                rx, ry, bx, by = 0.0, 0.0, 0.0, 0.0
-                range_sum, bearing_sum, range_weight, bearing_weight = 0.0, 0.0, 0.0, 0.0
-                total, bearing_total, cross = 0.0, noise.bearing_variance, 0.0
+            for j in range(LANES):
+                i = begin + min(j, count - 1)
+                block[AT_X + j], block[AT_Y + j] = starts[i, landmark, 0], starts[i, landmark, 1]
+                block[LEAST + j], block[GOES_ON + j] = math.inf, 1.0
+                block[MEAN_X + j], block[MEAN_Y + j] = block[AT_X + j], block[AT_Y + j]
+                block[OF_XX + j] = start_covariances[i, landmark, 0]
+                block[OF_XY + j] = start_covariances[i, landmark, 1]
+                block[OF_YY + j] = start_covariances[i, landmark, 2]
+            for step in range(STEPS + 1):
+                for row in range(COST, BEARING_TOTAL):
+                    block[row] = 0.0
+                for j in range(LANES):
+                    block[BEARING_TOTAL + j] = noise.bearing_variance
                 for k in range(bounds[landmark], bounds[landmark + 1]):
-                    pose = paths[keyframes[k], i]
-                    dx, dy = x - pose[0], y - pose[1]
-                    distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
-                    ex, ey = dx / distance, dy / distance
-                    of_bearing = wrapped(measurements[k, 1] + pose[2] - elementary.atan2(dy, dx))
+                    _direct(block, paths[keyframes[k]], begin, count, measurements[k, 1])
                     if own.shape[1] and own[k, 3] >= 0.0:
-                        of_range, of_bearing, total, between, bearing_total = innovation_of(
-                            measurements[k], own[k], NO_SENSOR, distance, of_bearing
-                        )
-                        wr, w, wb = _information(total, between, bearing_total, noise)
-                        along, across = w * of_bearing, w * of_range
-                        cost += 2.0 * along * of_range
-                        gx += along * ex - across * ey / distance
-                        gy += along * ey + across * ex / distance
-                        xx -= 2.0 * w * ex * ey / distance
-                        xy += w * (ex * ex - ey * ey) / distance
-                        yy += 2.0 * w * ex * ey / distance
-                        rx, ry = rx - w * ey / distance, ry + w * ex / distance
-                        bx, by = bx + w * ex, by + w * ey
-                        range_sum, bearing_sum = range_sum + along, bearing_sum + across
-                        cross += w
-                        range_information[k] = wr
+                        _add_claim(block, measurements[k], own[k], noise)
                     else:
-                        total = noise.range_variance + noise.range_per_m2 * distance * distance
-                        if iteration == 0:
-                            range_information[k] = 1.0 / (noise.range_white * total)
-                        of_range = measurements[k, 0] - distance
-                        wb = 1.0 / (noise.bearing_white * noise.bearing_variance)
-                        bearing_total = noise.bearing_variance
-                    wr = range_information[k]
-                    cost += wr * of_range * of_range + wb * of_bearing * of_bearing
-                    wr_r, wb_b = wr * of_range, wb * of_bearing / distance
-                    gx += wr_r * ex - wb_b * ey
-                    gy += wr_r * ey + wb_b * ex
-                    wt = wb / (distance * distance)
-                    xx += wr * ex * ex + wt * ey * ey
-                    xy += (wr - wt) * ex * ey
-                    yy += wr * ey * ey + wt * ex * ex
-                    rx, ry = rx + wr * ex, ry + wr * ey
-                    bx, by = bx - wb * ey / distance, by + wb * ex / distance
-                    range_sum, range_weight = range_sum + wr_r, range_weight + wr
-                    bearing_sum, bearing_weight = bearing_sum + wb * of_bearing, bearing_weight + wb
-                if noise.range_white < 1.0:
-                    share = 1.0 / (range_weight + 1.0 / ((1.0 - noise.range_white) * total))
-                    cost -= share * range_sum * range_sum
-                    gx, gy = gx - share * range_sum * rx, gy - share * range_sum * ry
-                    xx, xy, yy = xx - share * rx * rx, xy - share * rx * ry, yy - share * ry * ry
-                    bearing_sum -= share * cross * range_sum
-                    bx, by = bx - share * cross * rx, by - share * cross * ry
-                    bearing_weight -= share * cross * cross
-                if noise.bearing_white < 1.0:
-                    constant = (1.0 - noise.bearing_white) * bearing_total
-                    share = 1.0 / (bearing_weight + 1.0 / constant)
-                    cost -= share * bearing_sum * bearing_sum
-                    gx, gy = gx - share * bearing_sum * bx, gy - share * bearing_sum * by
-                    xx, xy, yy = xx - share * bx * bx, xy - share * bx * by, yy - share * by * by
-                determinant = xx * yy - xy * xy
-                if not (cost < least and determinant > 0.0):
+                        _weigh(block, measurements[k, 0], weights[k], noise, step == 0)
+                    _add(block)
+                _eliminate_errors(block, noise)
+                if not _step(block):
                     break
-                least = cost
-                step_x, step_y = (
-                    (yy * gx - xy * gy) / determinant,
-                    (xx * gy - xy * gx) / determinant,
-                )
-                means[i, landmark, 0], means[i, landmark, 1] = x, y
-                covariances[i, landmark, 0] = yy / determinant
-                covariances[i, landmark, 1] = -xy / determinant
-                covariances[i, landmark, 2] = xx / determinant
-                if step_x * gx + step_y * gy < SOLVED:
-                    break
-                x, y = x + step_x, y + step_y
+            for j in range(count):
+                i = begin + j
+                means[i, landmark, 0] = block[MEAN_X + j]
+                means[i, landmark, 1] = block[MEAN_Y + j]
+                covariances[i, landmark, 0] = block[OF_XX + j]
+                covariances[i, landmark, 1] = block[OF_XY + j]
+                covariances[i, landmark, 2] = block[OF_YY + j]
     return means, covariances
+
+
+@compiled
+def _direct(
+    block: Block, poses: Float[np.ndarray, "M 3"], begin: int, count: int, bearing: float
+) -> None:
+    """The rows DISTANCE to OF_BEARING of a measurement with this bearing."""
+    for j in range(LANES):
+        i = begin + min(j, count - 1)
+        block[EX + j] = block[AT_X + j] - poses[i, 0]
+        block[EY + j] = block[AT_Y + j] - poses[i, 1]
+        block[OF_BEARING + j] = bearing + poses[i, 2]
+    for j in range(LANES):
+        dx, dy = block[EX + j], block[EY + j]
+        apart = math.sqrt(dx * dx + dy * dy)
+        distance = apart if apart > NEAREST_M else NEAREST_M
+        away = max(abs(dx), abs(dy)) >= 1e-240
+        direction = elementary.direction_near(abs(dy), dx if away else math.copysign(1.0, dx))
+        angle = block[OF_BEARING + j] - math.copysign(direction, dy)
+        turns = np.floor((math.pi - angle) / (2.0 * math.pi))
+        block[OF_BEARING + j] = angle + 2.0 * math.pi * turns
+        block[DISTANCE + j] = distance
+        block[EX + j], block[EY + j] = dx / distance, dy / distance
+
+
+@compiled
+def _weigh(
+    block: Block, reading: float, weights: Float[np.ndarray, " lanes"], noise: Noise, first: bool
+) -> None:
+    """The range's innovation and both weights by the sensor's noise; weights: of the range, as the
+    first evaluation predicts it.
+    """
+    white = 1.0 / (noise.bearing_white * noise.bearing_variance)
+    for j in range(LANES):
+        distance = block[DISTANCE + j]
+        total = noise.range_variance + noise.range_per_m2 * distance * distance
+        weight = 1.0 / (noise.range_white * total) if first else weights[j]
+        weights[j] = weight
+        block[RANGE_INFORMATION + j], block[BEARING_INFORMATION + j] = weight, white
+        block[OF_RANGE + j] = reading - distance
+        block[TOTAL + j], block[BEARING_TOTAL + j] = total, noise.bearing_variance
+
+
+@compiled
+def _add_claim(
+    block: Block,
+    measurement: Float[np.ndarray, "2"],
+    own: Float[np.ndarray, " own"],
+    noise: Noise,
+) -> None:
+    """The same by the noise that a measurement claims; adds the terms between range and bearing."""
+    for j in range(LANES):
+        distance, ex, ey = block[DISTANCE + j], block[EX + j], block[EY + j]
+        of_range, of_bearing, total, between, bearing_total = innovation_of(
+            measurement, own, NO_SENSOR, distance, block[OF_BEARING + j]
+        )
+        wr, w, wb = _information(total, between, bearing_total, noise)
+        along, across = w * of_bearing, w * of_range
+        block[COST + j] += 2.0 * along * of_range
+        block[GX + j] += along * ex - across * ey / distance
+        block[GY + j] += along * ey + across * ex / distance
+        block[XX + j] -= 2.0 * w * ex * ey / distance
+        block[XY + j] += w * (ex * ex - ey * ey) / distance
+        block[YY + j] += 2.0 * w * ex * ey / distance
+        block[RX + j] -= w * ey / distance
+        block[RY + j] += w * ex / distance
+        block[BX + j] += w * ex
+        block[BY + j] += w * ey
+        block[RANGE_SUM + j] += along
+        block[BEARING_SUM + j] += across
+        block[CROSS + j] += w
+        block[RANGE_INFORMATION + j], block[BEARING_INFORMATION + j] = wr, wb
+        block[OF_RANGE + j], block[OF_BEARING + j] = of_range, of_bearing
+        block[TOTAL + j], block[BEARING_TOTAL + j] = total, bearing_total
+
+
+@compiled
+def _add(block: Block) -> None:
+    """Adds a measurement's terms by its innovations and weights."""
+    for j in range(LANES):
+        distance, ex, ey = block[DISTANCE + j], block[EX + j], block[EY + j]
+        of_range, of_bearing = block[OF_RANGE + j], block[OF_BEARING + j]
+        wr, wb = block[RANGE_INFORMATION + j], block[BEARING_INFORMATION + j]
+        block[COST + j] += wr * of_range * of_range + wb * of_bearing * of_bearing
+        wr_r, wb_b = wr * of_range, wb * of_bearing / distance
+        block[GX + j] += wr_r * ex - wb_b * ey
+        block[GY + j] += wr_r * ey + wb_b * ex
+        wt = wb / (distance * distance)
+        block[XX + j] += wr * ex * ex + wt * ey * ey
+        block[XY + j] += (wr - wt) * ex * ey
+        block[YY + j] += wr * ey * ey + wt * ex * ex
+        block[RX + j] += wr * ex
+        block[RY + j] += wr * ey
+        block[BX + j] -= wb * ey / distance
+        block[BY + j] += wb * ex / distance
+        block[RANGE_SUM + j] += wr_r
+        block[RANGE_WEIGHT + j] += wr
+        block[BEARING_SUM + j] += wb * of_bearing
+        block[BEARING_WEIGHT + j] += wb
+
+
+@compiled
+def _eliminate_errors(block: Block, noise: Noise) -> None:
+    """Takes the constant errors of range and bearing out, by Schur's complement."""
+    if noise.range_white < 1.0:
+        for j in range(LANES):
+            constant = (1.0 - noise.range_white) * block[TOTAL + j]
+            share = 1.0 / (block[RANGE_WEIGHT + j] + 1.0 / constant)
+            total, rx, ry, cross = (
+                block[RANGE_SUM + j], block[RX + j], block[RY + j], block[CROSS + j]
+            )  # fmt: skip
+            block[COST + j] -= share * total * total
+            block[GX + j] -= share * total * rx
+            block[GY + j] -= share * total * ry
+            block[XX + j] -= share * rx * rx
+            block[XY + j] -= share * rx * ry
+            block[YY + j] -= share * ry * ry
+            block[BEARING_SUM + j] -= share * cross * total
+            block[BX + j] -= share * cross * rx
+            block[BY + j] -= share * cross * ry
+            block[BEARING_WEIGHT + j] -= share * cross * cross
+    if noise.bearing_white < 1.0:
+        for j in range(LANES):
+            constant = (1.0 - noise.bearing_white) * block[BEARING_TOTAL + j]
+            share = 1.0 / (block[BEARING_WEIGHT + j] + 1.0 / constant)
+            total, bx, by = block[BEARING_SUM + j], block[BX + j], block[BY + j]
+            block[COST + j] -= share * total * total
+            block[GX + j] -= share * total * bx
+            block[GY + j] -= share * total * by
+            block[XX + j] -= share * bx * bx
+            block[XY + j] -= share * bx * by
+            block[YY + j] -= share * by * by
+
+
+@compiled
+def _step(block: Block) -> bool:
+    """Keeps the evaluations of lower cost, and steps on from them; returns whether any does."""
+    for j in range(LANES):
+        gx, gy = block[GX + j], block[GY + j]
+        xx, xy, yy = block[XX + j], block[XY + j], block[YY + j]
+        determinant = xx * yy - xy * xy
+        better = block[COST + j] < block[LEAST + j] and determinant > 0.0
+        better = better and block[GOES_ON + j] > 0.0
+        step_x, step_y = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant
+        block[LEAST + j] = block[COST + j] if better else block[LEAST + j]
+        block[MEAN_X + j] = block[AT_X + j] if better else block[MEAN_X + j]
+        block[MEAN_Y + j] = block[AT_Y + j] if better else block[MEAN_Y + j]
+        block[OF_XX + j] = yy / determinant if better else block[OF_XX + j]
+        block[OF_XY + j] = -xy / determinant if better else block[OF_XY + j]
+        block[OF_YY + j] = xx / determinant if better else block[OF_YY + j]
+        far = better and not step_x * gx + step_y * gy < SOLVED
+        block[AT_X + j] = block[AT_X + j] + step_x if far else block[AT_X + j]
+        block[AT_Y + j] = block[AT_Y + j] + step_y if far else block[AT_Y + j]
+        block[GOES_ON + j] = 1.0 if far else 0.0
+    going = 0.0
+    for j in range(LANES):
+        going += block[GOES_ON + j]
+    return going > 0.0
