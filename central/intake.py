@@ -28,7 +28,7 @@ class Inputs:
 
     closed_ns: every input that ends up to here has arrived. ahead: later inputs are in the map,
     too. recorded: the inputs are those that a recorded map has named: no further robot is
-    withdrawn, and every message that goes with the map is made. now_ns: team time.
+    withdrawn. now_ns: team time.
     """
 
     closed_ns: float = float("inf")

@@ -28,7 +28,7 @@ class SubmapInputs(Inputs):
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
     from a submap. withdrawn: robots withdrawn by an order. verdicts: an operator's on unnamed
     landmarks. missing: what streams wait for. arrived: number of submaps, orders and verdicts that
-    have arrived, to compare maps by.
+    have arrived, to compare maps by. priors_of: the robots whose priors are recorded with the map.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -38,6 +38,7 @@ class SubmapInputs(Inputs):
     verdicts: Collection[Verdict] = ()
     missing: tuple[m.VersionEntry, ...] = ()
     arrived: int = 0
+    priors_of: Collection[str] = ()
 
 
 class SubmapIntake(Intake[SubmapInputs]):

@@ -136,6 +136,10 @@ class _LogInputs:
                     self._set.admit_sighting(each)
         starts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
         self._starts = {s: start for s, start in starts.items() if isinstance(start, m.InitialPose)}
+        self._priors_of: dict[bytes, set[str]] = {}
+        for prior in (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR)):
+            if isinstance(prior, m.Prior):
+                self._priors_of.setdefault(prior.digest, set()).add(prior.robot)
         own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
         self._maps = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
 
@@ -169,5 +173,6 @@ class _LogInputs:
             verdicts={verdict_of(each) for each in fused.verdicts},
             missing=fused.missing,
             arrived=fused.heard,
+            priors_of=self._priors_of.get(fused.digest, set()),
             now_ns=fused.stamp_ns,
         )

@@ -29,7 +29,7 @@ from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import least_squares
 from team.estimation.map_joining.condensing_kernel import add_blocks
 from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
-from team.estimation.map_joining.priors_kernel import prior_terms
+from team.estimation.map_joining.priors_kernel import add_priors, prior_terms
 from team.estimation.map_joining.resting_kernel import own_blocks, symmetric_of
 from team.estimation.map_joining.submap_graph import CommonBias, Graph
 from team.estimation.sparse_cholesky import sparse
@@ -110,12 +110,12 @@ class Island(least_squares.Iterate):
     sighting_age: Int64[np.ndarray, " S"]
     settings: JoinSettings
 
-    @property
+    @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
         """The robust scale c of each submap at its age."""
         return self._scale_at(self.age)
 
-    @property
+    @cached_property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
         """The robust scale c of each inter-robot measurement at its age."""
         return self._scale_at(self.sighting_age)
@@ -327,12 +327,9 @@ class Island(least_squares.Iterate):
             gradient[graph.boundary] += old.gradient_at(self.state, graph.boundary)
             sizes = np.diff(graph.offset)[old.nodes]
             add_blocks(values, old.information, sizes, graph.condensed_entry, pattern.value_start)
-        for k, prior in enumerate(graph.priors):
-            slope = self.prior_slope(k)
-            begin = graph.offset[prior.node]
-            weight = self.prior_weight[k]
-            gradient[begin : begin + len(slope)] += weight * slope
-            pattern.diagonal_block(values, prior.node)[...] += weight * prior.information
+        at = pattern.value_start[pattern.column_start[graph.prior_factors.node]]
+        slopes = self._prior_terms[0]
+        add_priors(values, gradient, graph.prior_factors, slopes, self.prior_weight, at)
         return values, gradient
 
     @property

@@ -7,6 +7,7 @@ since its factor was added, so that a residual that is large at first is not tak
 
 import math
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -123,4 +124,18 @@ def robust_scale(
     """
     if robust_c is None:
         return np.full(len(age), math.inf)
-    return robust_c * np.maximum(1.0, start * _powers(decay, age))
+    if decay >= 1.0:  # it never narrows
+        return robust_c * np.maximum(1.0, start * _powers(decay, age))
+    narrowing = _narrowing(start, decay)
+    scale: Float[np.ndarray, " k"] = robust_c * narrowing[np.minimum(age, len(narrowing) - 1)]
+    return scale
+
+
+@lru_cache
+def _narrowing(start: float, decay: float) -> Float[np.ndarray, " k"]:
+    """max(1, start · decay^age) of each age, up to the first one at which it is 1."""
+    count = 1
+    while start * _powers(decay, np.array([count - 1]))[0] > 1.0:
+        count += 1
+    factors: Float[np.ndarray, " k"] = np.maximum(1.0, start * _powers(decay, np.arange(count)))
+    return factors

@@ -11,9 +11,10 @@ from team.estimation.geometry import wrapped
 
 class PriorFactors(NamedTuple):
     """The priors N(mean, information⁻¹) of the numbers begin … begin + size − 1 of the state: a
-    pose (x, y, theta) or one number. Means and matrices are padded with zeros.
+    pose (x, y, theta) or one number, those of a node. Means and matrices are padded with zeros.
     """
 
+    node: Int64[np.ndarray, " priors"]
     begin: Int64[np.ndarray, " priors"]
     size: Int64[np.ndarray, " priors"]
     mean: Float[np.ndarray, "priors 3"]
@@ -38,3 +39,23 @@ def prior_terms(
                 slopes[k, i] += priors.information[k, i, j] * r[j]
             chi2[k] += r[i] * slopes[k, i]
     return slopes, chi2
+
+
+@compiled
+def add_priors(
+    values: Float[np.ndarray, " _"],
+    gradient: Float[np.ndarray, " n"],
+    priors: PriorFactors,
+    slopes: Float[np.ndarray, "priors 3"],
+    weights: Float[np.ndarray, " priors"],
+    at: Int64[np.ndarray, " priors"],
+) -> None:
+    """Adds each prior, times its weight, to half the gradient and to the values of a block pattern;
+    at: where its node's own block begins. slopes: of `prior_terms`.
+    """
+    for k in range(len(weights)):
+        size = priors.size[k]
+        for i in range(size):
+            gradient[priors.begin[k] + i] += weights[k] * slopes[k, i]
+            for j in range(size):
+                values[at[k] + i * size + j] += weights[k] * priors.information[k, i, j]

@@ -184,11 +184,11 @@ class Graph:
     def prior_factors(self) -> PriorFactors:
         """The priors in flat arrays, for the kernel."""
         sizes = np.array([len(each.mean) for each in self.priors], np.int64)
-        nodes = [each.node for each in self.priors]
+        nodes = np.array([each.node for each in self.priors], np.int64)
         means, information = np.zeros((len(sizes), 3)), np.zeros((len(sizes), 3, 3))
         for k, (n, each) in enumerate(zip(sizes.tolist(), self.priors, strict=True)):
             means[k, :n], information[k, :n, :n] = each.mean, each.information
-        return PriorFactors(self.offset[nodes], sizes, means, information)
+        return PriorFactors(nodes, self.offset[nodes], sizes, means, information)
 
     @cached_property
     def sighting_factors(self) -> InterRobotFactors:
