@@ -6,7 +6,6 @@ own messages are used; when it has gone, a peer's.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 import msgspec
 
@@ -60,7 +59,7 @@ class PeersAsCentre:
             self._robot = name if self._robot is None else self._robot
             if name != self._robot:
                 return None
-        renamed = replace(sample, key=as_channel.key(name))
+        renamed = msgspec.structs.replace(sample, key=as_channel.key(name))
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
 
     def _spoken(self, sample: Sample) -> Sample | None:
@@ -69,7 +68,7 @@ class PeersAsCentre:
         except WireError:
             return None
         as_centre = msgspec.structs.replace(message, node="central")
-        return replace(sample, payload=encoded(as_centre))
+        return msgspec.structs.replace(sample, payload=encoded(as_centre))
 
     def _status(self, sample: Sample, node: str) -> Sample | None:
         """The status of the peer's fold as a centre's status."""
@@ -87,7 +86,7 @@ class PeersAsCentre:
         own = m.Status(
             stamp_ns=status.stamp_ns, node="central", state=status.state, figures=figures
         )
-        return replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
+        return msgspec.structs.replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
 
 
 def _is_alive(token: Sample) -> bool:

@@ -29,7 +29,7 @@ from team.recording.records import (
     expanded,
     frames,
     index,
-    records,
+    places,
 )
 from team.wire.bus import Sample
 from team.wire.channels import VIEW, Channel, channel_of
@@ -117,18 +117,21 @@ class Log:
         """The samples of a chunk, on channels of these names; channels that it declares are added
         to `keys`.
         """
-        samples = []
-        for _, opcode, body in records(expanded(frame.body)):
+        samples, data, size = [], expanded(frame.body), _MESSAGE.size
+        unpack = _MESSAGE.unpack_from
+        for opcode, start, end in places(data):
             if opcode == _OF_MESSAGE:
-                number, sequence, log_time, wall_ns = _MESSAGE.unpack_from(body)
+                if start + size > end:
+                    raise ValueError("a message without its times")
+                number, sequence, log_time, wall_ns = unpack(data, start)
                 if number not in keys:
                     raise ValueError(f"message on channel {number}, which nothing describes")
                 if (key := keys[number]) is not None:
-                    payload = body[_MESSAGE.size :]
+                    payload = data[start + size : end]
                     stamp_ns = log_time or _stamp_in(payload)
                     samples.append(Sample(key, payload, stamp_ns, wall_ns, sequence))
             elif opcode == Opcode.CHANNEL:
-                self._introduce(body, names, keys)
+                self._introduce(data[start:end], names, keys)
         return samples
 
     def _key(self, topic: str, names: set[str] | None) -> str | None:

@@ -9,7 +9,6 @@ import struct
 import zlib
 from collections.abc import Iterator
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import IO, NamedTuple, cast
 
@@ -158,17 +157,27 @@ def records(data: bytes) -> Iterator[Frame]:
 
     Small records take many times their size as Python objects, so their number is bounded as well.
     """
-    starts: list[int] = []
+    for opcode, start, end in places(data):
+        yield Frame(start - FRAME_SIZE, opcode, data[start:end])
+
+
+def places(data: bytes) -> list[tuple[int, int, int]]:
+    """Of each record of an expanded chunk its opcode, and where its bytes begin and end; raises as
+    `records`.
+    """
+    found: list[tuple[int, int, int]] = []
     offset, size, head = 0, len(data), _FRAME.size
+    unpack, most = _FRAME.unpack_from, MOST_RECORDS
     while offset < size:
-        if len(starts) == MOST_RECORDS:
-            raise ValueError(f"more than {MOST_RECORDS} records, which no recorder writes")
-        starts.append(offset)
-        offset += head + _FRAME.unpack_from(data, offset)[1]
+        if len(found) == most:
+            raise ValueError(f"more than {most} records, which no recorder writes")
+        opcode, length = unpack(data, offset)
+        start = offset + head
+        offset = start + length
+        found.append((opcode, start, offset))
     if offset > size:
         raise ValueError("a record ends beyond its chunk")
-    for start, end in pairwise([*starts, size]):
-        yield Frame(start, data[start], data[start + head : end])
+    return found
 
 
 def expanded(body: bytes) -> bytes:

@@ -5,7 +5,8 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import closing
-from dataclasses import replace
+
+import msgspec
 
 from team.recording.inventory import Inventory, NumberedStream, intervals
 from team.recording.last_words import MISSING
@@ -237,11 +238,11 @@ class RecordLoop:
             came = _is_alive(sample.payload)
         except WireError as error:  # a name that no node has: recorded as it came
             _LOG.warning("%.80s: %s", sample.key, error)
-            return replace(sample, stamp_ns=self._newest_ns)
+            return msgspec.structs.replace(sample, stamp_ns=self._newest_ns)
         (self._alive.add if came else self._alive.discard)(node)
         self._missing.discard(node)
         message = Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
-        return replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
+        return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
     def look(self, end: TheEnd) -> None:
         """Requests a final map that was missed, and removes processes that left without an

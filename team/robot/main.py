@@ -7,7 +7,8 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+
+import msgspec
 
 from team.config import Exchange, RobotConfig
 from team.containment import reply_of
@@ -243,7 +244,11 @@ class RobotShell:
                 if silent:  # it has not published yet what would be asked for
                     self._first_of[incarnation] = sample
                 elif last is not None and incarnation == last.incarnation:
-                    passed.append(replace(sample, payload=encoded(last), stamp_ns=last.stamp_ns))
+                    passed.append(
+                        msgspec.structs.replace(
+                            sample, payload=encoded(last), stamp_ns=last.stamp_ns
+                        )
+                    )
                 elif last is None or incarnation < last.incarnation:
                     passed.append(sample)
                 else:

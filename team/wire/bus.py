@@ -13,6 +13,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import msgspec
+
 from team.wire.channels import ALIVE, END_ORDER, ORDER, REPLIES, VIEW, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
@@ -35,9 +37,8 @@ from team.wire.messages import (
 _LOG = logging.getLogger("teamslam")
 
 
-@dataclass(frozen=True)
-class Sample:
-    """One publication as it was received."""
+class Sample(msgspec.Struct, frozen=True, gc=False):
+    """One publication as it was received; a log has hundreds of thousands."""
 
     key: str
     payload: bytes

@@ -5,7 +5,6 @@ import csv
 import json
 import random
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -121,7 +120,7 @@ def test_a_recorder_that_came_late_is_told_but_a_cut_is_not(tmp_path: Path) -> N
 
 
 def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
-    again = [replace(s, wall_ns=s.wall_ns + 10**9) for s in drive("alpha", 1)]
+    again = [msgspec.structs.replace(s, wall_ns=s.wall_ns + 10**9) for s in drive("alpha", 1)]
     assert found(recorded(path, drive("alpha", 1) + again)) == []
 
 
@@ -130,7 +129,7 @@ def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
         sampled(c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k)
         for k in range(3)
     ]
-    again = [replace(s, wall_ns=s.wall_ns + 10**9) for s in said[2:]]
+    again = [msgspec.structs.replace(s, wall_ns=s.wall_ns + 10**9) for s in said[2:]]
     assert found(recorded(path, said + again)) == ["central/status: 2 messages missing: 0–1"]
 
 
@@ -158,7 +157,9 @@ def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path)
         keys=("robot/alpha/done", "robot/alpha/team/pose"),
         counts=(1, 4),
     )
-    said.append(replace(sampled(c.TALLY, "robot/alpha", tally, 0), wall_ns=10**18 + 100))
+    said.append(
+        msgspec.structs.replace(sampled(c.TALLY, "robot/alpha", tally, 0), wall_ns=10**18 + 100)
+    )
     assert found(recorded(path, said)) == [
         "robot/alpha/team/pose: 4 messages missing: 0–3",
         "source/alpha: 2 measurements of incarnation 1 missing: 10–11",
@@ -194,12 +195,14 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
 
     def status(counter: int, wall_s: int) -> Sample:
         said = m.Status(stamp_ns=counter * 10**9, node="robot/alpha", state="mapping", figures={})
-        return replace(sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9)
+        return msgspec.structs.replace(
+            sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9
+        )
 
     def tally(node: str, since_s: int, until_s: int, count: int) -> Sample:
         keys = (f"{node}/status",)
         said = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
-        return replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
+        return msgspec.structs.replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
 
     first = [status(k, 10 + k) for k in range(3)]
     second = [status(k, 20 + k) for k in range(2)]
@@ -213,7 +216,7 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
 
 def test_views_that_are_missing_can_be_drawn_again(path: Path) -> None:
     views = [
-        replace(
+        msgspec.structs.replace(
             sampled(
                 c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k
             ),
@@ -229,7 +232,9 @@ def test_views_that_are_missing_can_be_drawn_again(path: Path) -> None:
 
 def test_what_was_asked_for_later_is_not_held_against_the_counters(path: Path) -> None:
     late = [
-        replace(s, counter=NO_COUNTER, wall_ns=s.wall_ns + 50) if s.counter in (2, 3) else s
+        msgspec.structs.replace(s, counter=NO_COUNTER, wall_ns=s.wall_ns + 50)
+        if s.counter in (2, 3)
+        else s
         for s in drive("alpha", 5)
     ]
     assert found(recorded(path, late)) == []
@@ -317,9 +322,9 @@ def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(
 
 def test_unsound_messages_are_counted_and_the_first_is_explained(path: Path) -> None:
     samples = drive("alpha", 1)
-    samples[3] = replace(samples[3], payload=samples[3].payload[:-1])
-    samples[4] = replace(samples[4], payload=encoded(odometry(4, "bravo")))
-    samples[5] = replace(samples[5], stamp_ns=5)
+    samples[3] = msgspec.structs.replace(samples[3], payload=samples[3].payload[:-1])
+    samples[4] = msgspec.structs.replace(samples[4], payload=encoded(odometry(4, "bravo")))
+    samples[5] = msgspec.structs.replace(samples[5], stamp_ns=5)
     *_, line = found(recorded(path, samples))
     assert line.startswith("source/alpha/odometry: 3 unsound, the first: message 2: truncated")
     samples[3:5] = drive("alpha", 1)[3:5]
@@ -518,7 +523,7 @@ def test_robots_own_logs_merge_once_and_stably(tmp_path: Path) -> None:
 
 def test_what_a_robot_says_again_after_a_restart_is_no_duplicate(tmp_path: Path) -> None:
     first = drive("alpha", 1)[0]
-    twice = [first, replace(first, wall_ns=first.wall_ns + 10**9)]
+    twice = [first, msgspec.structs.replace(first, wall_ns=first.wall_ns + 10**9)]
     log = recorded(tmp_path / "a.mcap", twice)
     assert merge([log, log], tmp_path / "m.mcap") == (2, 2)
     assert list(open_log(tmp_path / "m.mcap").samples()) == twice
@@ -588,7 +593,10 @@ def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: 
     samples = [
         sampled(by_class[type(x)], getattr(x, "robot", "alpha"), x, i) for i, x in enumerate(kept)
     ]
-    samples += [replace(samples[0], payload=b"\x90"), Sample("view/scene", b"?", 0, 0, 0)]
+    samples += [
+        msgspec.structs.replace(samples[0], payload=b"\x90"),
+        Sample("view/scene", b"?", 0, 0, 0),
+    ]
     exported = export_csv(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1
     assert {path.stem for path in exported.rows} == {table_of(by_class[type(x)], x) for x in kept}

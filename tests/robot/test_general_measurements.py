@@ -1,6 +1,5 @@
 """Teams whose robots tell in every form, in memory: every rule maps them, the log says it again."""
 
-from dataclasses import replace
 from functools import cache
 
 import msgspec
@@ -97,7 +96,7 @@ def told(of: Scenario, samples: list[Sample]) -> list[Sample]:
     """The same run with another scenario in its log."""
     payload = encoded(configured("world", 0, 0, of))
     return [
-        replace(sample, payload=payload)
+        msgspec.structs.replace(sample, payload=payload)
         if isinstance(opened(sample)[2], m.Configuration)
         else sample
         for sample in samples

@@ -1,7 +1,6 @@
 """Logs built by hand: what a world publishes, and beside it what a team would have said."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -136,7 +135,7 @@ def counted_twice(log: Sequence[Sample]) -> list[Sample]:
             copies = 2 if isinstance(message, m.Observations) else 1
             for k in range(copies):
                 again = msgspec.structs.replace(message, number=2 * message.number + k)
-                doubled.append(replace(sample, payload=encoded(again)))
+                doubled.append(msgspec.structs.replace(sample, payload=encoded(again)))
         else:
             doubled.append(sample)
     return doubled

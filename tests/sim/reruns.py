@@ -1,7 +1,6 @@
 """Logs to compute again: written from samples, honest or tampered with."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -52,7 +51,7 @@ def changed(samples: Sequence[Sample], channel: ch.Channel, change: Change) -> l
         if found != channel:
             out.append(sample)
         elif (other := change(message)) is not None:
-            out.append(replace(sample, payload=encoded(other)))
+            out.append(msgspec.structs.replace(sample, payload=encoded(other)))
     return out
 
 

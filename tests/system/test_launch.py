@@ -1,7 +1,7 @@
 """`teamslam launch`: one command, and a whole team of processes maps a place and ends by itself."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -178,7 +178,7 @@ def keep_another_runs_set(launched: Launched, file: Path) -> None:
         assert isinstance(submap, Submap)
         other = from_floats(floats(submap.mean, "mean") + 1.0)
         payload = encoded(msgspec.structs.replace(submap, mean=other))
-        kept.note([replace(sample, payload=payload)])
+        kept.note([msgspec.structs.replace(sample, payload=payload)])
     kept.close()
 
 

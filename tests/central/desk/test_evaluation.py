@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path as Folder
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -360,7 +361,7 @@ def test_the_own_pose_counts_only_where_there_is_no_team_pose() -> None:
 def test_damaged_messages_are_counted_and_left_out() -> None:
     log = joined_log(scenario(), 0.1)
     damaged = [
-        replace(s, payload=s.payload[:-3])
+        msgspec.structs.replace(s, payload=s.payload[:-3])
         if s.key in (ch.FINAL_MAP.key(), ch.START.key("r1"))
         else s
         for s in log

@@ -1,7 +1,6 @@
 """How a run went over its time: figures against what was put into the log, events in words."""
 
-import dataclasses
-
+import msgspec
 import numpy as np
 import pytest
 
@@ -79,11 +78,11 @@ def measurement(k: int, wall_ms: int) -> Sample:
             )
         ]
     )
-    return dataclasses.replace(sample, wall_ns=wall_ms * MS)
+    return msgspec.structs.replace(sample, wall_ns=wall_ms * MS)
 
 
 def at(outgoing: Outgoing, wall_ms: int) -> Sample:
-    return dataclasses.replace(samples([outgoing])[0], wall_ns=wall_ms * MS)
+    return msgspec.structs.replace(samples([outgoing])[0], wall_ns=wall_ms * MS)
 
 
 def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 from typer.testing import CliRunner
 
@@ -38,7 +39,7 @@ def log() -> list[Sample]:
     """A run in memory, which has no wall clock: each message a millisecond after the one before."""
     of = scenario(robots=2)
     return [
-        replace(sample, wall_ns=(k + 1) * 1_000_000)
+        msgspec.structs.replace(sample, wall_ns=(k + 1) * 1_000_000)
         for k, sample in enumerate(run_team(of, streams(of)))
     ]
 
@@ -70,7 +71,9 @@ def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Pat
 
 
 def test_clocks_that_disagree_still_give_a_picture(log: list[Sample], tmp_path: Path) -> None:
-    behind = [replace(s, wall_ns=1) if s.key.startswith("central") else s for s in log]
+    behind = [
+        msgspec.structs.replace(s, wall_ns=1) if s.key.startswith("central") else s for s in log
+    ]
     found = history(behind)
     assert max(of.last_s.max() for of in found.latencies.values()) < 0.0
     assert latency_picture(found, tmp_path / "latency.png")  # a warning would be an error here

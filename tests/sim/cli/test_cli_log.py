@@ -3,9 +3,9 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -40,7 +40,7 @@ def published() -> list[Sample]:
     samples = []
     for sample in world_log(scenario(robots=2)):
         count = counts[sample.key] = counts.get(sample.key, -1) + 1
-        samples.append(replace(sample, counter=count, wall_ns=count))
+        samples.append(msgspec.structs.replace(sample, counter=count, wall_ns=count))
     return samples
 
 
@@ -166,7 +166,9 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
         start, first = (next(s for s in own if opened(s)[2].number == k) for k in (0, 1))
         name = {"stamp_ns": first.stamp_ns, "robot": "r1", "incarnation": 1, "number": 1}
         told = Increment(**name, duration_ns=10**9, increment=step)
-        recorder.write([start, replace(first, key="source/r1/odometry", payload=encoded(told))])
+        recorder.write(
+            [start, msgspec.structs.replace(first, key="source/r1/odometry", payload=encoded(told))]
+        )
     status, _, err = run("export", moving, "--format", "utias", "-o", tmp_path / "m")
     assert status == 2
     assert "moving.mcap: it has odometry as motions, which the format does not have" in err
