@@ -30,7 +30,7 @@ from team.estimation.hybrid_slam.fastslam import at_poses as particles_at
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.marginals import LandmarkMap, Trajectory
-from team.estimation.models import Increment, acceptable, corrected, increment_of, located
+from team.estimation.models import Increment, increment_of, located, scanned
 from team.estimation.models import predicted as measurement_of
 from team.estimation.submap import LocalMap
 from team.recording.reader import Log, LogError, open_log
@@ -93,8 +93,8 @@ class Keyframe:
 
     def calibrated(self, sensor: Sensor) -> "Keyframe":
         """The measurements within the sensor's limits, with its calibration applied."""
-        valid = acceptable(sensor, self.ranges, self.bearings)
-        ranges, bearings = corrected(sensor, self.ranges[valid], self.bearings[valid])
+        valid, ranges, bearings = scanned(sensor, self.ranges, self.bearings)
+        ranges, bearings = ranges[valid], bearings[valid]
         return Keyframe(
             increment=self.increment, ids=self.ids[valid], ranges=ranges, bearings=bearings
         )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from team.config import Alphas, MotionModel, MotionNoise, Sensor
-from team.estimation import elementary, elementwise
+from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import Point, Pose, adjoint, compose, exponential, inverse, wrapped
 
@@ -396,6 +396,48 @@ def variances(sensor: Sensor) -> tuple[float, float, float]:
     )
 
 
+class Calibration(NamedTuple):
+    """The numbers of a `Sensor` that make a raw measurement a corrected one, or refuse it."""
+
+    range_offset: float
+    range_scale: float
+    bearing_offset: float
+    has_lens: bool
+    lens: tuple[float, float, float]
+    range_is_depth: bool
+    optical_axis: float
+    ranges: tuple[float, float]
+    half_field: float
+
+
+@lru_cache(maxsize=256)
+def calibration_of(sensor: Sensor) -> Calibration:
+    """The calibration of a sensor as the kernel takes it."""
+    lens = sensor.bearing_lens
+    return Calibration(
+        range_offset=float(sensor.range_offset),
+        range_scale=float(sensor.range_scale),
+        bearing_offset=float(sensor.bearing_offset),
+        has_lens=not lens.is_ideal,
+        lens=(float(lens.linear), float(lens.square), float(lens.cubic)),
+        range_is_depth=sensor.range_is_depth,
+        optical_axis=float(sensor.optical_axis),
+        ranges=(float(sensor.min_range), float(sensor.max_range)),
+        half_field=0.5 * sensor.field_of_view,
+    )
+
+
+Scanned = tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+
+
+def scanned(
+    sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
+) -> Scanned:
+    """`acceptable` and `corrected` of the same measurements, in one call."""
+    raw = np.array(ranges, np.float64), np.array(bearings, np.float64)
+    return _scanned(calibration_of(sensor), *raw)
+
+
 def corrected(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -403,18 +445,7 @@ def corrected(
 
     A depth is divided by cos(b − optical_axis) too; where that is below OFF_AXIS it is NaN.
     """
-    turned = bearings - sensor.bearing_offset
-    lens = sensor.bearing_lens
-    if not lens.is_ideal:
-        turned = turned - bearings * (
-            lens.linear + bearings * (lens.square + bearings * lens.cubic)
-        )
-    turns = np.floor((np.pi - turned) / (2.0 * np.pi))
-    distances = (ranges - sensor.range_offset) / sensor.range_scale
-    if sensor.range_is_depth:
-        cosine = elementwise.cos(bearings - sensor.optical_axis)
-        distances = np.where(cosine > OFF_AXIS, distances / np.maximum(cosine, OFF_AXIS), np.nan)
-    return distances, turned + 2.0 * np.pi * turns
+    return scanned(sensor, ranges, bearings)[1:]
 
 
 def acceptable(
@@ -425,14 +456,30 @@ def acceptable(
     Measurements that are not finite do not; neither does one whose corrected range is not positive,
     or a depth beyond OFF_AXIS.
     """
-    distances, _ = corrected(sensor, ranges, bearings)
-    inside: Bool[np.ndarray, " n"] = (
-        (ranges >= sensor.min_range)
-        & (ranges <= sensor.max_range)
-        & (distances > 0.0)
-        & (
-            np.abs(np.remainder(bearings + np.pi, 2.0 * np.pi) - np.pi)
-            <= 0.5 * sensor.field_of_view
-        )
-    )
-    return inside
+    return scanned(sensor, ranges, bearings)[0]
+
+
+@compiled
+def _scanned(
+    by: Calibration, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
+) -> Scanned:
+    mask, n = np.empty(len(ranges), np.bool_), len(ranges)
+    distances, turned = np.empty(n), np.empty(n)
+    linear, square, cubic = by.lens
+    least, most = by.ranges
+    for k in range(len(ranges)):
+        r, b = ranges[k], bearings[k]
+        angle = b - by.bearing_offset
+        if by.has_lens:
+            angle = angle - b * (linear + b * (square + b * cubic))
+        turns = np.floor((np.pi - angle) / (2.0 * np.pi))
+        turned[k] = angle + 2.0 * np.pi * turns
+        distance = (r - by.range_offset) / by.range_scale
+        if by.range_is_depth:
+            cosine = elementary.cos(b - by.optical_axis)
+            distance = distance / cosine if cosine > OFF_AXIS else np.nan
+        distances[k] = distance
+        off_axis = abs(np.remainder(b + np.pi, 2.0 * np.pi) - np.pi)
+        within = least <= r <= most and off_axis <= by.half_field
+        mask[k] = within and distance > 0.0
+    return mask, distances, turned

@@ -15,7 +15,7 @@ from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
 from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
-from team.estimation.models import Increment, acceptable, corrected
+from team.estimation.models import Increment, scanned
 from team.estimation.mount import of_sensor
 from team.estimation.odometry import STANDING, Intervals, OdometryInterval
 from team.estimation.scans import Own, calibrated, unclaimed
@@ -125,12 +125,13 @@ class Segmenter:
         """
         if self.now_ns is not None and stamp_ns < self.now_ns:
             return Rejection.OLDER
-        mask = acceptable(self._sensor, ranges, bearings)
+        mask, r, b = scanned(self._sensor, ranges, bearings)
         if len(ids) and not mask.any():
             return Rejection.SENSOR_LIMITS
-        r, b = corrected(self._sensor, ranges[mask], bearings[mask])
+        if not mask.all():
+            ids, r, b = ids[mask], r[mask], b[mask]
         noises = unclaimed(len(r)) if own is None else calibrated(own[mask], self._sensor)
-        scan = KeyframeScan(stamp_ns, ids[mask], r, b, noises, np.zeros(3))
+        scan = KeyframeScan(stamp_ns, ids, r, b, noises, np.zeros(3))
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 

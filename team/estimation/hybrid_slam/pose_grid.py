@@ -21,7 +21,7 @@ from team.estimation.inter_robot import (
     point_seen,
     reduced,
 )
-from team.estimation.models import Increment, acceptable, corrected
+from team.estimation.models import Increment, scanned
 from team.rejection import Rejection
 
 TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
@@ -94,8 +94,7 @@ class PoseGrid:
         away_ns = abs(stamp_ns - node_ns)
         if away_ns > self._near_ns or not self._begin_ns < node_ns <= self._last_ns:
             return Rejection.NO_NODE
-        mask = acceptable(self._sensor, ranges, bearings)
-        distances, directions = corrected(self._sensor, ranges, bearings)
+        mask, distances, directions = scanned(self._sensor, ranges, bearings)
         distances = distances - self._sensor.marker_range_offset
         mask &= distances > 0.0
         for k in np.flatnonzero(mask):
