@@ -94,7 +94,10 @@ class Intervals(NamedTuple):
 
     def first(self, count: int) -> "Intervals":
         """The first `count` of them."""
-        return Intervals(*(column[:count] for column in self))
+        if count >= len(self.forward):
+            return self
+        ends_ns, durations_ns, forward, yaw_rates = self
+        return Intervals(ends_ns[:count], durations_ns[:count], forward[:count], yaw_rates[:count])
 
     @property
     def last(self) -> OdometryInterval:

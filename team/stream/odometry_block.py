@@ -40,6 +40,8 @@ class OdometryBlock(NamedTuple):
 
     def part(self, begin: int, end: int) -> "OdometryBlock":
         """The intervals begin … end − 1."""
+        if begin == 0 and end >= self.size:
+            return self
         return OdometryBlock(
             self.robot,
             self.incarnation,

@@ -1,7 +1,7 @@
 """Consecutive odometry intervals, composed in one compiled call.
 
-Odometry arrives tens of times between two uses of the resulting motion. Each interval is one row
-here; the motions since the last keyframe, since the last pose node and since the first scan of a
+Odometry arrives tens of times between two uses of the resulting motion. Each interval is kept as it
+came; the motions since the last keyframe, since the last pose node and since the first scan of a
 keyframe are updated when they are needed.
 """
 
@@ -27,6 +27,8 @@ from team.estimation.models import (
 from team.estimation.odometry import Intervals, OdometryInterval
 
 Spread = Float[np.ndarray, "3 3"]
+Driven = tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+"""Durations [ns], forward speeds [m/s] and yaw rates [rad/s] of consecutive intervals."""
 
 
 class Since(NamedTuple):
@@ -46,42 +48,27 @@ class Since(NamedTuple):
 
 
 @compiled
-def gone_on(since: Since, rows: Float[np.ndarray, "n 10"], turns_first: bool) -> Since:
-    """All motions after further intervals, in order: equal to `Increment.then` and `compose`.
-
-    rows: `models.course_of` of each interval, then its `odometry.forward_column`, as `rows_of`.
-    """
+def gone_on(since: Since, model: CourseModel, driven: Driven) -> Since:
+    """All motions after further intervals, in order: equal to `Increment.then` and `compose`."""
     motion, covariance, shift, node_motion, node_covariance, of_scan = since
-    for row in rows:
-        if turns_first:
-            step, spread = turn_then_drive(row[0], row[1], row[2], row[3], row[4], row[5], row[6])
+    durations_ns, forward, yaw_rates = driven
+    for k in range(len(forward)):
+        duration_s = durations_ns[k] * 1e-9
+        way, turn, of_way, of_turn, both, final, lateral = course_of(
+            model, duration_s, forward[k], yaw_rates[k]
+        )
+        if model.turns_first:
+            step, spread = turn_then_drive(way, turn, of_way, of_turn, both, final, lateral)
         else:
-            step, spread = arc(row[0], row[1], row[2], row[3], row[4], row[5], row[6])
+            step, spread = arc(way, turn, of_way, of_turn, both, final, lateral)
         node_motion, node_covariance = composed(node_motion, node_covariance, step, spread)
         motion, covariance = composed(motion, covariance, step, spread)
         shift = carried_on(shift, step)
-        for i in range(3):
-            shift[i] += row[7 + i]
+        ahead, left = scale_column(model, duration_s, forward[k], yaw_rates[k])
+        shift[0] += ahead
+        shift[1] += left
         of_scan = compose(of_scan, step)
     return Since(motion, covariance, shift, node_motion, node_covariance, of_scan)
-
-
-@compiled
-def rows_of(
-    model: CourseModel,
-    durations_ns: Int64[np.ndarray, " n"],
-    forward: Float[np.ndarray, " n"],
-    yaw_rates: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, "n 10"]:
-    """A row of `gone_on` for each interval."""
-    rows = np.zeros((len(forward), 10))
-    for k in range(len(forward)):
-        duration_s = durations_ns[k] * 1e-9
-        course = course_of(model, duration_s, forward[k], yaw_rates[k])
-        for i in range(7):
-            rows[k, i] = course[i]
-        rows[k, 7], rows[k, 8] = scale_column(model, duration_s, forward[k], yaw_rates[k])
-    return rows
 
 
 class OdometryRun:
@@ -89,12 +76,12 @@ class OdometryRun:
 
     def __init__(self, motion: MotionModel) -> None:
         self._model = model_of(motion)
-        self._rows: list[Float[np.ndarray, "n 10"]] = []
+        self._stretches: list[Driven] = []
         self._parts: list[tuple[int, float, float]] = []
 
     def __bool__(self) -> bool:
         """Whether there are any."""
-        return bool(self._rows or self._parts)
+        return bool(self._stretches or self._parts)
 
     def add(self, over: OdometryInterval, duration_ns: int) -> None:
         """Adds the next part of an interval."""
@@ -103,15 +90,13 @@ class OdometryRun:
     def add_all(self, intervals: Intervals) -> None:
         """Adds whole intervals."""
         self._note_parts()
-        _, durations_ns, forward, yaw_rates = intervals
-        self._rows.append(rows_of(self._model, durations_ns, forward, yaw_rates))
+        self._stretches.append(intervals[1:])
 
     def _note_parts(self) -> None:
         if self._parts:
             durations, forward, yaw_rates = zip(*self._parts, strict=True)
             speeds = np.array([forward, yaw_rates], np.float64)
-            of_parts = np.array(durations, np.int64), speeds[0], speeds[1]
-            self._rows.append(rows_of(self._model, *of_parts))
+            self._stretches.append((np.array(durations, np.int64), speeds[0], speeds[1]))
             self._parts = []
 
     def behind(self, motion: Increment) -> Increment:
@@ -119,7 +104,7 @@ class OdometryRun:
         none = np.zeros(3)
         still = none, np.zeros((3, 3))
         since = Since(motion.mean, motion.covariance, none, *still, none)
-        after = gone_on(since, self._whole(), self._model.turns_first)
+        after = gone_on(since, self._model, self._whole())
         return Increment(after.motion, after.covariance)
 
     def driven(
@@ -130,13 +115,16 @@ class OdometryRun:
         of_scan: Pose,
     ) -> Since:
         """The motions up to now with all stored parts, which are removed."""
-        rows, self._rows = self._whole(), []
+        whole, self._stretches = self._whole(), []
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
-        return gone_on(since, rows, self._model.turns_first)
+        return gone_on(since, self._model, whole)
 
-    def _whole(self) -> Float[np.ndarray, "n 10"]:
+    def _whole(self) -> Driven:
         self._note_parts()
-        if len(self._rows) > 1:
-            self._rows = [np.concatenate(self._rows)]
-        return self._rows[0]
+        if len(self._stretches) > 1:
+            durations, forward, yaw_rates = zip(*self._stretches, strict=True)
+            self._stretches = [
+                (np.concatenate(durations), np.concatenate(forward), np.concatenate(yaw_rates))
+            ]
+        return self._stretches[0]

@@ -44,6 +44,10 @@ class HybridSlam:
         self._config, self._incarnation = config, incarnation
         self._grid = PoseGrid(config.sensor, front) if with_nodes else None
         self._segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s, self._grid)
+        self._lasting_ns = (
+            min(round(front.window_s * 1e9), LONGEST_NS),
+            min(round(front.standing_s * 1e9), LONGEST_NS),
+        )
         self._innovation, self._scans = NOTHING, 0
         self._driven_m: float
         self._start_ns: int | None = None
@@ -98,16 +102,15 @@ class HybridSlam:
         if self._start_ns is None or self._is_half_a_submap:
             return 0
         count = self._segmenter.quiet(intervals)
-        front = self._config.front_end
-        lasting_ns = (
-            min(round(front.window_s * 1e9), LONGEST_NS),
-            min(round(front.standing_s * 1e9), LONGEST_NS),
-        )
+        if not count:
+            return 0
+        taken = intervals.first(count)
+        least_m = self._config.front_end.window_m
         count, driven_m = still_open(
-            intervals.first(count), self._start_ns, lasting_ns, self._driven_m, front.window_m
+            taken, self._start_ns, self._lasting_ns, self._driven_m, least_m
         )
         if count:
-            taken = intervals.first(count)
+            taken = taken.first(count)
             self._driven_m = driven_m
             self._segmenter.drive_on(taken)
             if self._grid is not None:
