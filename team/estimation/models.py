@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from team.config import Alphas, MotionModel, MotionNoise, Sensor
 from team.estimation import elementary
 from team.estimation.compiled import compiled
-from team.estimation.geometry import Point, Pose, adjoint, compose, exponential, inverse, wrapped
+from team.estimation.geometry import Point, Pose, adjoint, inverse, swept, wrapped
 
 NEAREST_M = 1e-3
 """A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""
@@ -51,8 +51,21 @@ def composed(
     mean: Pose, covariance: Float[np.ndarray, "3 3"], then: Pose, added: Float[np.ndarray, "3 3"]
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
     """T₁Exp(ξ₁)T₂Exp(ξ₂) = T₁T₂Exp(Ad(T₂⁻¹)ξ₁)Exp(ξ₂), to first order in the noise."""
-    Ad = adjoint(inverse(then))
-    half = np.empty((3, 3))
+    after, total = mean.copy(), covariance.copy()
+    carry(after, total, then, added, adjoint(inverse(then)), np.empty((3, 3)))
+    return after, total
+
+
+@compiled
+def carry(
+    mean: Pose,
+    covariance: Float[np.ndarray, "3 3"],
+    then: Pose,
+    added: Float[np.ndarray, "3 3"],
+    Ad: Float[np.ndarray, "3 3"],
+    half: Float[np.ndarray, "3 3"],
+) -> None:
+    """`composed` in place; Ad: of then⁻¹, half: scratch."""
     for i in range(3):
         for j in range(3):
             half[i, j] = (
@@ -60,14 +73,24 @@ def composed(
                 + Ad[i, 1] * covariance[1, j]
                 + Ad[i, 2] * covariance[2, j]
             )
-    total = np.empty((3, 3))
     for i in range(3):
         for j in range(i, 3):
-            total[i, j] = added[i, j] + (
+            covariance[i, j] = added[i, j] + (
                 half[i, 0] * Ad[j, 0] + half[i, 1] * Ad[j, 1] + half[i, 2] * Ad[j, 2]
             )
-            total[j, i] = total[i, j]
-    return compose(mean, then), total
+            covariance[j, i] = covariance[i, j]
+    go(mean, then)
+
+
+@compiled
+def go(pose: Pose, then: Pose) -> None:
+    """`geometry.compose` in place."""
+    s, c = elementary.sin_and_cos(pose[2])
+    pose[0], pose[1] = (
+        pose[0] + c * then[0] - s * then[1],
+        pose[1] + s * then[0] + c * then[1],
+    )
+    pose[2] = wrapped(pose[2] + then[2])
 
 
 class CourseModel(NamedTuple):
@@ -293,12 +316,23 @@ def arc(
     final: float,
     lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
-    """The two columns of SE(2)'s right Jacobian at (d, 0, φ) that the noises a and b act through.
+    """`drive_arc` as a motion of its own."""
+    step, covariance = np.empty(3), np.empty((3, 3))
+    course = distance, turn, forward_var, turn_var, both, final, lateral
+    drive_arc(course, step, covariance)
+    return step, covariance
+
+
+@compiled
+def drive_arc(course: Course, step: Pose, covariance: Float[np.ndarray, "3 3"]) -> None:
+    """The motion of an arc and its noise, in place: the two columns of SE(2)'s right Jacobian at
+    (d, 0, φ) that the noises a and b act through.
 
     Jr₁ = (sin φ/φ, −(1 − cos φ)/φ, 0), Jr₃ = (d(φ − sin φ)/φ², d(1 − cos φ)/φ², 1); Solà et al.,
     A micro Lie theory, eq. 163. Near φ = 0 the quotients are taken from their series. `both` is the
     covariance of a and b.
     """
+    distance, turn, forward_var, turn_var, both, final, lateral = course
     if abs(turn) < 1e-3:
         square = turn * turn
         sine = 1.0 - square / 6.0
@@ -311,7 +345,6 @@ def arc(
         cubic = (turn - s) / (turn * turn)
     ax, ay = sine, -turn * cosine
     bx, by = distance * cubic, distance * cosine
-    covariance = np.empty((3, 3))
     covariance[0, 0] = forward_var * ax * ax + turn_var * bx * bx + 2.0 * both * ax * bx
     covariance[0, 1] = forward_var * ax * ay + turn_var * bx * by + both * (ax * by + ay * bx)
     covariance[1, 1] = forward_var * ay * ay + turn_var * by * by + 2.0 * both * ay * by + lateral
@@ -321,7 +354,8 @@ def arc(
     covariance[1, 0] = covariance[0, 1]
     covariance[2, 0] = covariance[0, 2]
     covariance[2, 1] = covariance[1, 2]
-    return exponential(np.array([distance, 0.0, turn])), covariance
+    step[0], step[1] = swept(distance, 0.0, turn)
+    step[2] = wrapped(turn)
 
 
 @compiled
@@ -334,9 +368,21 @@ def turn_then_drive(
     final: float,
     lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
-    """The noises (a, b) reach the end's tangent space by J = [[1, 0], [0, d], [0, 1]]."""
+    """`turn_and_drive` as a motion of its own."""
+    step, covariance = np.empty(3), np.empty((3, 3))
+    course = distance, turn, forward_var, turn_var, both, final, lateral
+    turn_and_drive(course, step, covariance)
+    return step, covariance
+
+
+@compiled
+def turn_and_drive(course: Course, step: Pose, covariance: Float[np.ndarray, "3 3"]) -> None:
+    """The motion of a turn and a way behind it, and its noise, in place.
+
+    The noises (a, b) reach the end's tangent space by J = [[1, 0], [0, d], [0, 1]].
+    """
+    distance, turn, forward_var, turn_var, both, final, lateral = course
     s, c = elementary.sin_and_cos(turn)
-    covariance = np.zeros((3, 3))
     covariance[0, 0] = forward_var
     covariance[0, 1] = covariance[1, 0] = both * distance
     covariance[0, 2] = covariance[2, 0] = both
@@ -344,7 +390,7 @@ def turn_then_drive(
     covariance[1, 2] = turn_var * distance
     covariance[2, 1] = turn_var * distance
     covariance[2, 2] = turn_var + final
-    return np.array([distance * c, distance * s, wrapped(turn)]), covariance
+    step[0], step[1], step[2] = distance * c, distance * s, wrapped(turn)
 
 
 @compiled

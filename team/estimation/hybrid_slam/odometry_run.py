@@ -11,18 +11,19 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.config import MotionModel
+from team.estimation import elementary
 from team.estimation.compiled import compiled
-from team.estimation.geometry import Pose, compose
-from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
+from team.estimation.geometry import Pose, wrapped
 from team.estimation.models import (
     CourseModel,
     Increment,
-    arc,
-    composed,
+    carry,
     course_of,
+    drive_arc,
+    go,
     model_of,
     scale_column,
-    turn_then_drive,
+    turn_and_drive,
 )
 from team.estimation.odometry import Intervals, OdometryInterval
 
@@ -50,25 +51,38 @@ class Since(NamedTuple):
 @compiled
 def gone_on(since: Since, model: CourseModel, driven: Driven) -> Since:
     """All motions after further intervals, in order: equal to `Increment.then` and `compose`."""
-    motion, covariance, shift, node_motion, node_covariance, of_scan = since
+    motion, covariance, shift = since.motion.copy(), since.covariance.copy(), since.shift.copy()
+    node_motion, node_covariance = since.node_motion.copy(), since.node_covariance.copy()
+    of_scan = since.of_scan.copy()
     durations_ns, forward, yaw_rates = driven
+    step, spread, half, Ad = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
     for k in range(len(forward)):
         duration_s = durations_ns[k] * 1e-9
-        way, turn, of_way, of_turn, both, final, lateral = course_of(
-            model, duration_s, forward[k], yaw_rates[k]
-        )
+        course = course_of(model, duration_s, forward[k], yaw_rates[k])
         if model.turns_first:
-            step, spread = turn_then_drive(way, turn, of_way, of_turn, both, final, lateral)
+            turn_and_drive(course, step, spread)
         else:
-            step, spread = arc(way, turn, of_way, of_turn, both, final, lateral)
-        node_motion, node_covariance = composed(node_motion, node_covariance, step, spread)
-        motion, covariance = composed(motion, covariance, step, spread)
-        shift = carried_on(shift, step)
+            drive_arc(course, step, spread)
+        _adjoint_of_inverse(step, Ad)
+        carry(node_motion, node_covariance, step, spread, Ad, half)
+        carry(motion, covariance, step, spread, Ad, half)
+        s, c = elementary.sin_and_cos(step[2])  # `carried_on`
+        x, y = shift[0] - step[1] * shift[2], shift[1] + step[0] * shift[2]
         ahead, left = scale_column(model, duration_s, forward[k], yaw_rates[k])
-        shift[0] += ahead
-        shift[1] += left
-        of_scan = compose(of_scan, step)
+        shift[0], shift[1] = c * x + s * y + ahead, -s * x + c * y + left
+        go(of_scan, step)
     return Since(motion, covariance, shift, node_motion, node_covariance, of_scan)
+
+
+@compiled
+def _adjoint_of_inverse(step: Pose, Ad: Spread) -> None:
+    """`geometry.adjoint` of `geometry.inverse`, in place."""
+    s, c = elementary.sin_and_cos(step[2])
+    x, y = -c * step[0] - s * step[1], s * step[0] - c * step[1]
+    s, c = elementary.sin_and_cos(wrapped(-step[2]))
+    Ad[0, 0], Ad[0, 1], Ad[0, 2] = c, -s, y
+    Ad[1, 0], Ad[1, 1], Ad[1, 2] = s, c, -x
+    Ad[2, 2] = 1.0
 
 
 class OdometryRun:
