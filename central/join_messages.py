@@ -174,7 +174,7 @@ def _listed(named: Sequence[str]) -> str:
 
 
 def priors(
-    fold: Fold, shown: Sequence[int], fused: m.FusedMap, wanted: SentPriors | Collection[str]
+    fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: SentPriors | Collection[str]
 ) -> list[Outgoing]:
     """The prior of the latest stream of every robot in the team's frame for which it has new
     information by what was sent, or which is named.
@@ -185,12 +185,12 @@ def priors(
     for robot, incarnation in fold.home:
         latest[robot] = max(latest.get(robot, 0), incarnation)
     streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
-    if isinstance(wanted, SentPriors):
+    if isinstance(requested, SentPriors):
         blocks = marginals.landmark_blocks(fold, shown)
         poses = ((each, marginals.last_pose(fold, each)) for each in streams)
-        streams = [each for each, pose in poses if wanted.is_worth(each, pose, blocks)]
+        streams = [each for each, pose in poses if requested.is_worth(each, pose, blocks)]
     else:
-        streams = [each for each in streams if each[0] in wanted]
+        streams = [each for each in streams if each[0] in requested]
     if not streams:
         return []
     found = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, shown)

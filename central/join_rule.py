@@ -136,8 +136,8 @@ class JoinRule(FusionRule[SubmapInputs]):
         if final:
             with_it = self._sound(trajectories(fold, digest, inputs.submaps))
             return [*with_it, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
-        wanted = inputs.priors_of if inputs.recorded else self._sent_priors
-        with_it = self._sound(priors(fold, shown.ids, fused, wanted))
+        requested = inputs.priors_of if inputs.recorded else self._sent_priors
+        with_it = self._sound(priors(fold, shown.ids, fused, requested))
         return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *with_it]
 
     def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:

@@ -49,12 +49,17 @@ class Since(NamedTuple):
 
 
 @compiled
-def gone_on(since: Since, model: CourseModel, driven: Driven) -> Since:
+def gone_on(
+    since: Since,
+    model: CourseModel,
+    durations_ns: Int64[np.ndarray, " n"],
+    forward: Float[np.ndarray, " n"],
+    yaw_rates: Float[np.ndarray, " n"],
+) -> Since:
     """All motions after further intervals, in order: equal to `Increment.then` and `compose`."""
     motion, covariance, shift = since.motion.copy(), since.covariance.copy(), since.shift.copy()
     node_motion, node_covariance = since.node_motion.copy(), since.node_covariance.copy()
     of_scan = since.of_scan.copy()
-    durations_ns, forward, yaw_rates = driven
     step, spread, half, Ad = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
     for k in range(len(forward)):
         duration_s = durations_ns[k] * 1e-9
@@ -118,7 +123,7 @@ class OdometryRun:
         none = np.zeros(3)
         still = none, np.zeros((3, 3))
         since = Since(motion.mean, motion.covariance, none, *still, none)
-        after = gone_on(since, self._model, self._whole())
+        after = gone_on(since, self._model, *self._whole())
         return Increment(after.motion, after.covariance)
 
     def driven(
@@ -132,7 +137,7 @@ class OdometryRun:
         whole, self._stretches = self._whole(), []
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
-        return gone_on(since, self._model, whole)
+        return gone_on(since, self._model, *whole)
 
     def _whole(self) -> Driven:
         self._note_parts()
