@@ -18,9 +18,8 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Int64
 
-from team.estimation import dense
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.condensed_factor import (
     NOBODY,
@@ -30,18 +29,20 @@ from team.estimation.map_joining.condensed_factor import (
     newest,
     places,
 )
-from team.estimation.map_joining.condensing_kernel import add_submaps
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
-from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
 from team.estimation.map_joining.memory import MOST, Observed
+from team.estimation.map_joining.path_elimination import (
+    Factors,
+    nodes_of,
+    quadratic,
+    without_paths,
+)
 from team.estimation.map_joining.resting import FIRST, beside, idle, split
 from team.estimation.map_joining.submap_graph import Graph, without_nodes
 
 Indices = Int64[np.ndarray, " _"]
-Values = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "n n"]
 T = TypeVar("T")
 
 LAG = 8
@@ -138,15 +139,15 @@ def _condensed(
         np.bool_,
     )
     prior = np.array([eliminated[each.node] for each in graph.priors], np.bool_)
-    touched = [graph.submaps[f].nodes for f in np.flatnonzero(leaving)]
-    touched += [np.array(graph.sightings[s][1:]) for s in np.flatnonzero(seen)]
-    touched += [np.array([graph.priors[k].node]) for k in np.flatnonzero(prior)]
-    touched += [] if before is None else [before.nodes]
-    union = np.unique(np.concatenate(touched))
-    union = union[~graph.fixed[union]]
-    H, g, cost = _quadratic(island, union, leaving, seen, prior)
-    out = np.repeat(eliminated[union], np.diff(graph.offset)[union])
-    parts = split(H, g, out)
+    factors = Factors(leaving, seen, prior)
+    union = nodes_of(island, factors, [] if before is None else [before.nodes])
+    sizes = np.diff(graph.offset)
+    unknowns = int(sizes[union[eliminated[union]]].sum())
+    if before is None:
+        union, H, g, cost = without_paths(island, union, factors, eliminated)
+    else:
+        H, g, cost = quadratic(island, union, factors)
+    parts = split(H, g, np.repeat(eliminated[union], sizes[union]))
     left, node_of = without_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
     remaining = union[~eliminated[union]]
     numbers = places(graph.offset, remaining)
@@ -160,7 +161,7 @@ def _condensed(
         slope=parts.slope,
         cost=cost - parts.lowered,
         submaps=int(leaving.sum()) + (0 if before is None else before.submaps),
-        redundancy=measured - int(out.sum()) + (0 if before is None else before.redundancy),
+        redundancy=measured - unknowns + (0 if before is None else before.redundancy),
         departed=_departed(island, leaving, seen, prior),
         resting=beside(island, union, parts, rests),
     )
@@ -182,63 +183,6 @@ def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarra
         eliminated[nodes[0]] = True
         eliminated[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
     return eliminated
-
-
-def _quadratic(
-    island: Island,
-    union: Indices,
-    leaving: Bool[np.ndarray, " F"],
-    seen: Bool[np.ndarray, " S"],
-    prior: Bool[np.ndarray, " priors"],
-) -> tuple[Matrix, Values, float]:
-    """Matrix A, half the gradient and the cost of the condensed factors, over the union of their
-    nodes.
-    """
-    graph, state = island.graph, island.state
-    sizes = np.diff(graph.offset)[union]
-    place = np.full(len(graph.fixed), -1, np.int64)
-    place[union] = np.cumsum(sizes) - sizes
-    total = int(sizes.sum())
-    H, g, cost = np.zeros((total, total)), np.zeros(total), 0.0
-    before = graph.condensed
-    if before is not None:
-        within = places(
-            np.concatenate([place[union], [total]]), np.searchsorted(union, before.nodes)
-        )
-        H[np.ix_(within, within)] += before.information
-        g[within] += before.gradient_at(state, graph.boundary)
-        cost = before.cost_at(state, graph.boundary)
-    weights = island.weight / island.settings.covariance_factor
-    at_work = np.flatnonzero(leaving)
-    add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)
-    cost += island.cost_of_factors(leaving, seen, prior)
-    for s in np.flatnonzero(seen):
-        _add_sighting(H, g, place, island, int(s))
-    for k in np.flatnonzero(prior):
-        each, slope = graph.priors[k], island.prior_slope(int(k))
-        begin, weight = place[each.node], island.prior_weight[k]
-        end = begin + len(slope)
-        g[begin:end] += weight * slope
-        H[begin:end, begin:end] += weight * each.information
-    return H, g, cost
-
-
-def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) -> None:
-    graph, state = island.graph, island.state
-    sighting, *nodes = graph.sightings[s]
-    a, b = (int(graph.offset[node]) for node in nodes)
-    r, jacobian = sighting_residual(state[a : a + 3], state[b : b + 3], sighting.measurement)
-    weighted = island.sighting_weight[s] * sighting.information
-    blocks = [(place[node], jacobian[:, 3 * i : 3 * i + 3]) for i, node in enumerate(nodes)]
-    for row, left in blocks:
-        if row < 0:
-            continue
-        g[row : row + 3] += dense.product(left.T, dense.product(weighted, r))
-        for column, right in blocks:
-            if column >= 0:
-                H[row : row + 3, column : column + 3] += dense.product(
-                    dense.product(left.T, weighted), right
-                )
 
 
 def _departed(

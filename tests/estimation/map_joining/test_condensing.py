@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining import marginals
+from team.estimation.map_joining import condensing, marginals, path_elimination
 from team.estimation.map_joining.condensing import condensed
-from team.estimation.map_joining.gauss_newton import final_cost
+from team.estimation.map_joining.gauss_newton import aged, final_cost
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
 from team.estimation.map_joining.minima import degrees_of_freedom
+from team.estimation.map_joining.path_elimination import quadratic
 from team.estimation.map_joining.relinearising import is_due, relinearised
+from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import team
 
 LAG = 3
@@ -105,3 +107,25 @@ def test_it_is_due_when_a_size_is_passed_and_not_again():
     passed = [size for size in range(2, 3000, 2) if is_due(size - 2, size)]
     assert passed == [192, 288, 432, 648, 972]
     assert is_due(100, 700)
+
+
+def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monkeypatch):
+    """Inter-robot measurements connect the runs of one robot with those of others."""
+    world = meeting(3, robots=3, submaps=9)
+    fold = joined_with(world.submaps, world.starts, world.sightings, ROBUST)
+    fold = replace(fold, islands={fold.main_key: aged(fold.main, 100)})
+    monkeypatch.setattr(path_elimination, "RUN", 3)
+    by_runs = condensed(fold, lag=2, begin=0, first=1).main.graph.condensed
+    monkeypatch.setattr(
+        condensing,
+        "without_paths",
+        lambda island, union, factors, _: (union, *quadratic(island, union, factors)),
+    )
+    at_once = condensed(fold, lag=2, begin=0, first=1).main.graph.condensed
+    assert by_runs.submaps == 21
+    assert by_runs.redundancy == at_once.redundancy
+    assert by_runs.nodes.tolist() == at_once.nodes.tolist()
+    assert by_runs.cost == pytest.approx(at_once.cost, rel=1e-9)
+    largest = np.abs(at_once.information).max()
+    assert np.allclose(by_runs.information, at_once.information, rtol=1e-9, atol=1e-11 * largest)
+    assert np.allclose(by_runs.slope, at_once.slope, atol=1e-9 * np.abs(at_once.slope).max())

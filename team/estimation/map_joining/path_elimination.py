@@ -1,0 +1,182 @@
+"""The quadratic of factors at the present state, with the old poses eliminated run by run.
+
+A stream's old poses are a chain: a run of them is connected with the landmarks seen along it and
+with the poses at its ends. Runs are therefore eliminated one after the other, each from a dense
+quadratic over what it is connected with, and what is left of one run is a factor of the next
+(George 1973, SIAM J. Numer. Anal. 10(2), by blocks). All at once the same elimination would be of a
+dense matrix of all poses and landmarks.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation import dense
+from team.estimation.contribution import Stream
+from team.estimation.map_joining.condensed_factor import places
+from team.estimation.map_joining.condensing_kernel import add_submaps
+from team.estimation.map_joining.gauss_newton import Island
+from team.estimation.map_joining.inter_robot_kernel import sighting_residual
+from team.estimation.map_joining.resting import split
+
+Indices = Int64[np.ndarray, " _"]
+Values = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
+
+RUN = 16
+"""Number of submaps whose poses are eliminated together."""
+
+
+class Factors(NamedTuple):
+    """Marks of submaps, inter-robot measurements and priors, in the graph's order."""
+
+    submaps: Bool[np.ndarray, " F"]
+    sightings: Bool[np.ndarray, " S"]
+    priors: Bool[np.ndarray, " priors"]
+
+
+class Left(NamedTuple):
+    """A quadratic over some nodes, ascending: what eliminating others has left."""
+
+    nodes: Indices
+    information: Matrix
+    slope: Values
+
+
+def quadratic(
+    island: Island,
+    union: Indices,
+    factors: Factors,
+) -> tuple[Matrix, Values, float]:
+    """Matrix A, half the gradient and the cost of these factors and of the condensed one, over the
+    union of their nodes.
+    """
+    leaving, seen, prior = factors
+    graph, state = island.graph, island.state
+    sizes = np.diff(graph.offset)[union]
+    place = np.full(len(graph.fixed), -1, np.int64)
+    place[union] = np.cumsum(sizes) - sizes
+    total = int(sizes.sum())
+    H, g, cost = np.zeros((total, total)), np.zeros(total), 0.0
+    before = graph.condensed
+    if before is not None:
+        within = places(
+            np.concatenate([place[union], [total]]), np.searchsorted(union, before.nodes)
+        )
+        H[np.ix_(within, within)] += before.information
+        g[within] += before.gradient_at(state, graph.boundary)
+        cost = before.cost_at(state, graph.boundary)
+    weights = island.weight / island.settings.covariance_factor
+    at_work = np.flatnonzero(leaving)
+    add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)
+    cost += island.cost_of_factors(leaving, seen, prior)
+    for s in np.flatnonzero(seen):
+        _add_sighting(H, g, place, island, int(s))
+    for k in np.flatnonzero(prior):
+        each, slope = graph.priors[k], island.prior_slope(int(k))
+        begin, weight = place[each.node], island.prior_weight[k]
+        end = begin + len(slope)
+        g[begin:end] += weight * slope
+        H[begin:end, begin:end] += weight * each.information
+    return H, g, cost
+
+
+def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) -> None:
+    graph, state = island.graph, island.state
+    sighting, *nodes = graph.sightings[s]
+    a, b = (int(graph.offset[node]) for node in nodes)
+    r, jacobian = sighting_residual(state[a : a + 3], state[b : b + 3], sighting.measurement)
+    weighted = island.sighting_weight[s] * sighting.information
+    blocks = [(place[node], jacobian[:, 3 * i : 3 * i + 3]) for i, node in enumerate(nodes)]
+    for row, left in blocks:
+        if row < 0:
+            continue
+        g[row : row + 3] += dense.product(left.T, dense.product(weighted, r))
+        for column, right in blocks:
+            if column >= 0:
+                H[row : row + 3, column : column + 3] += dense.product(
+                    dense.product(left.T, weighted), right
+                )
+
+
+def without_paths(
+    island: Island, union: Indices, factors: Factors, eliminated: Bool[np.ndarray, " _"]
+) -> tuple[Indices, Matrix, Values, float]:
+    """The quadratic of the factors without the eliminated poses: its nodes, A, half the gradient
+    and the cost, less what the poses' elimination lowers it by. Nothing is condensed yet.
+
+    union: the factors' nodes, but for constants. eliminated: marks of nodes; of these, landmarks
+        stay.
+    """
+    graph = island.graph
+    sizes, total = np.diff(graph.offset), 0.0
+    left: list[Left] = []
+    rest = Factors(*(each.copy() for each in factors))
+    for run in _runs(island, factors.submaps):
+        path = np.zeros(len(graph.fixed), np.bool_)
+        for f in run:
+            contribution, nodes, *_ = graph.submaps[f]
+            path[nodes[0]] = True
+            path[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
+        path &= ~graph.fixed
+        taken = _of_run(island, run, path, rest)
+        for each, marks in zip(rest, taken, strict=True):
+            each[marks] = False
+        beside = [each for each in left if path[each.nodes].any()]
+        left = [each for each in left if not path[each.nodes].any()]
+        nodes = nodes_of(island, taken, (each.nodes for each in beside))
+        H, g, cost = quadratic(island, nodes, taken)
+        _add(H, g, sizes, nodes, beside)
+        parts = split(H, g, np.repeat(path[nodes], sizes[nodes]))
+        left.append(Left(nodes[~path[nodes]], parts.information, parts.slope))
+        total += cost - parts.lowered
+    union = union[~eliminated[union] | (sizes[union] == 2)]
+    H, g, cost = quadratic(island, union, rest)
+    _add(H, g, sizes, union, left)
+    return union, H, g, total + cost
+
+
+def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]]:
+    """The marked submaps of each stream, by runs."""
+    streams: dict[Stream, list[int]] = defaultdict(list)
+    for f in np.flatnonzero(leaving).tolist():
+        streams[island.graph.submaps[f].contribution.stream].append(f)
+    for stream in sorted(streams):
+        own = streams[stream]
+        yield from (own[k : k + RUN] for k in range(0, len(own), RUN))
+
+
+def _of_run(
+    island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: Factors
+) -> Factors:
+    """A run's submaps, and what else contains one of its eliminated poses."""
+    graph = island.graph
+    submaps = np.zeros(len(graph.submaps), np.bool_)
+    submaps[run] = True
+    seen = path[graph.sighting_factors.nodes].any(axis=1)
+    priors = path[np.array([each.node for each in graph.priors], np.int64)]
+    return Factors(submaps, among.sightings & seen, among.priors & priors)
+
+
+def nodes_of(island: Island, factors: Factors, others: Iterable[Indices]) -> Indices:
+    """The nodes of factors, and `others`, ascending, but for constants."""
+    graph = island.graph
+    touched = [*others]
+    touched += [graph.submaps[f].nodes for f in np.flatnonzero(factors.submaps)]
+    touched += [np.array(graph.sightings[s][1:]) for s in np.flatnonzero(factors.sightings)]
+    touched += [np.array([graph.priors[k].node]) for k in np.flatnonzero(factors.priors)]
+    union = np.unique(np.concatenate(touched))
+    found: Indices = union[~graph.fixed[union]]
+    return found
+
+
+def _add(H: Matrix, g: Values, sizes: Indices, nodes: Indices, left: list[Left]) -> None:
+    """Adds quadratics over parts of these nodes."""
+    first = np.concatenate([[0], np.cumsum(sizes[nodes])])
+    for each in left:
+        within = places(first, np.searchsorted(nodes, each.nodes))
+        H[np.ix_(within, within)] += each.information
+        g[within] += each.slope
