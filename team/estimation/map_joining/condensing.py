@@ -34,7 +34,7 @@ from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
 from team.estimation.map_joining.memory import MOST, Observed
 from team.estimation.map_joining.path_elimination import (
-    Factors,
+    MarkedFactors,
     nodes_of,
     quadratic,
     without_paths,
@@ -139,7 +139,7 @@ def _condensed(
         np.bool_,
     )
     prior = np.array([eliminated[each.node] for each in graph.priors], np.bool_)
-    factors = Factors(leaving, seen, prior)
+    factors = MarkedFactors(leaving, seen, prior)
     union = nodes_of(island, factors, [] if before is None else [before.nodes])
     sizes = np.diff(graph.offset)
     unknowns = int(sizes[union[eliminated[union]]].sum())

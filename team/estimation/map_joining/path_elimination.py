@@ -30,7 +30,7 @@ RUN = 16
 """Number of submaps whose poses are eliminated together."""
 
 
-class Factors(NamedTuple):
+class MarkedFactors(NamedTuple):
     """Marks of submaps, inter-robot measurements and priors, in the graph's order."""
 
     submaps: Bool[np.ndarray, " F"]
@@ -49,7 +49,7 @@ class Left(NamedTuple):
 def quadratic(
     island: Island,
     union: Indices,
-    factors: Factors,
+    factors: MarkedFactors,
 ) -> tuple[Matrix, Values, float]:
     """Matrix A, half the gradient and the cost of these factors and of the condensed one, over the
     union of their nodes.
@@ -103,7 +103,7 @@ def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) 
 
 
 def without_paths(
-    island: Island, union: Indices, factors: Factors, eliminated: Bool[np.ndarray, " _"]
+    island: Island, union: Indices, factors: MarkedFactors, eliminated: Bool[np.ndarray, " _"]
 ) -> tuple[Indices, Matrix, Values, float]:
     """The quadratic of the factors without the eliminated poses: its nodes, A, half the gradient
     and the cost, less what the poses' elimination lowers it by. Nothing is condensed yet.
@@ -114,7 +114,7 @@ def without_paths(
     graph = island.graph
     sizes, total = np.diff(graph.offset), 0.0
     left: list[Left] = []
-    rest = Factors(*(each.copy() for each in factors))
+    rest = MarkedFactors(*(each.copy() for each in factors))
     for run in _runs(island, factors.submaps):
         path = np.zeros(len(graph.fixed), np.bool_)
         for f in run:
@@ -150,18 +150,18 @@ def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]
 
 
 def _of_run(
-    island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: Factors
-) -> Factors:
+    island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: MarkedFactors
+) -> MarkedFactors:
     """A run's submaps, and what else contains one of its eliminated poses."""
     graph = island.graph
     submaps = np.zeros(len(graph.submaps), np.bool_)
     submaps[run] = True
     seen = path[graph.sighting_factors.nodes].any(axis=1)
     priors = path[np.array([each.node for each in graph.priors], np.int64)]
-    return Factors(submaps, among.sightings & seen, among.priors & priors)
+    return MarkedFactors(submaps, among.sightings & seen, among.priors & priors)
 
 
-def nodes_of(island: Island, factors: Factors, others: Iterable[Indices]) -> Indices:
+def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) -> Indices:
     """The nodes of factors, and `others`, ascending, but for constants."""
     graph = island.graph
     touched = [*others]
