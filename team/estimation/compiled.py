@@ -162,9 +162,9 @@ class CircularKernelsError(TypeError):
 def program_of(kernel: Callable[..., object]) -> str:
     """Digest of a kernel's byte code and of all that its names refer to: kernels and constants.
 
-    A name of anything else, such as a class, adds all sources that the kernel's module imports. A
-    kernel that calls itself adds no more by that. Raises CircularKernelsError where kernels call
-    each other in a circle.
+    Of a named tuple only its fields matter. A name of anything else, such as a class, adds all
+    sources that the kernel's module imports. A kernel that calls itself adds no more by that.
+    Raises CircularKernelsError where kernels call each other in a circle.
     """
     callers = _CALLERS.get()
     if kernel in callers:
@@ -236,6 +236,9 @@ def _add_meant(
         digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
     elif _is_plain(value):
         digest.update(repr(value).encode())
+    elif isinstance(value, type) and "_field_defaults" in vars(value):
+        fields = vars(value)["_fields"], vars(value)["_field_defaults"]
+        digest.update(repr(fields).encode())
     elif _is_ours(str(getattr(value, "__module__", None) or getattr(value, "__name__", ""))):
         digest.update(_sources(kernel.__module__))
 

@@ -143,12 +143,14 @@ LIMIT = 1.0
 class Pair(NamedTuple):
     a: int
     b: int
+class Kind:
+    pass
 """
 REACHES = '''
 import math
 from team.estimation.compiled import compiled
 from kernels import inner as module
-from kernels.far import LIMIT, Pair
+from kernels.far import LIMIT, Kind, Pair
 from kernels.inner import inner
 from kernels.tables import UNUSED
 
@@ -166,8 +168,12 @@ def constant(x):
     return x < LIMIT
 
 @compiled
-def of_a_class(x):
+def of_a_record(x):
     return Pair(x, x)[0]
+
+@compiled
+def of_a_class(x):
+    return Kind is None
 
 @compiled
 def alone(x):
@@ -186,7 +192,14 @@ def test_the_program_of_a_kernel_is_what_it_can_reach(
         "tables": "UNUSED = 1\n",
         "reaches": REACHES,
     }
-    kernels = ("through_a_name", "through_a_module", "constant", "of_a_class", "alone")
+    kernels = (
+        "through_a_name",
+        "through_a_module",
+        "constant",
+        "of_a_record",
+        "of_a_class",
+        "alone",
+    )
 
     def programs(**changed: str) -> dict[str, str]:
         for name, text in {**sources, **changed}.items():
@@ -208,7 +221,7 @@ def test_the_program_of_a_kernel_is_what_it_can_reach(
     called = {"through_a_name", "through_a_module", "of_a_class"}
     assert moved(inner=INNER.format("3.0")) == called
     assert moved(far=FAR.replace("1.0", "2.0")) == {"constant", "of_a_class"}
-    assert moved(far=FAR.replace("    b: int", "    c: int")) == {"of_a_class"}
+    assert moved(far=FAR.replace("    b: int", "    c: int")) == {"of_a_record", "of_a_class"}
     assert moved(tables="UNUSED = 2\n") == {"of_a_class"}
     assert moved(reaches=REACHES.replace("y * y", "y + y")) == {"alone", "of_a_class"}
     described_otherwise = "# a line more\n" + REACHES.replace("What it does", "What it is for")
