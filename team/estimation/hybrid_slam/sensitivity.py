@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt32
 
 from team.config import Bias
 from team.estimation.gaussian import FAULTS, NotACovarianceError
@@ -20,44 +20,69 @@ from team.estimation.hybrid_slam.sensitivity_kernel import (
     BIASES,
     SINGULAR,
     Noise,
-    columns_of_all,
+    columns_along,
+    rows_of,
 )
 
 
-class Motion(NamedTuple):
-    """The motion up to a keyframe, or after the last one: its noise, its shift by `forward_scale`.
-
-    covariance, forward: in the tangent space of the motion's end (forward [m], left [m], turn).
+class Motions(NamedTuple):
+    """The motions up to each keyframe, and after the last one: the noise of each, and its shift by
+    `forward_scale`, both in the tangent space of the motion's end (forward [m], left [m], turn).
     """
 
-    covariance: Float[np.ndarray, "3 3"]
-    forward: Float[np.ndarray, "3"]
+    covariances: Float[np.ndarray, "P 3 3"]
+    shifts: Float[np.ndarray, "P 3"]
+
+    def then(
+        self, covariance: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]
+    ) -> "Motions":
+        """With one more."""
+        covariances = np.concatenate((self.covariances, covariance[None]))
+        return Motions(covariances, np.concatenate((self.shifts, shift[None])))
+
+
+NO_MOTIONS = Motions(np.empty((0, 3, 3)), np.empty((0, 3)))
+
+
+class Seen(NamedTuple):
+    """The measurements of a window: of each the keyframe, the landmark and the noise it claims."""
+
+    keyframes: Int64[np.ndarray, " N"]
+    ids: UInt32[np.ndarray, " N"]
+    own: Float[np.ndarray, "N own"]
 
 
 def columns(
-    biases: Sequence[Bias],
-    path: Float[np.ndarray, "P 3"],
-    motions: Sequence[Motion],
-    landmarks: Float[np.ndarray, "L 2"],
-    measurements: tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " N"]],
-    own: Float[np.ndarray, "N own"],
+    paths: tuple[Float[np.ndarray, "K M 3"], Float[np.ndarray, " M"]],
+    end: Float[np.ndarray, "3"],
+    motions: Motions,
+    landmarks: tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]],
+    seen: Seen,
     noise: Noise,
-) -> tuple[Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
-    """∂/∂b of the path's poses (x, y, theta) and of the landmarks, in the window's frame.
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
+    """The mean path, and ∂/∂b of its poses (x, y, theta) and of the landmarks, in the window's
+    frame, by each of BIASES.
 
-    path: the pose at the end of each motion; the first motion begins at zero. measurements: of each
-    the pose (an index into path) and the landmark; own: the noises that they claim. The bias b is
-    the error: a bearing reads b too much, a range b too much or (1 + b) times itself, and the way
-    driven is (1 + b) times the odometry's.
+    paths: the particles' poses at the keyframes, and their weights; end: the mean pose at the
+    window's end. The bias b is the error: a bearing reads b too much, a range b too much or (1 + b)
+    times itself, and the way driven is (1 + b) times the odometry's.
     """
-    covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 3, 3)
-    shifts = np.array([motion.forward for motion in motions]).reshape(-1, 3)
-    poses, points, fault = columns_of_all(
-        path, covariances, shifts, landmarks, *measurements, own, noise
+    path, poses, points, fault = columns_along(
+        np.ascontiguousarray(paths[0]), paths[1], end, *motions, *landmarks, *seen, noise
     )
     if fault == SINGULAR:
         raise np.linalg.LinAlgError("Singular matrix")
     if fault:
         raise NotACovarianceError("the smoother of a window", FAULTS[fault])
-    chosen = [BIASES.index(bias) for bias in biases]
-    return poses[chosen], points[chosen]
+    return path, poses, points
+
+
+def rows(
+    biases: Sequence[Bias],
+    poses: Float[np.ndarray, "B P 3"],
+    points: Float[np.ndarray, "B L 2"],
+    nodes: Int64[np.ndarray, " nodes"],
+) -> Float[np.ndarray, "b n"]:
+    """∂/∂b of (end pose, pose nodes, landmarks) by some of BIASES; nodes: places in the path."""
+    chosen = np.array([BIASES.index(bias) for bias in biases], np.int64)
+    return rows_of(chosen, np.ascontiguousarray(poses), np.ascontiguousarray(points), nodes)

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt32
 
 from team.config import Bias
 from team.estimation import elementary
@@ -12,6 +12,7 @@ from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import solve_lower, solve_stack, solve_upper
 from team.estimation.gaussian import factor_or_fault
 from team.estimation.geometry import adjoint, between
+from team.estimation.hybrid_slam.moments import mean_path
 from team.estimation.models import NEAREST_M
 
 BIASES: tuple[Bias, ...] = get_args(Bias)
@@ -42,6 +43,50 @@ def carried_on(
     x = column[0] - motion[1] * column[2]
     y = column[1] + motion[0] * column[2]
     return np.array([c * x + s * y, -s * x + c * y, column[2]])
+
+
+@compiled
+def columns_along(
+    paths: Float[np.ndarray, "K M 3"],
+    weights: Float[np.ndarray, " M"],
+    end: Float[np.ndarray, "3"],
+    covariances: Float[np.ndarray, "P 3 3"],
+    shifts: Float[np.ndarray, "P 3"],
+    ids: UInt32[np.ndarray, " L"],
+    landmarks: Float[np.ndarray, "L 2"],
+    keyframes: Int64[np.ndarray, " N"],
+    seen: UInt32[np.ndarray, " N"],
+    own: Float[np.ndarray, "N own"],
+    noise: Noise,
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"], int]:
+    """`columns_of_all` about the particles' mean path, which is returned, too."""
+    path = np.concatenate((mean_path(paths, weights), end.reshape(1, 3)))[: len(shifts)].copy()
+    slots = np.searchsorted(ids, seen)
+    poses, points, fault = columns_of_all(
+        path, covariances, shifts, landmarks, keyframes, slots, own, noise
+    )
+    return path, poses, points, fault
+
+
+@compiled
+def rows_of(
+    chosen: Int64[np.ndarray, " b"],
+    poses: Float[np.ndarray, "B P 3"],
+    points: Float[np.ndarray, "B L 2"],
+    nodes: Int64[np.ndarray, " nodes"],
+) -> Float[np.ndarray, "b n"]:
+    """The chosen biases' rows over the last pose, the poses at `nodes` and the points."""
+    first = 3 + 3 * len(nodes)
+    rows = np.zeros((len(chosen), first + 2 * points.shape[1]))
+    for b in range(len(chosen)):
+        of_poses, of_points, row = poses[chosen[b]], points[chosen[b]], rows[b]
+        for i in range(3 if len(of_poses) else 0):
+            row[i] = of_poses[len(of_poses) - 1, i]
+            for k in range(len(nodes)):
+                row[3 + 3 * k + i] = of_poses[nodes[k], i]
+        for k in range(len(of_points)):
+            row[first + 2 * k], row[first + 2 * k + 1] = of_points[k, 0], of_points[k, 1]
+    return rows
 
 
 @compiled

@@ -25,11 +25,10 @@ from team.estimation.hybrid_slam.moments import (
     POSE_JITTER,
     by_landmark,
     by_slot,
-    mean_path,
     sample_factor,
     submap_moments,
 )
-from team.estimation.hybrid_slam.sensitivity import Motion, columns
+from team.estimation.hybrid_slam.sensitivity import NO_MOTIONS, Motions, Seen, columns, rows
 from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import Increment
 from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
@@ -65,7 +64,7 @@ class Window:
     node_keyframes: Int64[np.ndarray, " nodes"]
     own: Own
     innovation: Innovation = NOTHING
-    motions: tuple[Motion, ...] = ()
+    motions: Motions = NO_MOTIONS
 
 
 class ParticleLandmarks(NamedTuple):
@@ -156,12 +155,10 @@ def advanced(
     )
 
 
-def _with_motion(
-    window: Window, increment: Increment, forward: Float[np.ndarray, "3"]
-) -> tuple[Motion, ...]:
+def _with_motion(window: Window, increment: Increment, forward: Float[np.ndarray, "3"]) -> Motions:
     if not window.front_end.biases:
-        return ()
-    return (*window.motions, Motion(increment.covariance, forward))
+        return NO_MOTIONS
+    return window.motions.then(increment.covariance, forward)
 
 
 def marked(window: Window, stamp_ns: int) -> Window:
@@ -256,7 +253,7 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
     if fault:
         raise NotACovarianceError("the submap of a window", FAULTS[fault])
     local = LocalMap(ids, mean, covariance, window.node_stamps)
-    return _with_sensitivity(window, local) if window.front_end.biases else local
+    return _with_sensitivity(window, local, weights) if window.front_end.biases else local
 
 
 def of_base(window: Window) -> Window:
@@ -282,35 +279,30 @@ def motion_alone(motion: Increment) -> LocalMap:
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))
 
 
-def _with_sensitivity(window: Window, local: LocalMap) -> LocalMap:
+def _with_sensitivity(
+    window: Window, local: LocalMap, weights: Float[np.ndarray, " M"]
+) -> LocalMap:
     """The Gaussian with its derivatives by the biases.
 
     That by `forward_scale` is left out where all of the window's motion is calibrated.
     """
-    uncalibrated = any(motion.forward.any() for motion in window.motions)
+    uncalibrated = bool(window.motions.shifts.any())
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
-    weights = elementwise.exp(window.particles.log_weights)
-    mount = np.array(window.sensor.mount)
-    of_sensor = local.mean[None, :3], local.landmarks
-    if window.sensor.is_mounted:
+    mount, is_mounted = np.array(window.sensor.mount), window.sensor.is_mounted
+    end, points = local.end_pose, local.landmarks
+    if is_mounted:
         away = inverse(mount)
-        of_sensor = base_poses(of_sensor[0], away), base_points(of_sensor[1], away)
-    path = np.concatenate((mean_path(np.ascontiguousarray(window.paths), weights), of_sensor[0]))
-    path = path[: len(window.motions)]
-    slots = np.searchsorted(local.ids, window.ids)
-    poses, landmarks = columns(
-        biases,
-        path,
+        end, points = base_poses(end[None], away)[0], base_points(points, away)
+    path, poses, landmarks = columns(
+        (window.paths, weights),
+        end,
         window.motions,
-        of_sensor[1],
-        (window.keyframes, slots),
-        window.own,
+        (local.ids, points),
+        Seen(window.keyframes, window.ids, window.own),
         noise_of(window.sensor),
     )
-    if window.sensor.is_mounted:
+    if is_mounted:
         poses = base_shifts(poses, path, mount)
         landmarks = base_points(landmarks, np.array([0.0, 0.0, mount[2]]))
-    end = poses[:, -1:] if len(path) else np.zeros((len(biases), 1, 3))
-    submap_poses = np.concatenate((end, poses[:, window.node_keyframes]), axis=1)
-    rows = (submap_poses.reshape(len(biases), -1), landmarks.reshape(len(biases), -1))
-    return replace(local, biases=biases, sensitivity=np.concatenate(rows, axis=1))
+    sensitivity = rows(biases, poses, landmarks, window.node_keyframes)
+    return replace(local, biases=biases, sensitivity=sensitivity)
