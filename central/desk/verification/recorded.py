@@ -60,6 +60,8 @@ class Recorded:
     withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
     unsound: int = 0
     _filed: int = 0
+    _indexed: int = 0
+    _by_channel: dict[str, list[RecordedOutput]] = field(default_factory=dict)
 
     def take_all(self, samples: Sequence[Sample]) -> None:
         """File samples in the order of the log; those with odometry are decoded together."""
@@ -129,7 +131,14 @@ class Recorded:
 
     def of(self, channel: ch.Channel) -> list[m.Message]:
         """The recorded messages of a channel, in the order of the log."""
-        return [outputs.message for outputs in self.outputs if outputs.channel is channel]
+        return [each.message for each in self.outputs_of(channel)]
+
+    def outputs_of(self, channel: ch.Channel) -> Sequence[RecordedOutput]:
+        """The recorded outputs on a channel, in the order of the log."""
+        for each in self.outputs[self._indexed :]:
+            self._by_channel.setdefault(each.channel.name, []).append(each)
+        self._indexed = len(self.outputs)
+        return self._by_channel.get(channel.name, ())
 
     @property
     def contradicted(self) -> list[m.Measurement]:

@@ -133,7 +133,7 @@ def verify(log: Log) -> Verification:
             recomputed |= recomputed_peer(found, robot)
     results = []
     for channel in CHECKED:
-        of_channel = (each for each in found.outputs if each.channel is channel)
+        of_channel = found.outputs_of(channel)
         outputs = [each for each in of_channel if getattr(each.message, "robot", "") not in others]
         if outputs:
             results.append(_compared(channel.name, outputs, recomputed, found, exact=not other))

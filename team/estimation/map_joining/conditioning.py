@@ -91,13 +91,41 @@ class SubmapCorrection(NamedTuple):
         correlated with it in the sense that makes this covariance rather too large than too small.
         A bias without an estimate is zero.
         """
-        mean, covariance = local.mean, self.covariance_factor * local.covariance
-        for name, value, sigma in self.biases:
-            if name in local.biases:
-                column = local.sensitivity[local.biases.index(name)]
-                mean = mean + value * column
-                covariance += sigma * sigma * np.outer(column, column)
+        known = [each for each in self.biases if each[0] in local.biases]
+        if not known:
+            return LocalMap(
+                local.ids,
+                local.mean,
+                self.covariance_factor * local.covariance,
+                local.node_stamps,
+            )
+        mean, covariance = _shifted(
+            local.mean,
+            np.ascontiguousarray(local.covariance),
+            self.covariance_factor,
+            local.sensitivity[[local.biases.index(name) for name, _, _ in known]],
+            np.array([(value, sigma) for _, value, sigma in known]),
+        )
         return LocalMap(local.ids, mean, covariance, local.node_stamps)
+
+
+@compiled
+def _shifted(
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+    factor: float,
+    columns: Float[np.ndarray, "B n"],
+    estimates: Float[np.ndarray, "B 2"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """The mean + Sᵀ b and f P + Sᵀ diag(σ²) S of biases (b, σ) with the columns S."""
+    shifted, total = mean.copy(), factor * covariance
+    for k in range(len(columns)):
+        variance = estimates[k, 1] * estimates[k, 1]
+        for i in range(len(mean)):
+            shifted[i] += estimates[k, 0] * columns[k, i]
+            for j in range(len(mean)):
+                total[i, j] += variance * (columns[k, i] * columns[k, j])
+    return shifted, total
 
 
 class RobotPrior(NamedTuple):
