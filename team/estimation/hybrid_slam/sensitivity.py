@@ -25,7 +25,7 @@ from team.estimation.hybrid_slam.sensitivity_kernel import (
 )
 
 
-class Motions(NamedTuple):
+class WindowMotions(NamedTuple):
     """The motions up to each keyframe, and after the last one: the noise of each, and its shift by
     `forward_scale`, both in the tangent space of the motion's end (forward [m], left [m], turn).
     """
@@ -35,16 +35,16 @@ class Motions(NamedTuple):
 
     def then(
         self, covariance: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]
-    ) -> "Motions":
+    ) -> "WindowMotions":
         """With one more."""
         covariances = np.concatenate((self.covariances, covariance[None]))
-        return Motions(covariances, np.concatenate((self.shifts, shift[None])))
+        return WindowMotions(covariances, np.concatenate((self.shifts, shift[None])))
 
 
-NO_MOTIONS = Motions(np.empty((0, 3, 3)), np.empty((0, 3)))
+NO_MOTIONS = WindowMotions(np.empty((0, 3, 3)), np.empty((0, 3)))
 
 
-class Seen(NamedTuple):
+class WindowSights(NamedTuple):
     """The measurements of a window: of each the keyframe, the landmark and the noise it claims."""
 
     keyframes: Int64[np.ndarray, " N"]
@@ -55,9 +55,9 @@ class Seen(NamedTuple):
 def columns(
     paths: tuple[Float[np.ndarray, "K M 3"], Float[np.ndarray, " M"]],
     end: Float[np.ndarray, "3"],
-    motions: Motions,
+    motions: WindowMotions,
     landmarks: tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]],
-    seen: Seen,
+    seen: WindowSights,
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
     """The mean path, and ∂/∂b of its poses (x, y, theta) and of the landmarks, in the window's

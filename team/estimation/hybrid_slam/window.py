@@ -28,7 +28,13 @@ from team.estimation.hybrid_slam.moments import (
     sample_factor,
     submap_moments,
 )
-from team.estimation.hybrid_slam.sensitivity import NO_MOTIONS, Motions, Seen, columns, rows
+from team.estimation.hybrid_slam.sensitivity import (
+    NO_MOTIONS,
+    WindowMotions,
+    WindowSights,
+    columns,
+    rows,
+)
 from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import Increment
 from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
@@ -64,7 +70,7 @@ class Window:
     node_keyframes: Int64[np.ndarray, " nodes"]
     own: Own
     innovation: Innovation = NOTHING
-    motions: Motions = NO_MOTIONS
+    motions: WindowMotions = NO_MOTIONS
 
 
 class ParticleLandmarks(NamedTuple):
@@ -155,7 +161,9 @@ def advanced(
     )
 
 
-def _with_motion(window: Window, increment: Increment, forward: Float[np.ndarray, "3"]) -> Motions:
+def _with_motion(
+    window: Window, increment: Increment, forward: Float[np.ndarray, "3"]
+) -> WindowMotions:
     if not window.front_end.biases:
         return NO_MOTIONS
     return window.motions.then(increment.covariance, forward)
@@ -298,7 +306,7 @@ def _with_sensitivity(
         end,
         window.motions,
         (local.ids, points),
-        Seen(window.keyframes, window.ids, window.own),
+        WindowSights(window.keyframes, window.ids, window.own),
         noise_of(window.sensor),
     )
     if is_mounted:
