@@ -8,7 +8,8 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.estimation import dense
 from team.estimation.compiled import compiled
-from team.estimation.dense_kernel import factored
+from team.estimation.dense_kernel import factored, matrix_product
+from team.estimation.geometry import tangent
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -139,3 +140,32 @@ def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
     upper = np.zeros((n, n))
     upper[np.triu_indices(n)] = triangle
     return upper + np.triu(upper, 1).T
+
+
+def curved(pose: PoseGaussian) -> PoseGaussian:
+    """The covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ = (f, l, φ) ~ N(0, S), to second order.
+
+    A robot with an uncertain heading lies on an arc, not in an ellipse: its position is (f, l) +
+    φ/2 (−l, f) to second order, which adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the variance of
+    f, and so on (moments of a Gaussian; Isserlis 1918). Far from where the heading was known this
+    exceeds σ_f². The mean stays the most likely pose.
+    """
+    return PoseGaussian(pose.mean, _curved(float(pose.mean[2]), np.array(pose.covariance)))
+
+
+@compiled
+def _curved(heading: float, covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    T = tangent(heading)
+    S = matrix_product(matrix_product(T.T.copy(), covariance), T)
+    of_squares = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            of_squares[i, j] = S[2, 2] * S[i, j] + 2.0 * (S[i, 2] * S[j, 2])
+    ff, fl, ll = 0.25 * of_squares[0, 0], 0.25 * of_squares[0, 1], 0.25 * of_squares[1, 1]
+    turn = T[:2, :2].copy()
+    added = matrix_product(matrix_product(turn, np.array([[ll, -fl], [-fl, ff]])), turn.T.copy())
+    result = covariance.copy()
+    for i in range(2):
+        for j in range(2):
+            result[i, j] += added[i, j]
+    return result

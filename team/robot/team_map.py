@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from team import translate
+from team.estimation.gaussian import curved
 from team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
     SubmapCorrection,
-    curved,
     followed,
     is_majority,
     pose_now,

@@ -5,8 +5,8 @@ import pytest
 
 from team import translate
 from team.config import Bounds
-from team.estimation.gaussian import PoseGaussian
-from team.estimation.map_joining.conditioning import curved, followed
+from team.estimation.gaussian import PoseGaussian, curved
+from team.estimation.map_joining.conditioning import followed
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.plausible import prior_beyond
 from team.robot.team_map import TeamMap

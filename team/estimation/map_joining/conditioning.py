@@ -24,9 +24,7 @@ from team.config import Bias
 from team.estimation.compiled import compiled
 from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Contribution
-from team.estimation.dense_kernel import matrix_product
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian
-from team.estimation.geometry import tangent
 from team.estimation.map_joining.chain_kernel import (
     NO_COVARIANCE,
     Chain,
@@ -288,32 +286,3 @@ def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
     if open_window is None:
         return Posed(PoseGaussian(whole.mean[:3], whole.covariance[:3, :3]))
     return Posed(*end_pose(whole, open_window, GATE))
-
-
-def curved(pose: PoseGaussian) -> PoseGaussian:
-    """The covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ = (f, l, φ) ~ N(0, S), to second order.
-
-    A robot with an uncertain heading lies on an arc, not in an ellipse: its position is (f, l) +
-    φ/2 (−l, f) to second order, which adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the variance of
-    f, and so on (moments of a Gaussian; Isserlis 1918). Far from where the heading was known this
-    exceeds σ_f². The mean stays the most likely pose.
-    """
-    return PoseGaussian(pose.mean, _curved(float(pose.mean[2]), np.array(pose.covariance)))
-
-
-@compiled
-def _curved(heading: float, covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    T = tangent(heading)
-    S = matrix_product(matrix_product(T.T.copy(), covariance), T)
-    of_squares = np.empty((2, 2))
-    for i in range(2):
-        for j in range(2):
-            of_squares[i, j] = S[2, 2] * S[i, j] + 2.0 * (S[i, 2] * S[j, 2])
-    ff, fl, ll = 0.25 * of_squares[0, 0], 0.25 * of_squares[0, 1], 0.25 * of_squares[1, 1]
-    turn = T[:2, :2].copy()
-    added = matrix_product(matrix_product(turn, np.array([[ll, -fl], [-fl, ff]])), turn.T.copy())
-    result = covariance.copy()
-    for i in range(2):
-        for j in range(2):
-            result[i, j] += added[i, j]
-    return result

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.gaussian import NotACovarianceError, PoseGaussian
+from team.estimation.gaussian import NotACovarianceError, PoseGaussian, curved
 from team.estimation.geometry import compose, exponential, tangent
 from team.estimation.map_joining import conditioning, whole_map
 from team.estimation.map_joining.conditioning import (
     TRUSTING,
     RobotPrior,
     SubmapCorrection,
-    curved,
     followed,
     pose_now,
 )
