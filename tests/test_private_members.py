@@ -11,7 +11,7 @@ OFFICIAL = {"_replace", "_asdict", "_fields", "_exit"}
 """Named so by the language's own library, and meant for all: named tuples, `os._exit`."""
 NUMBAS = {
     *("_cache", "_cache_file", "_cache_path", "_impl", "_data_path", "_load_overload", "_memo"),
-    "_guard_against_spurious_io_errors",
+    *("_guard_against_spurious_io_errors", "_data_name", "_save_data", "_save_index"),
 }
 """What team/estimation/compiled.py has to ask numba for: it has no public way."""
 

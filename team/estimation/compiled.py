@@ -89,6 +89,17 @@ class _CacheFile(IndexDataCacheFile):
         except (AttributeError, ImportError):
             return {}
 
+    def save(self, key: Any, data: Any) -> None:
+        """Stores the code of one form; `key` alone names its file.
+
+        Numba numbers them in the order of their coming, so that two processes could give one file
+        to two forms.
+        """
+        form = hashlib.blake2b(repr(key).encode(), digest_size=8).digest()
+        name = self._data_name(int.from_bytes(form))  # type: ignore[no-untyped-call] # Numba's
+        self._save_data(name, data)  # type: ignore[no-untyped-call] # Numba's
+        self._save_index({**self._load_index(), key: name})  # type: ignore[no-untyped-call]
+
     def _load_data(self, name: str) -> Any:
         if not loads_alone():
             return super()._load_data(name)  # type: ignore[no-untyped-call] # Numba's
@@ -145,6 +156,8 @@ def _name_runtime() -> None:
         binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
+_NAMES = b"parts numbered at random"
+"""How the parts of a kernel are named: code whose parts have other names is not linked with it."""
 _CALLERS: ContextVar[tuple[Callable[..., object], ...]] = ContextVar("callers", default=())
 """The kernels whose digests are being computed, each one called by the one before it."""
 
@@ -177,7 +190,7 @@ def program_of(kernel: Callable[..., object]) -> str:
 
 
 def _digest_of(kernel: Callable[..., object]) -> str:
-    digest = hashlib.blake2b(digest_size=8)
+    digest = hashlib.blake2b(_NAMES, digest_size=8)
     _add_code(digest, kernel.__code__, kernel.__doc__)
     digest.update(repr((kernel.__defaults__, kernel.__kwdefaults__, kernel in _INLINED)).encode())
     for chain in sorted(_globals(kernel.__code__)):

@@ -5,6 +5,8 @@ another one compiles the same kernel finds nothing and would compile it again, w
 with two cores takes the time of both.
 """
 
+import itertools
+import secrets
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
 
 if sys.platform != "win32":
@@ -43,11 +46,22 @@ def compile_once(dispatcher: Any, lock_of: Callable[[], Path]) -> None:
             try:
                 lock = lock_of() if lock is None else lock
                 with alone(lock, PATIENCE_S):
+                    _number_from_anywhere()
                     return compile_here(signature)
             finally:
                 compiling = False
 
     dispatcher.compile = compile_
+
+
+def _number_from_anywhere() -> None:
+    """Lets Numba number the functions that it compiles from a random number on.
+
+    The number is in the name by which a cached kernel's parts are linked, and Numba counts from
+    one in each process. Parts of two processes can then be called alike and be different: one that
+    sorts integers, one that orders them (docs/decisions/0130).
+    """
+    FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))
 
 
 @contextmanager

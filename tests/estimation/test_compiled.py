@@ -118,6 +118,56 @@ def test_cached_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path)
     assert run("row", "rows") == ["5.0", "5.0", "rows", "negative", "False", "False"]
 
 
+SORTING = """
+import sys
+import numpy as np
+from team.estimation.compiled import compiled
+
+@compiled
+def ascending(row):
+    return np.sort(row)
+
+@compiled
+def places(row):
+    return np.argsort(row)
+
+@compiled
+def _first(n):
+    return n
+
+@compiled
+def _second(n):
+    return n
+
+@compiled
+def _third(n):
+    return n
+
+if sys.argv[1:] == ["places"]:
+    _first(1), _second(1), _third(1)
+for kernel in sys.argv[1:]:
+    print(*globals()[kernel](np.array([7, 5, 9, 6])), sep="", end=" ")
+"""
+
+
+def test_kernels_that_two_processes_compiled_do_not_share_parts_that_are_called_alike(
+    tmp_path: Path,
+) -> None:
+    """Numba numbers the functions that it compiles within a process: of two numbered alike, one
+    that sorts and one that orders, the linker took the first for both.
+    """
+    (tmp_path / "sorting.py").write_text(SORTING)
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{Path.cwd()}"}
+    said = [
+        subprocess.run(
+            [sys.executable, "-m", "sorting", *kernels], env=environment, cwd=tmp_path,
+            capture_output=True, text=True, check=True,
+        ).stdout.split()
+        for kernels in (["ascending"], ["places"], ["ascending", "places"])
+    ]  # fmt: skip
+    assert said == [["5679"], ["1302"], ["5679", "1302"]]
+
+
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     folder = tmp_path / "kernels"
