@@ -1,12 +1,13 @@
 """The attendance of a team: which robots are present, how far each is, and which are awaited."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from central.robot_attendance import Attendance, note
+from central.robot_attendance import Attendance, Awaited, Least, note
 from team.wire import messages as m
 from team.wire.newer import further, later_end, later_head
 
+_OfAnEnd = tuple[m.End, Awaited[m.StreamEnd]]
 Dealt = Callable[[m.Done], bool]
 """True once all messages announced in a robot's `Done` have been dealt with."""
 
@@ -30,6 +31,11 @@ class TeamAttendance:
     _has_head: bool = field(default=False, init=False)
     _ended: m.End | None = field(default=None, init=False)
     _last: dict[str, int] = field(default_factory=dict, init=False)
+    _unsettled: Awaited[str] = field(default_factory=Awaited, init=False)
+    _unconfirmed: dict[int, _OfAnEnd] = field(default_factory=dict, init=False)
+    _changed: set[str] = field(default_factory=set, init=False)
+    _of_all: tuple[object, ...] = field(default=(), init=False)
+    _least: Least = field(default_factory=Least, init=False)
 
     @classmethod
     def of(cls, robots: Sequence[str]) -> "TeamAttendance":
@@ -39,9 +45,11 @@ class TeamAttendance:
     def admit(self, robot: str) -> None:
         """Add a robot to the team."""
         self.robots = dict(sorted({**self.robots, robot: Attendance()}.items()))
+        self._changed.add(robot)
 
     def take(self, message: m.Message) -> None:
         """Take a message's information on its sender; messages of strangers are ignored."""
+        self.note_change(message)
         match message:
             case m.Submap() | m.MapEstimate():
                 self.now_ns = max(self.now_ns, message.stamp_ns)
@@ -74,6 +82,12 @@ class TeamAttendance:
                 found.given_up = True
             case _:
                 pass
+
+    def note_change(self, message: m.Message) -> None:
+        """Note that what is known of a message's robot may have changed."""
+        name = getattr(message, "robot", None) or getattr(message, "node", "").rpartition("/")[2]
+        if name in self.robots:
+            self._changed.add(name)
 
     def note_end(self, end: m.End) -> None:
         """Keep an announced end, believed or refused: robots' last words may confirm it."""
@@ -193,7 +207,9 @@ class TeamAttendance:
         return self._is_concluded(dealt) or (self._agree(dealt) and self._is_concluded(dealt))
 
     def _is_concluded(self, dealt: Dealt) -> bool:
-        return self.end is not None and all(self.settled(r, dealt) for r in self.robots)
+        return self.end is not None and self._unsettled.is_none(
+            self.robots, lambda name: not self.settled(name, dealt)
+        )
 
     def _agree(self, dealt: Dealt) -> bool:
         """Believe an announced end and the robots' last words that confirm each other.
@@ -201,17 +217,28 @@ class TeamAttendance:
         Where there are no keys, a stranger may have announced ends and last words further than
         there is anything; those of the world and of its robots name the same counters all the same.
         """
-        for end in self.ends:
+        for end in self._possible_ends(dealt):
             found = {s.robot: self._confirmed(s, dealt) for s in end.streams}
             others = self.robots.keys() - found.keys()
-            if not all(self._is_excused(r) for r, done in found.items() if done is None):
-                continue
             if all(self._is_excused(r) for r in others) and any(found.values()):
                 self.world_end = end
+                self._changed.update(found)
                 for name, done in found.items():
                     self.robots[name].done = done or self.robots[name].done
                 return True
         return False
+
+    def _possible_ends(self, dealt: Dealt) -> Iterator[m.End]:
+        """The announced ends whose streams are each confirmed or not waited for."""
+
+        def is_open(stream: m.StreamEnd) -> bool:
+            return self._confirmed(stream, dealt) is None and not self._is_excused(stream.robot)
+
+        known = self._unconfirmed
+        self._unconfirmed = {id(end): known.get(id(end), (end, Awaited())) for end in self.ends}
+        for end, unconfirmed in self._unconfirmed.values():
+            if unconfirmed.is_none(end.streams, is_open):
+                yield end
 
     def _is_excused(self, name: str) -> bool:
         """Whether the team does not wait for the robot's last word."""
@@ -233,17 +260,29 @@ class TeamAttendance:
     def watermark_ns(self, dealt: Dealt, count: Callable[[tuple[str, int]], int]) -> float:
         """The least progress of the live robots: every submap that ends before it has arrived.
 
-        count: how many submaps of a stream have been dealt with.
+        count: how many submaps of a stream have been dealt with. Only robots that something was
+        heard of since the last call are looked at again.
         """
-        least = float("inf")
-        for name, robot in self.robots.items():
-            if robot.lost or self._is_away(robot) or self.settled(name, dealt):
-                continue
-            progress = robot.progress
-            if progress is None or count((name, progress.incarnation)) < progress.submaps:
-                return float("-inf")
-            least = min(least, progress.stamp_ns)
-        return least
+        of_all = (self.end, self.withdrawn, self.ordered, self._has_head)
+        if of_all != self._of_all:
+            self._changed.update(self.robots)
+        self._of_all = of_all
+        for name in self._changed:
+            self._least.put(name, self._until_ns(name, dealt, count))
+        self._changed.clear()
+        return self._least.value
+
+    def _until_ns(self, name: str, dealt: Dealt, count: Callable[[tuple[str, int]], int]) -> float:
+        """The progress of one robot, as far as all of it has arrived; infinite where nothing waits
+        for the robot.
+        """
+        robot = self.robots[name]
+        if robot.lost or self._is_away(robot) or self.settled(name, dealt):
+            return float("inf")
+        progress = robot.progress
+        if progress is None or count((name, progress.incarnation)) < progress.submaps:
+            return float("-inf")
+        return progress.stamp_ns
 
     def _is_away(self, robot: Attendance) -> bool:
         """In a live team: True for a robot that has not begun or whose driver is absent; nothing

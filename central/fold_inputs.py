@@ -68,7 +68,7 @@ class FoldInputs:
     def ticks_behind(self, last: float, without: Collection[str]) -> list[int]:
         """The ticks after this one with a submap of any other robot, ascending."""
         ticks = self._members.behind(last)
-        return [tick for tick in ticks if self._members.keys(tick, without)]
+        return [tick for tick in ticks if self._members.has(tick, without)]
 
     def size(self, tick: int, without: Collection[str]) -> int:
         """Number of submaps of a tick, those of some robots left out."""

@@ -46,6 +46,8 @@ class JoinRule(FusionRule[SubmapInputs]):
     def _begin(self) -> None:
         self._ticks = TickFold(self.config)
         self._filed: dict[Stream, int] = {}
+        self._source: Mapping[Stream, object] | None = None
+        self._seen = 0
         self._gone: set[str] = set()
 
     def take(self, inputs: SubmapInputs) -> list[Outgoing]:
@@ -68,17 +70,21 @@ class JoinRule(FusionRule[SubmapInputs]):
         them.
         """
         submaps, ticks = inputs.submaps, self._ticks
-        if not self._gone.issubset(inputs.withdrawn) or any(
-            len(submaps.get(stream, ())) < filed for stream, filed in self._filed.items()
+        known = submaps is self._source  # it has only grown
+        if not self._gone.issubset(inputs.withdrawn) or (
+            not known
+            and any(len(submaps.get(stream, ())) < filed for stream, filed in self._filed.items())
         ):
             self._begin()
-            ticks = self._ticks
+            ticks, known = self._ticks, False
+        reached = inputs.reached[self._seen :] if known else submaps
         ticks.convicts = ticks.convicts and not inputs.recorded
         for robot in sorted({*inputs.withdrawn} - self._gone):
             ticks.withdraw(robot)
             self._gone.add(robot)
         ticks.judge(inputs.verdicts)
-        for stream, chain in sorted(submaps.items()):
+        for stream in sorted(set(reached)):
+            chain = submaps[stream]
             filed = self._filed.get(stream, 0)
             if not filed and chain:
                 start = translate.start_of(inputs.starts[stream])
@@ -89,6 +95,8 @@ class JoinRule(FusionRule[SubmapInputs]):
                 messages = (submap, *sightings)
                 ticks.add(submap, digest_of(*map(encoded, messages)), sightings)
                 self._filed[stream] = submap.sequence + 1
+        if inputs.reached:
+            self._source, self._seen = submaps, len(inputs.reached)
 
     @property
     def convicted(self) -> Mapping[str, str]:

@@ -63,6 +63,10 @@ class Members:
                 found.append(tick)
         return found[::-1]
 
+    def has(self, tick: int, gone: Collection[str]) -> bool:
+        """Whether a tick has a submap of a robot that is not withdrawn."""
+        return any(key[1] not in gone for key in self._ticks[tick])
+
     def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
         """The submaps of a tick in canonical order, without those of withdrawn robots."""
         return sorted(key for key in self._ticks[tick] if key[1] not in gone)

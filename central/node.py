@@ -113,6 +113,7 @@ class CentralNode:
         one, provisional and with the reason.
         """
         out, self._credit = self._credit, []
+        self._attendance.note_change(message)
         if out is None:
             out = self._intake.refuse(message, why, self._attendance.now_ns)
         if self.finished or not self._is_over:

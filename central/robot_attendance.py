@@ -1,7 +1,9 @@
 """The presence and progress of one robot, as the centre knows them."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from heapq import heappop, heappush
+from typing import Generic, TypeVar
 
 from team.wire import messages as m
 
@@ -52,6 +54,46 @@ class Attendance:
         if head is None or done is None or head.state == "open":
             return False
         return (done.incarnation, done.measurements) >= (head.incarnation, head.measurements)
+
+
+S = TypeVar("S")
+
+
+class Awaited(Generic[S]):
+    """Whether any of many is waited for: asks again the one that was, and all when none is left."""
+
+    def __init__(self) -> None:
+        self._left: list[S] = []
+
+    def is_none(self, everyone: Iterable[S], waits_for: Callable[[S], bool]) -> bool:
+        """True if no one is waited for."""
+        while self._left:
+            if waits_for(self._left[-1]):
+                return False
+            self._left.pop()
+        self._left = [each for each in everyone if waits_for(each)]
+        return not self._left
+
+
+class Least:
+    """The least of the values of many names, which change one by one; infinite without any."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, float] = {}
+        self._heap: list[tuple[float, str]] = []
+
+    def put(self, name: str, value: float) -> None:
+        """Set the value of a name."""
+        if self._values.get(name) != value:
+            self._values[name] = value
+            heappush(self._heap, (value, name))
+
+    @property
+    def value(self) -> float:
+        """The least value."""
+        while self._heap and self._values[self._heap[0][1]] != self._heap[0][0]:
+            heappop(self._heap)
+        return self._heap[0][0] if self._heap else float("inf")
 
 
 T = TypeVar("T", m.Done, m.End)

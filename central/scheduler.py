@@ -39,6 +39,7 @@ class Scheduler:
         self._quiet_ns: int | None = None
         self._published: Mapping[Stream, int] = {}
         self._announced: dict[str, str] = {}
+        self._compared: tuple[Mapping[Stream, int], Mapping[Stream, int], bool] = ({}, {}, False)
 
     def admit(self, robot: str) -> None:
         """Add a robot to the team."""
@@ -92,12 +93,17 @@ class Scheduler:
 
     def _is_news(self, until_ns: float) -> bool:
         """Whether an input up to this time is missing in the last map."""
-        return _lacks(self._published, self._members(until_ns))
+        members = self._members(until_ns)
+        published, of, found = self._compared
+        if published is not self._published or of is not members:
+            found = _lacks(self._published, members)
+            self._compared = self._published, members, found
+        return found
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
         """The inputs up to this time, as a map names them."""
-        gone = self.intake.withdrawn
-        return {s: n for s, n in self.intake.members(until_ns).items() if s[0] not in gone}
+        gone, found = self.intake.withdrawn, self.intake.members(until_ns)
+        return {s: n for s, n in found.items() if s[0] not in gone} if gone else found
 
     def _newest(self, inputs: Inputs) -> list[Outgoing]:
         """The map of the closed ticks, or of everything that is here if that is more.

@@ -1,12 +1,12 @@
 """The submaps of a team: the set, the credit for each of them, orders, and missing submaps."""
 
-from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.intake import Inputs, Instant, Intake
+from central.reach import Reach
 from central.submap_set import SubmapSet
 from central.unnamed_landmarks import verdict_of
 from central.withdrawal_witnesses import WithdrawalWitnesses
@@ -26,13 +26,15 @@ class SubmapInputs(Inputs):
     """A set of submaps, and orders and verdicts about it.
 
     starts: of every stream. submaps: of each stream from sequence 0 on, without a gap. sightings:
-    from a submap. withdrawn: robots withdrawn by an order. verdicts: an operator's on unnamed
+    from a submap. reached: the stream of each submap, in the order in which they came; none where
+    that is not known. withdrawn: robots withdrawn by an order. verdicts: an operator's on unnamed
     landmarks. missing: what streams wait for. arrived: number of submaps, orders and verdicts that
     have arrived, to compare maps by. priors_of: the robots whose priors are recorded with the map.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
     submaps: Mapping[Stream, Sequence[m.Submap]] = field(default_factory=dict)
+    reached: Sequence[Stream] = ()
     sightings: Callable[[m.Submap], Sequence[m.SightingFactor]] = _none
     withdrawn: Collection[str] = ()
     verdicts: Collection[Verdict] = ()
@@ -51,6 +53,7 @@ class SubmapIntake(Intake[SubmapInputs]):
         self._withdrawal_witnesses = WithdrawalWitnesses(robots)
         self._set = SubmapSet()
         self._starts: dict[Stream, m.InitialPose] = {}
+        self._reach = Reach()
         self._refusals: dict[Stream, set[int]] = {}
         self._verdicts: set[Verdict] = set()
         self._no_more: set[Verdict] = set()
@@ -67,7 +70,8 @@ class SubmapIntake(Intake[SubmapInputs]):
             closed_ns=closed_ns,
             now_ns=now_ns,
             starts=self._starts,
-            submaps=self._chains(),
+            submaps=self._reach.chains,
+            reached=self._reach.order,
             sightings=self._set.sightings,
             withdrawn=self.orders,
             verdicts=self._verdicts,
@@ -79,11 +83,12 @@ class SubmapIntake(Intake[SubmapInputs]):
     def _arrived(self) -> int:
         """Submaps in the map's reach, orders, and verdicts and their withdrawals."""
         verdicts = len(self._verdicts | self._no_more) + len(self._no_more)
-        return sum(map(len, self._chains().values())) + len(self.orders) + verdicts
+        return len(self._reach.order) + len(self.orders) + verdicts
 
-    def _chains(self) -> dict[Stream, Sequence[m.Submap]]:
-        """Of each stream that has begun, the submaps in the map's reach; they grow in place."""
-        return {stream: self._set.chain(stream) for stream in self._starts}
+    def _note_reached(self, stream: Stream) -> None:
+        """Note the submaps of a stream that has begun that have come into the map's reach."""
+        if stream in self._starts:
+            self._reach.note(stream, self._set.chain(stream))
 
     def instants(self, attendance: TeamAttendance) -> Iterator[Instant[SubmapInputs]]:
         """Now: what the least progress of the live robots has closed, and what is ahead of it."""
@@ -92,11 +97,7 @@ class SubmapIntake(Intake[SubmapInputs]):
 
     def members(self, until_ns: float) -> Mapping[Stream, int]:
         """The last submap of each stream that ends up to a time."""
-        found = {
-            stream: bisect_right(chain, until_ns, key=_end_ns) - 1
-            for stream, chain in self._chains().items()
-        }
-        return {stream: last for stream, last in found.items() if last >= 0}
+        return self._reach.members(until_ns)
 
     # What comes.
 
@@ -126,11 +127,13 @@ class SubmapIntake(Intake[SubmapInputs]):
         """Begin a stream, for which its submaps wait."""
         stream = (start.robot, start.incarnation)
         self._starts.setdefault(stream, start)
+        self._note_reached(stream)
 
     def take_submap(self, submap: m.Submap) -> int:
         """Admit a submap; returns how many of its stream have been dealt with."""
         stream = (submap.robot, submap.incarnation)
         self._judge(submap, self._set.admit(submap))
+        self._note_reached(stream)
         return self._dealt_with(stream, self._set.count(stream))
 
     def take_sighting(self, sighting: m.SightingFactor) -> int:
@@ -139,6 +142,7 @@ class SubmapIntake(Intake[SubmapInputs]):
         """
         stream = (sighting.robot, sighting.incarnation)
         self._judge(sighting, self._set.admit_sighting(sighting))
+        self._note_reached(stream)
         return self._dealt_with(stream, self._set.count(stream))
 
     def take_withdrawal(self, withdrawal: m.Withdrawal) -> None:
@@ -258,10 +262,6 @@ class SubmapIntake(Intake[SubmapInputs]):
             for stream in sorted(sent)
             if here[stream] < sent[stream]
         ]
-
-
-def _end_ns(submap: m.Submap) -> int:
-    return submap.stamp_ns
 
 
 def _credit(of: m.Submap | m.SightingFactor, count: int, now_ns: int) -> list[Outgoing]:

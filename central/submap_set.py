@@ -27,6 +27,7 @@ class SubmapSet:
     )
     used: dict[Stream, dict[tuple[int, str], SightingFactor]] = field(default_factory=dict)
     chains: dict[Stream, list[Submap]] = field(default_factory=dict)
+    _incomplete: set[Stream] = field(default_factory=set, init=False)
 
     def admit(self, submap: Submap) -> str | None:
         """Take a submap; returns the reason if it is refused. A submap of the set is accepted
@@ -59,6 +60,7 @@ class SubmapSet:
             if not (continues if adjacent else first.stamp_ns <= second.start_ns):
                 return f"{name} does not continue submap {sequence}"
         stream[submap.sequence] = submap
+        self._incomplete.add((submap.robot, submap.incarnation))
         return None
 
     def admit_sighting(self, sighting: SightingFactor) -> str | None:
@@ -107,10 +109,12 @@ class SubmapSet:
     def missing(self) -> tuple[VersionEntry, ...]:
         """The missing submap that each stream with later ones waits for."""
         gaps = []
-        for (robot, incarnation), found in sorted(self.streams.items()):
+        for robot, incarnation in sorted(self._incomplete):
             first = self.count((robot, incarnation))
-            if len(found) > first:
+            if len(self.streams[robot, incarnation]) > first:
                 gaps.append(VersionEntry(robot=robot, incarnation=incarnation, sequence=first))
+            else:
+                self._incomplete.discard((robot, incarnation))
         return tuple(gaps)
 
 

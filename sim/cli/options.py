@@ -63,7 +63,7 @@ TeamOption = Annotated[
 Seed = Annotated[
     int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
 ]
-Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 100.", metavar="N")]
+Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 1000.", metavar="N")]
 Peers = Annotated[
     bool, typer.Option("--peers", help="Each robot keeps the team's set and folds it by itself.")
 ]

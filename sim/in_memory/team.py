@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
 from central.config import CentralConfig
@@ -23,6 +24,9 @@ ROUND_S = 1.0
 """Team time [s] of one round: every robot gets its measurements of a round before the next, so that
 none is windows ahead of its teammates' messages, as in real time.
 """
+
+SHARED = 16
+"""Number of the last samples whose messages are kept for their other receivers."""
 
 
 @runtime_checkable
@@ -63,8 +67,18 @@ class _Seat:
     def take(self, now_ns: int) -> bool:
         samples = self.link.arrived(self.bus.receive(0.0), now_ns)
         for sample in samples:
-            self.send(self.boundary.take(self.node, sample))
+            message = self.boundary.let_in(sample, partial(_opened, sample))
+            if isinstance(message, list):
+                self.send(message)
+            else:
+                self.send(self.boundary.hand(self.node, message, sample))
         return bool(samples)
+
+
+@lru_cache(maxsize=SHARED)
+def _opened(sample: Sample) -> m.Message:
+    """The message of a sample, which nobody changes: opened once for all that receive it."""
+    return opened(sample)[2]
 
 
 def run_team(

@@ -5,6 +5,7 @@ fails in the end. A robot that is given up is named as lost in the final map. Wi
 or centre there is no map: then the run ends. Peers need no centre.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -17,6 +18,11 @@ from team.wire.bus import Bus, BusError, Outgoing
 
 SILENT_S = 10.0
 """A running process without a message for this long [s] is named."""
+FEW = 3
+"""Of more silent processes than this it is only said how many there are."""
+MANY = "many"
+REPEAT_S = 60.0
+"""The silence of one process, or of many, is told again after this time [s] at the earliest."""
 STARTING_S = 60.0
 """A starting process without any message for this long [s] is named: a busy machine is slow."""
 MEASURE_S = 2.0
@@ -139,36 +145,64 @@ class Silence:
 
     def __init__(self, end_s: float | None) -> None:
         self._end_s = end_s
-        self._named: set[int] = set()
+        self._silent: set[int] = set()
+        self._last_note: dict[str, float] = {}
 
     def look(self, services: Sequence[Supervised], watch: Watch) -> None:
-        """Name each process that has been silent for SILENT_S, once; end it where end_silent_s says
-        so.
+        """Name the processes that have become silent, many in one line; end one where end_silent_s
+        says so.
         """
         now = time.monotonic()
+        new: list[tuple[Supervised, float]] = []
         for service in services:
             child = service.child
             if not service.is_watched or service.due is not None or child.exit is not None:
+                self._silent.discard(child.pid)
                 continue
             last_message = watch.last_message.get(node_of(service.name), 0.0)
             if service.name == "router":  # it says nothing itself: all others are silent with it
                 last_message = max(watch.last_message.values(), default=0.0)
             silent_s = now - max(last_message, child.started)
-            starts = last_message < child.started and not child.is_stopped
-            if silent_s < (STARTING_S if starts else SILENT_S):
-                self._named.discard(child.pid)
+            if silent_s < SILENT_S:
+                self._silent.discard(child.pid)
                 continue
-            if child.pid not in self._named:
-                self._named.add(child.pid)
-                state = "is stopped (SIGSTOP?)" if child.is_stopped else "is there"
-                watch.note(
-                    f"{service.name} (pid {child.pid}) {state} and has said nothing for "
-                    f"{silent_s:.0f} s: the team may wait for it. To have it started again: "
-                    f"kill -9 {child.pid}"
-                )
+            if last_message < child.started and silent_s < STARTING_S and not child.is_stopped:
+                continue
+            if child.pid not in self._silent:
+                self._silent.add(child.pid)
+                new.append((service, silent_s))
             if self._end_s is not None and silent_s >= self._end_s:
                 watch.note(f"{service.name} (pid {child.pid}) was silent {silent_s:.0f} s: ended")
                 child.kill()
+        self._tell(new, watch, now)
+
+    def _tell(self, new: Sequence[tuple[Supervised, float]], watch: Watch, now: float) -> None:
+        """Name each of a few; of many say how many there are. Each is said once in REPEAT_S."""
+        many = len(self._silent) > FEW
+        for service, silent_s in new:
+            child = service.child
+            if child.is_stopped:
+                self._note(watch, service, "is stopped (SIGSTOP?)", silent_s)
+            elif not many and now >= self._last_note.get(service.name, -math.inf) + REPEAT_S:
+                self._last_note[service.name] = now
+                self._note(watch, service, "is there", silent_s)
+        if many and new and now >= self._last_note.get(MANY, -math.inf) + REPEAT_S:
+            self._last_note[MANY] = now
+            named = ", ".join(service.name for service, _ in new[:FEW])
+            watch.note(
+                f"{len(self._silent)} processes, {named} among them, have said nothing for "
+                f"{SILENT_S:.0f} s: this computer may be too busy for the team, which goes on "
+                "slower"
+            )
+
+    @staticmethod
+    def _note(watch: Watch, service: Supervised, state: str, silent_s: float) -> None:
+        pid = service.child.pid
+        watch.note(
+            f"{service.name} (pid {pid}) {state} and has said nothing for "
+            f"{silent_s:.0f} s: the team may wait for it. To have it started again: "
+            f"kill -9 {pid}"
+        )
 
 
 def failure(ended: Ended) -> str:

@@ -23,7 +23,7 @@ from central.config import CentralConfig
 from sim.scenarios.checks import ScenarioError, check_fields, check_known, close, plain
 from team.config import RobotConfig
 
-MAX_ROBOTS = 100
+MAX_ROBOTS = 1_000
 UTIAS_ROBOTS = 5
 ANY_ROBOT = "any_robot"
 """Stands for each robot of a data set that is not known yet."""

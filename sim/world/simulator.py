@@ -328,7 +328,8 @@ def _sightings(
     robot = robots[index]
     none = np.zeros(0)
     columns = [(none.astype(np.int64), none.astype(np.uint32), none, none)]
-    for i, other in enumerate(robots):
+    for i in _within_reach(world, robot, drives, index):
+        other = robots[i]
         if i != index:
             at = drives[i].poses[1:, np.newaxis, :2]
             seen = _visible(world, robot, drives[index].poses[1:], at)
@@ -343,6 +344,17 @@ def _sightings(
     return grouped(
         ends_ns[steps[order]], others[order].astype(np.uint32), ranges[order], bearings[order]
     )
+
+
+def _within_reach(
+    world: SimulatedWorld, robot: RobotConfig, drives: Sequence[Drive], index: int
+) -> list[int]:
+    """The robots that are ever so near to this one, in x and in y, that they may be visible."""
+    _, farthest = _limits(world, robot.sensor)
+    reach = 1.001 * (farthest + hypot(*robot.sensor.mount[:2])) + 1e-6
+    at = np.stack([drive.poses[1:, :2] for drive in drives])
+    near = (np.abs(at - at[index]) <= reach).all(axis=2).any(axis=1)
+    return np.flatnonzero(near).tolist()
 
 
 def _visible(

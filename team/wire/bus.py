@@ -11,6 +11,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import msgspec
@@ -260,16 +261,21 @@ class MemoryNetwork:
     stored: dict[str, deque[tuple["MemoryBus", Sample]]] = field(default_factory=dict)
     answers: list[tuple[Channel, str, Answer]] = field(default_factory=list)
     alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
+    _numbers: Iterator[int] = field(default_factory=count)
     _requests: dict[str, tuple[Channel, dict[str, set["MemoryBus"]]]] = field(default_factory=dict)
     _receivers: dict[str, list["MemoryBus"]] = field(default_factory=dict)
 
     def enter(self, bus: "MemoryBus") -> None:
         """Adds a bus, the last one to which a sample is delivered."""
         self.buses.append(bus)
+        bus.number = next(self._numbers)
 
     def leave(self, bus: "MemoryBus") -> None:
         """Removes a bus."""
         self.buses.remove(bus)
+        for _, buses in self._requests.values():
+            for wanting in buses.values():
+                wanting.discard(bus)
         self._receivers.clear()
 
     def want(self, bus: "MemoryBus", channel: Channel, name: str) -> None:
@@ -288,7 +294,7 @@ class MemoryNetwork:
                 if owner is not None:
                     names = buses if owner == "" else ("*", "**", owner)
                     wanting.update(*(buses.get(name, ()) for name in names))
-            found = self._receivers[key] = [bus for bus in self.buses if bus in wanting]
+            found = self._receivers[key] = sorted(wanting, key=lambda bus: bus.number)
         return found
 
     def deliver(self, source: "MemoryBus", sample: Sample) -> None:
@@ -303,9 +309,13 @@ class MemoryNetwork:
 
 
 class MemoryBus:
-    """A bus within one process: synchronous and deterministic."""
+    """A bus within one process: synchronous and deterministic.
+
+    number: its place among those of the network.
+    """
 
     def __init__(self, network: MemoryNetwork) -> None:
+        self.number = 0
         self._network = network
         self._arrived: deque[Sample] = deque()
         self._whole: set[str] = set()

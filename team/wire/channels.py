@@ -263,11 +263,14 @@ def robot_of(node: str) -> str | None:
     return robot if kind == "robot" else None
 
 
-@lru_cache(maxsize=4096)
+_OPENED = tuple(each for each in CHANNELS if each not in UNOPENED)
+
+
+@lru_cache(maxsize=16_384)
 def channel_of(key: str) -> tuple[Channel, str] | None:
     """The channel that a relative key belongs to, and the robot or node in it."""
-    for channel in CHANNELS:
-        if channel not in UNOPENED and (name := channel.owner(key)) is not None:
+    for channel in _OPENED:
+        if (name := channel.owner(key)) is not None:
             return channel, name
     return None
 

@@ -121,7 +121,11 @@ def test_equal_wheels_straight_on_err_in_way_and_turn_without_a_correlation():
 
 def test_standing_still_has_no_noise_of_ways_or_speeds():
     model = MotionModel(
-        kind="differential-drive", wheel_base=0.4, left_wheel=0.1, right_wheel=0.1, alphas=(1,) * 6
+        kind="differential-drive",
+        wheel_base=0.4,
+        left_wheel=0.1,
+        right_wheel=0.1,
+        alphas=(1.0,) * 6,
     )
     np.testing.assert_array_equal(increment_of(model, 1.0, 0.0, 0.0).covariance, np.zeros((3, 3)))
 

@@ -41,8 +41,8 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
     ("arguments", "parts"),
     [
         (["launch", "atlantis"], ["atlantis: no such scenario", "thesis", "waypoints"]),
-        (["launch", "thesis", "--robots", "0"], ["0 robots: a team has 1 to 100"]),
-        (["launch", "thesis", "--robots", "1000"], ["1000 robots: a team has 1 to 100"]),
+        (["launch", "thesis", "--robots", "0"], ["0 robots: a team has 1 to 1000"]),
+        (["launch", "thesis", "--robots", "1001"], ["1001 robots: a team has 1 to 1000"]),
         (
             ["launch", "thesis", "--estimator", "hybrid-thesis"],
             ["hybrid-thesis can not feed the rule join", "valid:", "kalman-per-axis"],

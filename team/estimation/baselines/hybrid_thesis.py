@@ -71,7 +71,7 @@ def filter_step(
         generator=generator,
     )
     mean, P = moments(
-        after.poses, elementwise.exp(after.log_weights), after.means, after.covariances
+        after.poses, elementwise.exp(after.log_weights), after.means, after.covariances, 1.0
     )
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
     return absorbed(
@@ -92,7 +92,7 @@ def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> 
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
     return Particles(
         poses=np.tile(state.pose, (particles, 1)),
-        log_weights=np.full(particles, -elementary.log(particles)),
+        log_weights=np.full(particles, -elementary.log(float(particles))),
         ids=state.ids[observed],
         means=np.tile(state.landmarks[observed], (particles, 1, 1)),
         covariances=np.tile(triangles, (particles, 1, 1)),

@@ -73,7 +73,7 @@ def filter_step(
         state = replace(
             state,
             poses=state.poses[:, parents],
-            log_weights=np.full(len(parents), -elementary.log(len(parents))),
+            log_weights=np.full(len(parents), -elementary.log(float(len(parents)))),
             means=state.means[parents],
             covariances=state.covariances[parents],
         )

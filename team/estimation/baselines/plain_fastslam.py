@@ -84,7 +84,8 @@ def landmark_gaussian(state: PlainFastSlam) -> LandmarkGaussian:
 def pose_moments(particles: Particles) -> PoseGaussian:
     """Moments of the weighted poses; singular where fewer than four of them differ."""
     none = particles.means[:, :0], particles.covariances[:, :0]
-    return PoseGaussian(*moments(particles.poses, elementwise.exp(particles.log_weights), *none))
+    weights = elementwise.exp(particles.log_weights)
+    return PoseGaussian(*moments(particles.poses, weights, *none, 1.0))
 
 
 def landmark_moments(particles: Particles) -> LandmarkGaussian:
@@ -93,7 +94,8 @@ def landmark_moments(particles: Particles) -> LandmarkGaussian:
     mean, P = moments(
         particles.poses,
         elementwise.exp(particles.log_weights),
-        particles.means[:, order],
-        particles.covariances[:, order],
+        np.ascontiguousarray(particles.means[:, order]),
+        np.ascontiguousarray(particles.covariances[:, order]),
+        1.0,
     )
     return LandmarkGaussian(particles.ids[order], mean[3:].reshape(-1, 2), P[3:, 3:])

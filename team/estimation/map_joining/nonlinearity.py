@@ -119,9 +119,10 @@ def nonlinearity_warnings(island: Island) -> list[str]:
     """
     texts = []
     for stream, where, node in ends(island):
+        if island.graph.fixed[island.graph.streams[stream][0]]:
+            continue
         found = understated_uncertainty(island, node)
-        given = island.graph.fixed[island.graph.streams[stream][0]]
-        if found is not None and not given:
+        if found is not None:
             texts.append(
                 f"{named(stream)} may have {where} farther off than its covariance says: "
                 f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "

@@ -136,7 +136,7 @@ def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter(proposa
     particles, found_evidence, _ = filtered(motions, keyframes, count, proposal)
     np.testing.assert_array_equal(particles.ids, IDS)
     found, spread = moments(
-        particles.poses, np.exp(particles.log_weights), particles.means, particles.covariances
+        particles.poses, np.exp(particles.log_weights), particles.means, particles.covariances, 1.0
     )
     sigma = np.sqrt(np.diag(P))
     error = found - mean

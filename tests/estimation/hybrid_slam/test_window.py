@@ -184,8 +184,9 @@ def test_solving_the_landmarks_again_takes_out_the_bias_of_the_first_measurement
         mean, P = moments(
             particles.poses,
             np.exp(particles.log_weights),
-            particles.means[:, order],
-            particles.covariances[:, order],
+            np.ascontiguousarray(particles.means[:, order]),
+            np.ascontiguousarray(particles.covariances[:, order]),
+            1.0,
         )
         P[np.arange(3), np.arange(3)] += POSE_JITTER
         with_ekf.append(nees(state_error(mean, truth), P))

@@ -100,3 +100,20 @@ def test_a_straight_valley_is_no_bend_however_wide():
     fold = folded(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
     assert understated_uncertainty(fold.main, start_node(fold)) is None
     assert not [text for text in warnings(searched([fold.main])) if "farther off" in text]
+
+
+def test_a_robot_whose_initial_pose_is_given_costs_no_profile(monkeypatch):
+    """Its profiles were computed and thrown away: the final map of a large team took most of its
+    time for them.
+    """
+    fold, asked = latecomer(blind=10), []
+
+    def noted(island, node):
+        asked.append(node)
+        return understated_uncertainty(island, node)
+
+    monkeypatch.setattr(nonlinearity, "understated_uncertainty", noted)
+    (said,) = nonlinearity.nonlinearity_warnings(fold.main)
+    assert said.startswith("r1 (incarnation 0) may have started farther off")
+    streams = fold.main.graph.streams
+    assert set(asked) == {streams["r1", 0][0], streams["r1", 0][-1]}

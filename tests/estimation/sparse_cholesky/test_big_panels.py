@@ -60,7 +60,7 @@ def test_a_panel_s_part_of_the_inverse_is_the_dense_one(shape):
     width = shape[0]
     dense, _, factor = panel_and_rest(*shape)
     inverse = np.linalg.inv(dense)
-    found = np.zeros_like(factor)
+    found = np.zeros(factor.shape)
     known = np.ascontiguousarray(inverse[width:, width:])
     products.selected_by_blocks(np.ascontiguousarray(factor), known, found)
     sigma = np.sqrt(np.diag(inverse))

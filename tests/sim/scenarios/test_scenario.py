@@ -148,8 +148,8 @@ def test_every_valid_pair_can_be_chosen(estimator: str, fusion: str) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"robots": 0}, "0 robots: a team has 1 to 100"),
-        ({"robots": 101}, "101 robots: a team has 1 to 100"),
+        ({"robots": 0}, "0 robots: a team has 1 to 1000"),
+        ({"robots": 1001}, "1001 robots: a team has 1 to 1000"),
         (
             {"estimator": "hybrid-thesis"},
             "can not feed the rule join, but kalman-per-axis or latest or alone; valid: ",
@@ -204,9 +204,9 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[central", "not valid TOML: "),
         (SMALL + "x = = 2", "line 6, column 5"),
         ("seed = 1.5\n" + SMALL, "expected int, got float at seed"),
-        ("robot_count = 0\n" + SMALL, "0 robots: a team has 1 to 100"),
-        ("robot_count = 101\n" + SMALL, "101 robots: a team has 1 to 100"),
-        ("robot_count = 'two'\n" + SMALL, "expected a number of robots from 1 to 100, got 'two'"),
+        ("robot_count = 0\n" + SMALL, "0 robots: a team has 1 to 1000"),
+        ("robot_count = 1001\n" + SMALL, "1001 robots: a team has 1 to 1000"),
+        ("robot_count = 'two'\n" + SMALL, "expected a number of robots from 1 to 1000, got 'two'"),
         ("robots = []\n" + SMALL, "no robots: give robot_count, [[robots]], or a base"),
         (SMALL, "no robots: give robot_count, [[robots]], or a base that has some"),
         ("robots = 3\n" + SMALL, "expected [[robots]], an array of tables, at robots"),

@@ -1,0 +1,86 @@
+"""What a user reads of processes that say nothing."""
+
+import time
+
+import pytest
+
+from sim.launch.supervision import FEW, Silence
+from sim.launch.supervisor import Child, Supervised
+from sim.launch.watch import Watch
+
+
+class Quiet(Child):
+    """A process that is there."""
+
+    pid = 0
+    exit = None
+    is_stopped = False
+
+    def __init__(self, pid: int) -> None:
+        self.pid, self.started = pid, 999.0
+
+
+class Stopped(Quiet):
+    """A process that does not run."""
+
+    is_stopped = True
+
+
+class Service(Supervised):
+    """The robot of this number."""
+
+    def __init__(self, number: int) -> None:
+        self.name, self.child = f"robot-r{number}", Quiet(100 + number)
+
+
+class Team:
+    """Processes that are there, a clock that is set by hand, and what is noted of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+        self.now = 1000.0
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
+        self.watch, self.silence = Watch(), Silence(None)
+        self.services = [Service(k) for k in range(count)]
+
+    def hears(self, *numbers: int) -> None:
+        for k in numbers:
+            self.watch.last_message[f"robot/r{k}"] = self.now
+
+    def after(self, seconds: float) -> list[str]:
+        """What is noted new, after this time."""
+        self.now, known = self.now + seconds, len(self.watch.notes)
+        self.silence.look(self.services, self.watch)
+        return self.watch.notes[known:]
+
+
+def test_a_few_silent_processes_are_named_each_once_a_minute(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    team = Team(monkeypatch, FEW)
+    team.hears(*range(FEW))
+    assert team.after(9.0) == []
+    said = team.after(2.0)
+    assert [f"robot-r{k} (pid {100 + k}) is there and has said nothing for 11 s" in text
+            for k, text in enumerate(said)] == [True] * FEW  # fmt: skip
+    assert team.after(5.0) == [], "one line a silence"
+    team.hears(0)
+    assert team.after(11.0) == [], "it was named half a minute ago"
+    team.hears(0)
+    assert team.after(0.0) == []
+    assert len(team.after(60.0)) == 1
+
+
+def test_of_many_silent_processes_one_line_says_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    team = Team(monkeypatch, 50)
+    team.hears(*range(50))
+    (said,) = team.after(11.0)
+    assert "50 processes, robot-r0, robot-r1, robot-r2 among them, have said nothing" in said
+    lines = 0
+    for k in range(100):  # an overloaded computer: each speaks now and then, at times of its own
+        team.hears(k % 50)
+        lines += len(team.after(1.0))
+    assert lines <= 2
+    team.services[7].child = Stopped(107)
+    team.hears(7)
+    team.after(0.0)
+    assert any("robot-r7 (pid 107) is stopped" in text for text in team.after(11.0))
