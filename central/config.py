@@ -26,9 +26,9 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Prior standard deviations of the errors that all robots share, beside each robot's own; 0:
     none.
 
-    An error of a common calibration is the same for all robots of a kind. marker: for landmarks
-    with identities, a share of the range by which a landmark's marker appears too far to every
-    robot, since it hangs higher or differs in size.
+    An error of a common calibration is the same for all robots of a kind. marker: a share of the
+    range by which a landmark's marker appears too far to every robot, since it hangs higher or
+    differs in size.
     """
 
     bearing: NonNegative = 0.0

@@ -16,6 +16,7 @@ from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.fastslam import effective_sample_size
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
+from team.estimation.hybrid_slam.redrawing import redrawn
 from team.estimation.hybrid_slam.unnamed import Settled, settled
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.models import Increment
@@ -144,6 +145,8 @@ class OpenWindow:
             keyframes = self.settled.keyframes
         if has_unnamed or self._gate.judges:
             self._take_all(keyframes)
+        if has_unnamed:
+            self.particles = redrawn(self.particles, keyframes, self._generator)
         sensor = self._config.sensor
         white = sensor.range_white == sensor.bearing_white == 1.0
         if self._least < DEPLETED and white and not has_unnamed:

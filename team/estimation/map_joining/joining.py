@@ -32,6 +32,7 @@ from team.estimation.map_joining.gauss_newton import (
     is_solvable,
     iterated,
 )
+from team.estimation.map_joining.markers import with_markers
 from team.estimation.map_joining.merging import Merge, ages, merge, sighted
 from team.estimation.map_joining.minima import (
     Minimum,
@@ -303,7 +304,8 @@ def converged(fold: Fold, settings: JoinSettings) -> Fold:
 
 def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     searches = {
-        key: _search(replace(island, settings=settings)) for key, island in fold.islands.items()
+        key: _search(with_markers(replace(island, settings=settings)))
+        for key, island in fold.islands.items()
     }
     main = searches[main_key]
     solved = replace(

@@ -424,7 +424,7 @@ def _in_common(
     """The errors of a submap that the whole team has in common, each with its sigma, in their
     order.
 
-    Unnamed landmarks have no marker that could be recognised.
+    The markers of unnamed landmarks are states of the full solution alone (`markers`).
     """
     found: dict[CommonError, float] = {
         bias: common_bias_sigma[bias] for bias in local.biases if bias in common_bias_sigma

@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from team.config import UNNAMED
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import packed, unpacked
 from team.estimation.geometry import compose, inverse, transformed
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import marginals
+from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
+from team.estimation.map_joining.markers import with_markers
+from team.estimation.map_joining.submap_graph import tied
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth
 
@@ -211,6 +215,30 @@ def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():
     np.testing.assert_array_equal(rows[1:].sum(axis=0), np.where(np.arange(13) < 3, 0.0, rows[0]))
     np.testing.assert_array_equal(rows[0], local.sensitivity[0])
     assert (np.count_nonzero(rows[1:], axis=1) == 2).all()
+
+
+def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
+    submaps, starts, _ = carts(6, submaps=3, marker=MARKER)
+    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
+    named = fold_of(submaps, starts, options).main
+    hidden = [replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids)) for x in submaps]
+    fold = folded(started(started(EMPTY_FOLD, starts[0]), starts[1]), hidden, options)
+    assert len(fold.main.graph.landmarks) == 5 * len(hidden)
+    number = fold.landmarks.number
+    first = {each.local: own for each, own in reversed(number.items())}
+    becomes = {own: first[each.local] for each, own in number.items()}
+    graph, state = tied(fold.main.graph, fold.main.state, becomes)
+    joined, *_ = settled(with_markers(replace(fold.main, graph=graph, state=state)))
+    graph = joined.graph
+    assert sorted(graph.common) == sorted(graph.landmarks) == sorted(first.values())
+    assert len(graph.priors) == len(named.graph.priors)
+    for local, own in first.items():
+        for nodes, of in (
+            (graph.landmarks, named.graph.landmarks),
+            (graph.common, named.graph.common),
+        ):
+            at, known = graph.offset[nodes[own]], named.graph.offset[of[local]]
+            assert joined.state[at] == pytest.approx(named.state[known], abs=1e-6)
 
 
 def _only_own_biases_are_discounted(graph):

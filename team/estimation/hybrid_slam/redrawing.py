@@ -1,0 +1,255 @@
+"""A window's paths drawn anew when it closes, from the smoothed window, and weighed.
+
+Each resampling leaves the particles fewer lines of descent: after forty keyframes all of them may
+share one path through the first thirty, and their scatter says nothing of its error. Once it is
+decided which measurement is of which landmark, the window is a smoothing problem. M paths x are
+drawn from the Gaussian q of its solution, and weigh
+
+    w ∝ p(x) Π_l ∫ p(z_l | x, l) dl / q(x),
+
+with the integral over each landmark l by Laplace's method along the path. This is importance
+sampling whose proposal is the Laplace approximation (Geweke 1989, Econometrica 57(6)): the weights
+correct what is not Gaussian, and the paths have no ancestors in common.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team.estimation import dense, elementary, elementwise
+from team.estimation.association.scans import Scans, points_of
+from team.estimation.association.smoothing import JITTER, Smoothed, smoothed
+from team.estimation.geometry import adjoint, between, inverse
+from team.estimation.hybrid_slam.fastslam import effective_sample_size, normalised
+from team.estimation.hybrid_slam.keyframes import Keyframe
+from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
+from team.estimation.hybrid_slam.moments import by_slot, mean_path
+from team.estimation.hybrid_slam.reduction import variances
+from team.estimation.hybrid_slam.window import Window, noise_of
+from team.estimation.scans import POINT
+
+Paths = Float[np.ndarray, "K M 3"]
+FEW = 10.0
+"""Effective number of lines of descent below which the scatter of paths is no estimate of their
+uncertainty, as of particles (`open_window.DEPLETED`).
+"""
+
+
+def redrawn(
+    window: Window, keyframes: Sequence[Keyframe], generator: np.random.Generator
+) -> Window:
+    """The window with paths drawn anew, if few lines of descent are left and the new ones are more.
+
+    A sample counts by its effective size 1/Σ w², the particles with w summed over those that have
+    one pose at the first keyframe. Draws 3 K M normal numbers, where it draws.
+    keyframes: of which the window has taken all measurements.
+    """
+    weights = elementwise.exp(window.particles.log_weights)
+    if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
+        return window
+    slots = _slots(window)
+    scans = _scans(window, keyframes)
+    landmarks = dense.product(weights, _rows(window.particles.means)).reshape(-1, 2)
+    poses = mean_path(np.ascontiguousarray(window.paths), weights)
+    try:
+        now = smoothed(scans, slots, poses, landmarks)
+        paths, log_weights = _drawn(now, scans, len(weights), generator)
+    except np.linalg.LinAlgError:
+        return window
+    means, covariances = _landmarks(window, paths, (scans, slots))
+    log_weights += _likelihood(window, paths, means, covariances, (scans, slots))
+    if not np.isfinite(log_weights).all():
+        return window
+    log_weights, _ = normalised(log_weights)
+    if effective_sample_size(log_weights) <= left:
+        return window
+    particles = replace(
+        window.particles,
+        poses=paths[-1].copy(),
+        log_weights=log_weights,
+        means=means,
+        covariances=covariances,
+    )
+    return replace(window, particles=particles, paths=paths)
+
+
+def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
+    """Effective number of the particles' ancestors at the window's first keyframe."""
+    _, ancestor = np.unique(window.paths[0], axis=0, return_inverse=True)
+    shares = np.bincount(ancestor.ravel(), weights)
+    return 1.0 / float(dense.product(shares, shares))
+
+
+def _slots(window: Window) -> Int64[np.ndarray, " N"]:
+    """The place of each measurement's landmark among the particles' landmarks."""
+    known = window.particles.ids
+    order = np.argsort(known)
+    found: Int64[np.ndarray, " N"] = order[np.searchsorted(known[order], window.ids)]
+    return found
+
+
+def _rows(values: Float[np.ndarray, "M L k"]) -> Float[np.ndarray, "M _"]:
+    return np.ascontiguousarray(values).reshape(len(values), -1)
+
+
+def _scans(window: Window, keyframes: Sequence[Keyframe]) -> Scans:
+    """The window's motions, and its measurements as points."""
+    ranges, bearings = window.measurements.T
+    points, covariances = points_of(ranges, bearings, variances(ranges, window.own, window.sensor))
+    return Scans(
+        motions=np.array([each.increment.mean for each in keyframes]),
+        motion_covariances=np.array([each.increment.covariance for each in keyframes]),
+        keyframes=window.keyframes,
+        points=points,
+        covariances=covariances,
+        names=window.ids.astype(np.int64),
+    )
+
+
+def _drawn(
+    now: Smoothed, scans: Scans, count: int, generator: np.random.Generator
+) -> tuple[Paths, Float[np.ndarray, " M"]]:
+    """Paths from the smoothed window's Gaussian, and log p(path) − log q(path) but for a
+    constant.
+    """
+    k = len(now.poses)
+    normals = generator.standard_normal((count, 3 * k))
+    L = dense.cholesky(now.covariance[: 3 * k, : 3 * k])
+    xi = dense.product(normals, L.T).reshape(count, k, 3).transpose(1, 0, 2)
+    paths = _composed(now.poses, xi)
+    before = np.concatenate((np.zeros((1, count, 3)), paths[:-1]))
+    went = _seen(before, paths[..., :2] - before[..., :2])
+    motions = np.broadcast_to(scans.motions[:, None], paths.shape)
+    error = np.empty_like(paths)
+    error[..., :2] = _seen(motions, went - motions[..., :2])
+    error[..., 2] = _wrapped(paths[..., 2] - before[..., 2] - motions[..., 2])
+    squared = _squared(error, scans.motion_covariances + JITTER)
+    of_draw = _row_sums(elementary.squared(normals))
+    return paths, 0.5 * (of_draw - squared)
+
+
+def _composed(poses: Float[np.ndarray, "K 3"], xi: Float[np.ndarray, "K M 3"]) -> Paths:
+    """Paths with the errors ξ (forward, left, turn) of their poses, composed of their motions.
+
+    The error of motion k at its end is ξ_k − Ad(motion⁻¹) ξ_{k−1}, a map of determinant 1. It is
+    small where those of far poses are not, which would bend a path of poses moved one by one.
+    """
+    paths = np.empty_like(xi)
+    pose, last, at = np.zeros(3), np.zeros(xi.shape[1:]), np.zeros(xi.shape[1:])
+    for k, after in enumerate(poses):
+        motion = between(pose, after)
+        error = xi[k] - dense.product(last, adjoint(inverse(motion)).T)
+        at = _moved(_moved(at, np.broadcast_to(motion, at.shape)), error)
+        paths[k], pose, last = at, after, xi[k]
+    return paths
+
+
+def _moved(
+    poses: Float[np.ndarray, "M 3"], by: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "M 3"]:
+    """Each pose ∘ (forward, left, turn)."""
+    return np.column_stack((_placed(poses, by[:, :2]), poses[:, 2] + by[:, 2]))
+
+
+def _placed(
+    poses: Float[np.ndarray, "*n 3"], points: Float[np.ndarray, "*n 2"]
+) -> Float[np.ndarray, "*n 2"]:
+    """Each point of a pose's frame."""
+    s, c = elementwise.sin_and_cos(poses[..., 2])
+    x, y = points[..., 0], points[..., 1]
+    return np.stack((poses[..., 0] + c * x - s * y, poses[..., 1] + s * x + c * y), axis=-1)
+
+
+def _landmarks(
+    window: Window, paths: Paths, measured: tuple[Scans, Int64[np.ndarray, " N"]]
+) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
+    """The landmarks given each path, all errors white, as the particles have them.
+
+    They are solved from the mean of their measurements along the path.
+    """
+    (scans, slots), particles = measured, window.particles
+    points = np.broadcast_to(scans.points[:, None], (len(slots), paths.shape[1], 2))
+    order = np.argsort(particles.ids)
+    place = np.argsort(order)
+    starts = np.zeros((len(order), paths.shape[1], 2))
+    np.add.at(starts, place[slots], _placed(paths[scans.keyframes], points))
+    starts /= np.bincount(slots, minlength=len(order))[order, None, None]
+    seen, bounds = by_slot(particles.ids[order], window.ids)
+    means, covariances = landmarks_along_paths(
+        np.ascontiguousarray(starts.transpose(1, 0, 2)),
+        np.ascontiguousarray(particles.covariances[:, order]),
+        paths,
+        bounds,
+        window.keyframes[seen],
+        window.measurements[seen],
+        own=window.own[seen],
+        noise=noise_of(window.sensor)._replace(range_white=1.0, bearing_white=1.0),
+    )
+    return np.ascontiguousarray(means[:, place]), np.ascontiguousarray(covariances[:, place])
+
+
+def _likelihood(
+    window: Window,
+    paths: Paths,
+    means: Float[np.ndarray, "M L 2"],
+    covariances: Float[np.ndarray, "M L 3"],
+    measured: tuple[Scans, Int64[np.ndarray, " N"]],
+) -> Float[np.ndarray, " M"]:
+    """Log p(measurements | path) but for a constant, landmarks integrated out by Laplace's
+    method.
+
+    The noise of a measurement that is a point is Gaussian in the plane, that of others in range and
+    bearing.
+    """
+    scans, slots = measured
+    at = paths[scans.keyframes]
+    seen = _seen(at, means.transpose(1, 0, 2)[slots] - at[..., :2])
+    own = window.own
+    ranges = window.measurements[:, 0]
+    rr, rb, bb = variances(ranges, own, window.sensor).T
+    noise = np.stack((np.stack((rr, rb), -1), np.stack((rb, bb), -1)), -2)
+    error = np.empty_like(seen)
+    error[..., 0] = elementwise.hypot(seen[..., 0], seen[..., 1]) - window.measurements[:, None, 0]
+    error[..., 1] = _wrapped(
+        elementwise.atan2(seen[..., 1], seen[..., 0]) - window.measurements[:, None, 1]
+    )
+    if own.size:
+        plane = own[:, 3] == POINT
+        error[plane] = (seen - scans.points[:, None])[plane]
+        noise[plane] = scans.covariances[plane]
+    xx, xy, yy = covariances.transpose(2, 0, 1)
+    spread = _row_sums(elementwise.log(np.maximum(xx * yy - xy * xy, 1e-300)))
+    found: Float[np.ndarray, " M"] = 0.5 * (spread - _squared(error, noise))
+    return found
+
+
+def _seen(
+    poses: Float[np.ndarray, "K M 3"], apart: Float[np.ndarray, "K M 2"]
+) -> Float[np.ndarray, "K M 2"]:
+    """Rᵀ d of each difference d from a pose."""
+    s, c = elementwise.sin_and_cos(poses[..., 2])
+    x, y = apart[..., 0], apart[..., 1]
+    return np.stack((c * x + s * y, c * y - s * x), axis=-1)
+
+
+def _wrapped(angles: Float[np.ndarray, "K M"]) -> Float[np.ndarray, "K M"]:
+    """Each angle in (−π, π]."""
+    return angles + 2.0 * np.pi * np.floor((np.pi - angles) / (2.0 * np.pi))
+
+
+def _squared(
+    error: Float[np.ndarray, "n M k"], covariances: Float[np.ndarray, "n k k"]
+) -> Float[np.ndarray, " M"]:
+    """Σ eᵀ C⁻¹ e over the n errors of each of M."""
+    weighted = dense.product(error, dense.inverse(covariances)) * error
+    n, count, k = error.shape
+    total = dense.product(np.ones(n), weighted.reshape(n, -1))
+    return _row_sums(total.reshape(count, k))
+
+
+def _row_sums(values: Float[np.ndarray, "M k"]) -> Float[np.ndarray, " M"]:
+    """The sum of each row, in the order of its index."""
+    sums: Float[np.ndarray, " M"] = dense.product(values, np.ones(values.shape[1]))
+    return sums

@@ -1,0 +1,110 @@
+"""The paths of a window whose landmarks have no names are drawn anew when it closes."""
+
+import numpy as np
+import pytest
+
+from team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
+from team.estimation.geometry import between, compose, inverse, transformed
+from team.estimation.hybrid_slam import open_window
+from team.estimation.hybrid_slam.keyframes import Keyframe
+from team.estimation.hybrid_slam.open_window import OpenWindow
+from team.estimation.hybrid_slam.reduction import KeyframeScan
+from team.estimation.hybrid_slam.window import gaussian
+from team.estimation.models import Increment
+from team.estimation.scans import unclaimed
+from team.estimation.submap import LocalMap
+
+SECOND = 10**9
+STEPS, REACH = 40, 5.0
+SENSOR = Sensor(range_sigma=0.01, bearing_sigma=0.005)
+SPREAD = np.array([0.08, 0.06, 0.05])
+
+
+def drive(seed: int) -> tuple[list[Keyframe], np.ndarray]:
+    """Keyframes along an arc of half a metre a step between landmarks, and the true end."""
+    random = np.random.default_rng(seed)
+    pose, keyframes = np.zeros(3), []
+    way = np.arange(-4.0, 28.0, 2.0)
+    angle = way / 12.0
+    world = np.concatenate(
+        [np.column_stack([r * np.sin(angle), 12.0 - r * np.cos(angle)]) for r in (10.0, 14.0)]
+    )
+    for k in range(1, STEPS + 1):
+        after = compose(pose, np.array([0.5, 0.0, 0.5 / 12.0]))
+        motion = Increment(
+            between(pose, after) + SPREAD * random.standard_normal(3), np.diag(SPREAD**2)
+        )
+        pose = after
+        seen = np.array([transformed(inverse(pose), each) for each in world])
+        seen = seen[np.hypot(*seen.T) < REACH]
+        n = len(seen)
+        ranges = np.hypot(*seen.T) + SENSOR.range_sigma * random.standard_normal(n)
+        bearings = np.arctan2(seen[:, 1], seen[:, 0])
+        bearings += SENSOR.bearing_sigma * random.standard_normal(n)
+        ids, at = (UNNAMED + np.arange(n)).astype(np.uint32), k * SECOND
+        look = KeyframeScan(
+            at, ids, ranges, bearings, unclaimed(n), np.zeros(3), at_ns=at, motion=motion
+        )
+        none = np.empty(0)
+        keyframes.append(
+            Keyframe(
+                at, motion, np.empty(0, np.uint32), none, none, unclaimed(0),
+                looks=(look,), rest=Increment.identity(),
+            )
+        )  # fmt: skip
+    return keyframes, pose
+
+
+def window_of(keyframes: list[Keyframe], seed: int) -> OpenWindow:
+    front = FrontEnd(particles=100, association=AssociationSettings(least_seen=2))
+    window = OpenWindow(RobotConfig(id="r1", seed=seed, sensor=SENSOR, front_end=front), 1, 0)
+    for each in keyframes:
+        window.advance(each)
+    window.confirm()
+    return window
+
+
+def submap_of(keyframes: list[Keyframe], seed: int) -> LocalMap:
+    local = window_of(keyframes, seed).solved(gaussian)
+    assert local is not None
+    assert len(local.ids) > 15
+    return local
+
+
+def differences(keyframes: list[Keyframe]) -> list[float]:
+    """Between the end poses of one window by two seeds each: χ² of three numbers, in one's
+    covariance.
+    """
+    maps = [submap_of(keyframes, seed) for seed in range(1, 5)]
+    return [
+        float((a.mean - b.mean)[:3] @ np.linalg.solve(a.covariance[:3, :3], (a.mean - b.mean)[:3]))
+        for k, a in enumerate(maps)
+        for b in maps[:k]
+    ]
+
+
+def test_a_window_says_the_same_whatever_its_random_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    keyframes, _ = drive(4)
+    assert max(differences(keyframes)) < 0.5
+    monkeypatch.setattr(open_window, "redrawn", lambda window, *_: window)
+    assert max(differences(keyframes)) > 2.0
+
+
+def test_its_covariance_is_what_the_truth_is_off_by() -> None:
+    found = []
+    for seed in range(8):
+        keyframes, true = drive(seed)
+        local = submap_of(keyframes, 1)
+        error = local.mean[:3] - true
+        found.append(float(error @ np.linalg.solve(local.covariance[:3, :3], error)) / 3.0)
+    assert np.mean(found) < 2.0  # of 24 numbers, once in a thousand
+
+
+def test_no_two_paths_have_an_ancestor_in_common() -> None:
+    keyframes, _ = drive(3)
+    window = window_of(keyframes, 1).particles
+    assert len(np.unique(window.paths[0], axis=0)) == 100
+    assert window.paths[-1].tobytes() == window.particles.poses.tobytes()
+    assert np.exp(window.particles.log_weights).sum() == pytest.approx(1.0)
