@@ -7,11 +7,12 @@ sixteen particles. A particle that has come to its end repeats its last evaluati
 import math
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt32
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.hybrid_slam.landmark_kernel import innovation_of
+from team.estimation.hybrid_slam.moments import by_landmark, by_slot
 from team.estimation.hybrid_slam.sensitivity_kernel import Noise
 from team.estimation.models import NEAREST_M
 
@@ -45,6 +46,36 @@ def _information(rr: float, rb: float, bb: float, noise: Noise) -> tuple[float, 
     rr, bb = noise.range_white * rr, noise.bearing_white * bb
     determinant = rr * bb - rb * rb
     return bb / determinant, -rb / determinant, rr / determinant
+
+
+@compiled
+def landmarks_of_window(
+    known: UInt32[np.ndarray, " L"],
+    starts: Float[np.ndarray, "M L 2"],
+    start_covariances: Float[np.ndarray, "M L 3"],
+    paths: Float[np.ndarray, "K M 3"],
+    seen: UInt32[np.ndarray, " N"],
+    keyframes: Int64[np.ndarray, " N"],
+    measurements: Float[np.ndarray, "N 2"],
+    own: Float[np.ndarray, "N own"],
+    noise: Noise,
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
+    """`landmarks_along_paths` by ascending id, of measurements as they came (`seen`: the landmark
+    of each).
+    """
+    ids, means, covariances = by_landmark(known, starts, start_covariances)
+    order, bounds = by_slot(ids, seen)
+    means, covariances = landmarks_along_paths(
+        means,
+        covariances,
+        paths,
+        bounds,
+        keyframes[order],
+        measurements[order],
+        own[order],
+        noise,
+    )
+    return ids, means, covariances
 
 
 @compiled

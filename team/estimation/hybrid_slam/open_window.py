@@ -13,7 +13,6 @@ import numpy as np
 from team.config import RobotConfig
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.fastslam import effective_sample_size
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
 from team.estimation.hybrid_slam.redrawing import redrawn
@@ -126,7 +125,7 @@ class OpenWindow:
             keyframe.forward,
             own=keyframe.own,
         )
-        self._least = min(self._least, effective_sample_size(self.particles.particles.log_weights))
+        self._least = min(self._least, self.particles.effective)
         self.keyframes_ns = (*self.keyframes_ns, keyframe.stamp_ns)
         if keyframe.is_node:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)

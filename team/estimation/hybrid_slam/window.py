@@ -6,6 +6,7 @@ measurements along that particle's path: an EKF is linearised at the first, nois
 and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -20,11 +21,10 @@ from team.estimation.geometry import inverse, tangent
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
-from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
+from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_of_window
 from team.estimation.hybrid_slam.moments import (
     POSE_JITTER,
     by_landmark,
-    by_slot,
     sample_factor,
     submap_moments,
 )
@@ -56,6 +56,7 @@ class Window:
     Poses are the sensor's, in the frame of the window's start of the sensor.
     node_stamps, node_keyframes: team time [ns] of the pose nodes, and the keyframe that each is.
     innovation: of all measurements so far that were predicted.
+    effective: number of effective particles after the last keyframe.
     motions:  up to each keyframe, and after the last one; kept where biases are asked for.
     """
 
@@ -70,6 +71,7 @@ class Window:
     node_keyframes: Int64[np.ndarray, " nodes"]
     own: Own
     innovation: Innovation = NOTHING
+    effective: float = math.inf
     motions: WindowMotions = NO_MOTIONS
 
 
@@ -124,7 +126,7 @@ def advanced(
     """One keyframe: the motion since the last one, then its measurements (there may be
     none).
 
-    The measurements are accepted and corrected already (`models.acceptable`, `models.corrected`).
+    The measurements are accepted and corrected already (`models.scanned`).
     forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
     own: the noises that the measurements claim (`team.estimation.scans`).
     """
@@ -148,15 +150,18 @@ def advanced(
     )
     paths = window.paths if info.parents is None else window.paths[:, info.parents]
     keyframe = np.full(len(ids), len(paths))
+    read = np.empty((len(ids), 2))
+    read[:, 0], read[:, 1] = ranges, bearings
     return replace(
         window,
         particles=particles,
         paths=np.concatenate((paths, particles.poses[None])),
         keyframes=np.concatenate((window.keyframes, keyframe)),
         ids=np.concatenate((window.ids, ids)),
-        measurements=np.concatenate((window.measurements, np.column_stack((ranges, bearings)))),
+        measurements=np.concatenate((window.measurements, read)),
         own=together([(len(window.ids), window.own), (len(ids), noises)]),
         innovation=window.innovation.plus(expected),
+        effective=info.effective_sample_size,
         motions=_with_motion(window, increment, forward),
     )
 
@@ -211,25 +216,23 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
     """
     particles = window.particles
     # One layout, whatever the indexing left: each would be a form of the kernel of its own.
-    ids, means, covariances = by_landmark(
+    held = (
         particles.ids,
         np.ascontiguousarray(particles.means),
         np.ascontiguousarray(particles.covariances),
     )
     if running and window.sensor.range_white == window.sensor.bearing_white == 1.0:
-        return ParticleLandmarks(ids, means, covariances)
-    order, bounds = by_slot(ids, window.ids)
-    means, covariances = landmarks_along_paths(
-        means,
-        covariances,
+        return ParticleLandmarks(*by_landmark(*held))
+    found = landmarks_of_window(
+        *held,
         np.ascontiguousarray(window.paths),
-        bounds,
-        window.keyframes[order],
-        window.measurements[order],
-        own=window.own[order],
+        window.ids,
+        window.keyframes,
+        window.measurements,
+        own=window.own,
         noise=noise_of(window.sensor),
     )
-    return ParticleLandmarks(ids, means, covariances)
+    return ParticleLandmarks(*found)
 
 
 def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
