@@ -93,7 +93,11 @@ def _array_difference(
 def _close(a: object, b: object) -> bool:
     if isinstance(a, float) and isinstance(b, float):
         return math.isclose(a, b, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
-    return False
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(_close, a, b))
+    if isinstance(a, msgspec.Struct) and type(a) is type(b):
+        return _close(msgspec.structs.astuple(a), msgspec.structs.astuple(b))
+    return a == b
 
 
 def _text(value: object) -> str:

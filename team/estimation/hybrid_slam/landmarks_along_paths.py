@@ -72,8 +72,8 @@ def landmarks_of_window(
         bounds,
         keyframes[order],
         measurements[order],
-        own[order],
-        noise,
+        own=own[order],
+        noise=noise,
     )
     return ids, means, covariances
 
