@@ -216,15 +216,15 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
     """
     particles = window.particles
     # One layout, whatever the indexing left: each would be a form of the kernel of its own.
-    held = (
+    estimates = (
         particles.ids,
         np.ascontiguousarray(particles.means),
         np.ascontiguousarray(particles.covariances),
     )
     if running and window.sensor.range_white == window.sensor.bearing_white == 1.0:
-        return ParticleLandmarks(*by_landmark(*held))
+        return ParticleLandmarks(*by_landmark(*estimates))
     found = landmarks_of_window(
-        *held,
+        *estimates,
         np.ascontiguousarray(window.paths),
         window.ids,
         window.keyframes,
