@@ -2,7 +2,8 @@
 
 import threading
 import time
-from dataclasses import replace
+
+import msgspec
 
 from central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
 from central.desk.view.export import Viewing, for_viewer
@@ -53,7 +54,7 @@ def run_viewer(bus: Bus, stop: threading.Event) -> int:
                 bus.publish(boundary.note(error, sample, ""))
                 continue
             for shown in views:
-                bus.publish_raw(replace(shown, wall_ns=time.time_ns()))
+                bus.publish_raw(msgspec.structs.replace(shown, wall_ns=time.time_ns()))
                 published += 1
     judge(boundary, final)
     return published
