@@ -32,7 +32,7 @@ from team.estimation.map_joining.gauss_newton import (
     is_solvable,
     iterated,
 )
-from team.estimation.map_joining.markers import with_markers
+from team.estimation.map_joining.markers import unmarked, with_markers
 from team.estimation.map_joining.merging import Merge, ages, merge, sighted
 from team.estimation.map_joining.minima import (
     Minimum,
@@ -326,7 +326,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         islands={**merged.islands, main_key: last.best.island},
         iterations=last.best.iterations,
         change=last.best.change,
-        warnings=tuple(warnings(last)),
+        warnings=(*warnings(last), *unmarked(last.best.island)),
     )
 
 

@@ -22,14 +22,10 @@ def with_markers(island: Island) -> Island:
     """The island with a state for the marker of each landmark without a name that has none; an
     island with condensed submaps as it is.
     """
-    graph, sigma = island.graph, island.settings.common_bias_sigma.get("marker")
-    number = {
-        node: id_
-        for id_, node in graph.landmarks.items()
-        if id_ >= UNNAMED and id_ not in graph.common
-    }
-    if sigma is None or not number or graph.condensed is not None:
+    graph, number = island.graph, _unmarked(island)
+    if not number or graph.condensed is not None:
         return island
+    sigma = island.settings.common_bias_sigma["marker"]
     marked = [_numbers(each, number) for each in graph.submaps]
     first = len(graph.fixed)
     errors = dict.fromkeys(error for each in marked for error in each)
@@ -48,6 +44,31 @@ def with_markers(island: Island) -> Island:
         priors=(*graph.priors, *(Prior(node, np.zeros(1), certainty) for node in nodes.values())),
     )
     return replace(island, graph=graph, state=np.append(island.state, np.zeros(count)))
+
+
+def unmarked(island: Island) -> list[str]:
+    """Warns, in words, of landmarks whose marker's error the full solution does not have."""
+    graph, count = island.graph, len(_unmarked(island))
+    if not count or not any(bias == "range_scale" for _, bias in graph.biases):
+        return []
+    return [
+        f"{count} landmarks without a name lack the error of their marker, since old submaps are "
+        "condensed: the map's covariance may be too small"
+    ]
+
+
+def _unmarked(island: Island) -> dict[int, int]:
+    """The number of each node of a landmark without a name that has no state for its marker; none
+    where the settings have none.
+    """
+    graph = island.graph
+    if "marker" not in island.settings.common_bias_sigma:
+        return {}
+    return {
+        node: id_
+        for id_, node in graph.landmarks.items()
+        if id_ >= UNNAMED and id_ not in graph.common
+    }
 
 
 def _numbers(submap: Joined, number: dict[int, int]) -> list[int]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from team.association import AssociationProfile
 from team.config import UNNAMED
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
@@ -12,6 +13,7 @@ from team.estimation.gaussian import packed, unpacked
 from team.estimation.geometry import compose, inverse, transformed
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import marginals
+from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
 from team.estimation.map_joining.markers import with_markers
@@ -217,18 +219,27 @@ def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():
     assert (np.count_nonzero(rows[1:], axis=1) == 2).all()
 
 
-def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
-    submaps, starts, _ = carts(6, submaps=3, marker=MARKER)
-    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
-    named = fold_of(submaps, starts, options).main
-    hidden = [replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids)) for x in submaps]
-    fold = folded(started(started(EMPTY_FOLD, starts[0]), starts[1]), hidden, options)
-    assert len(fold.main.graph.landmarks) == 5 * len(hidden)
+def hidden(submaps, starts, options):
+    """The fold without the landmarks' names, with those that are one united by hand; and the
+    number of each.
+    """
+    unnamed = [replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids)) for x in submaps]
+    fold = folded(started(started(EMPTY_FOLD, starts[0]), starts[1]), unnamed, options)
+    assert len(fold.main.graph.landmarks) == 5 * len(unnamed)
     number = fold.landmarks.number
     first = {each.local: own for each, own in reversed(number.items())}
     becomes = {own: first[each.local] for each, own in number.items()}
     graph, state = tied(fold.main.graph, fold.main.state, becomes)
-    joined, *_ = settled(with_markers(replace(fold.main, graph=graph, state=state)))
+    united = replace(fold.main, graph=graph, state=state)
+    return replace(fold, islands={fold.main_key: united}), first
+
+
+def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
+    submaps, starts, _ = carts(6, submaps=3, marker=MARKER)
+    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
+    named = fold_of(submaps, starts, options).main
+    fold, first = hidden(submaps, starts, options)
+    joined, *_ = settled(with_markers(fold.main))
     graph = joined.graph
     assert sorted(graph.common) == sorted(graph.landmarks) == sorted(first.values())
     assert len(graph.priors) == len(named.graph.priors)
@@ -239,6 +250,22 @@ def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
         ):
             at, known = graph.offset[nodes[own]], named.graph.offset[of[local]]
             assert joined.state[at] == pytest.approx(named.state[known], abs=1e-6)
+
+
+def test_a_map_says_that_landmarks_without_a_name_lack_the_error_of_their_marker():
+    submaps, starts, _ = carts(6, submaps=4, marker=MARKER)
+    options = JoinSettings(
+        bias_sigma=SIGMA,
+        common_bias_sigma={"marker": MARKER},
+        association=AssociationProfile(recent=1),
+    )
+    fold, _ = hidden(submaps, starts, options)
+    island, *_ = settled(fold.main)
+    old = condensed(replace(fold, islands={fold.main_key: island}), lag=2, begin=2)
+    assert old.departed
+    said = "5 landmarks without a name lack the error of their marker"
+    assert [each for each in converged(old, options).warnings if said in each]
+    assert not [each for each in converged(fold, options).warnings if "marker" in each]
 
 
 def _only_own_biases_are_discounted(graph):
