@@ -15,7 +15,7 @@ from central.fused import JOINT_LANDMARKS, version_entry
 from central.monitor import miscalibrations
 from central.rule import Tail
 from central.sent_priors import SentPriors
-from central.unnamed_landmarks import SHOWN, decisions_of, judgement_of, memberships_of
+from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
 from team.estimation.contribution import Stream
@@ -93,7 +93,7 @@ def team_map(
         withdrawn=withdrawn,
         covariance_scale=covariance_scale,
         heard=arrived,
-        memberships=memberships_of(fold.landmarks, None if tail == "final" else SHOWN),
+        memberships=memberships_of(fold.landmarks, tail == "final"),
         decisions=decisions_of(fold.landmarks),
         verdicts=tuple(judgement_of(v) for v in fold.landmarks.verdicts),
     )

@@ -237,7 +237,7 @@ class TickFold:
         members = self._inputs.tick(tick, self._gone)
         submaps = members.contributions
         unnamed = (each.stream for each in submaps if (each.local.ids >= UNNAMED).any())
-        is_named = not fold.landmarks.number
+        is_named = not fold.landmarks.are_there
         if fold.departed and is_named and (stream := next(unnamed, None)) is not None:
             raise CondensedError(stream)
         after = taken(fold, members, self.settings)

@@ -2,56 +2,75 @@
 back.
 """
 
+from collections.abc import Iterator
+from itertools import groupby
+
 import numpy as np
 
 from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
+from team.estimation.map_joining.association.member_log import (
+    KINDS,
+    LAST,
+    MemberRecord,
+    record_of,
+)
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 
-STEPS = ("", "track", "near", "sweep", "closure", "merge", "verdict")
+STEPS = ("", *KINDS)
 """The step that associated an unnamed landmark with a set, by its number on the wire."""
 DECISIONS = 100
 """Most decisions in a map, and most that wait."""
 LARGEST = 1e300
-SHOWN = 12
+SHOWN = 1 + LAST
 """Most members of a landmark in a running map; it may have as many as the run has submaps."""
 
 
-def memberships_of(landmarks: Landmarks, most: int | None = None) -> tuple[m.Membership, ...]:
-    """The table of unnamed landmarks: member, identity, step; of each landmark at most so many
-    members, its first and its last ones.
+def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
+    """The table of unnamed landmarks: member, identity, step; of each landmark all members, or its
+    first and its last ones.
     """
-    streams: dict[tuple[str, int], list[LocalLandmark]] = {}
-    named = landmarks.number if most is None else _few(landmarks, most)
-    for member in sorted(named):
-        streams.setdefault((member.robot, member.incarnation), []).append(member)
+    entries = sorted(_all(landmarks) if every else _few(landmarks))
     table = []
-    for (robot, incarnation), members in streams.items():
-        ties = [landmarks.ties.get(landmarks.number[member]) for member in members]
-        figures = [(0.0, 0.0, 0.0) if t is None else (t.llr, t.rival, t.sd) for t in ties]
+    for (robot, incarnation), group in groupby(entries, key=lambda entry: entry[0][:2]):
+        of = list(group)
+        figures = [figures for *_, figures in of]
         table.append(
             m.Membership(
                 robot=robot,
                 incarnation=incarnation,
-                sequences=from_ids(np.array([x.sequence for x in members], np.uint32)),
-                locals=from_ids(np.array([x.local for x in members], np.uint32)),
-                identities=from_ids(
-                    np.array([landmarks.identity(x) or 0 for x in members], np.uint32)
-                ),
-                steps=bytes(0 if t is None else STEPS.index(t.kind) for t in ties),
+                sequences=from_ids(np.array([each.sequence for each, *_ in of], np.uint32)),
+                locals=from_ids(np.array([each.local for each, *_ in of], np.uint32)),
+                identities=from_ids(np.array([id_ for _, id_, *_ in of], np.uint32)),
+                steps=bytes(step for _, _, step, _ in of),
                 figures=from_floats(np.clip(np.array(figures), -LARGEST, LARGEST)),
             )
         )
     return tuple(table)
 
 
-def _few(landmarks: Landmarks, most: int) -> list[LocalLandmark]:
-    """The first and the last members of each landmark, `most` in all."""
-    return [
-        member
-        for members in landmarks.sets.values()
-        for member in (*members[:1], *members[1:][1 - most :])
-    ]
+Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
+"""A member, its identity, the index in STEPS of its step, and the figures of that."""
+
+
+def _few(landmarks: Landmarks) -> Iterator[Entry]:
+    for id_, members in landmarks.present.items():
+        for member in (members.first, *members.last):
+            yield _entry(member, id_)
+
+
+def _all(landmarks: Landmarks) -> Iterator[Entry]:
+    identities = landmarks.identities()
+    for stream, sequence, rows in landmarks.log.all_rows():
+        for row in rows.tolist():
+            yield _entry(record_of(stream, sequence, row), identities[row[1]])
+
+
+def _entry(member: MemberRecord, id_: int) -> Entry:
+    name, tie = member
+    if tie is None:
+        return name, id_, 0, (0.0, 0.0, 0.0)
+    return name, id_, STEPS.index(tie.kind), (tie.llr, tie.rival, tie.sd)
 
 
 def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:

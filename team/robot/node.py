@@ -312,10 +312,16 @@ class RobotNode:
         return self._sound(self._go_on())
 
     def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """The messages that every receiver accepts; others are withheld and named."""
+        """The messages that every receiver accepts; others are withheld and named.
+
+        Of a map what rounding has spoilt is left out.
+        """
         sound = []
         for each in out:
             why = unsound(each.message)
+            if why is not None and isinstance(each.message, m.MapEstimate):
+                each = each._replace(message=translate.receivable(each.message)[0])
+                why = unsound(each.message)
             if why is None:
                 sound.append(each)
             else:

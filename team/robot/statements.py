@@ -94,10 +94,7 @@ class MessageWriter:
         landmarks: LandmarkGaussian,
         kind: Literal["joint", "blocks"],
     ) -> Outgoing:
-        """The running map, with the joint covariance or with each landmark's own.
-
-        Landmarks whose covariance rounding has spoilt are left out.
-        """
+        """The running map, with the joint covariance or with each landmark's own."""
         joint = kind == "joint"
         message = m.MapEstimate(
             stamp_ns=stamp_ns,
@@ -110,7 +107,7 @@ class MessageWriter:
             means=from_floats(landmarks.means),
             covariance=translate.covariance_bytes(landmarks.covariance, joint=joint),
         )
-        return Outgoing(ch.OWN_MAP, self.robot, translate.receivable(message)[0])
+        return Outgoing(ch.OWN_MAP, self.robot, message)
 
     def pose(
         self,

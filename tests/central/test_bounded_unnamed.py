@@ -10,9 +10,11 @@ from central.config import CentralConfig
 from central.tick_fold import TickFold
 from team import translate
 from team.association import AssociationProfile
+from team.config import UNNAMED
 from team.estimation.map_joining import auditing, condensing
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.relinearising import is_due
+from team.estimation.submap import LocalMap, Unnamed
 from team.wire.codec import encoded
 from team.wire.digest import digest_of
 from tests.estimation.map_joining.association.unnamed_worlds import circle, drive, wrong
@@ -30,19 +32,39 @@ def world():
     r = rng.uniform(17.0, 23.0, 32)
     landmarks = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
     submaps, truth = drive("r1", circle((0.0, 0.0), 20.0, 72, 2.0), landmarks, rng, reach=9.0)
-    messages = [
-        translate.submap_message(
-            "r1",
-            1,
-            each.sequence,
-            (10 * each.sequence + 1, 10 * each.sequence + 10),
-            (each.end_ns - 10**10, each.end_ns),
-            bytes(8),
-            each.local,
-        )
-        for each in submaps
-    ]
-    return messages, truth
+    return [message(each.sequence, each.end_ns, each.local) for each in submaps], truth
+
+
+@pytest.fixture(scope="module")
+def cluttered():
+    """A robot that sees the same sixteen landmarks all the time, with a false one in every other
+    submap."""
+    rng = np.random.default_rng(6)
+    angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
+    landmarks = 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    submaps, truth = drive("r1", circle((0.0, 0.0), 3.0, 80, 5.0), landmarks, rng, reach=20.0)
+    return [
+        message(each.sequence, each.end_ns, with_clutter(each.local, rng) if k % 2 else each.local)
+        for k, each in enumerate(submaps)
+    ], truth
+
+
+def with_clutter(local, rng):
+    """The submap with one landmark more, that is none."""
+    n = len(local.ids) + 1
+    at = rng.uniform(-5.0, 5.0, 2)
+    return LocalMap(
+        (UNNAMED + np.arange(n)).astype(np.uint32),
+        np.concatenate([local.mean, at]),
+        np.diag([*np.diag(local.covariance), 1e-3, 1e-3]),
+        unnamed=Unnamed(np.full(n, 5, np.uint32), np.ones((n, 1), np.bool_)),
+    )
+
+
+def message(sequence, end_ns, local):
+    counters = (10 * sequence + 1, 10 * sequence + 10)
+    stamps = (end_ns - 10**10, end_ns)
+    return translate.submap_message("r1", 1, sequence, counters, stamps, bytes(8), local)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -68,6 +90,7 @@ def bits(fold):
     old = fold.main.graph.condensed
     seen = [str(each.contribution.key) for each in fold.main.graph.observed]
     parts = [fold.main.state.tobytes(), *map(str.encode, seen), str(fold.landmarks.sets).encode()]
+    parts.append(str(fold.landmarks.present).encode())
     return b"".join(parts if old is None else [*parts, old.information.tobytes()])
 
 
@@ -113,3 +136,34 @@ def test_late_submaps_give_the_same_bytes(world):
     ticks.add(held, digest_of(encoded(held)))
     ticks.take_until(float("inf"))
     assert bits(ticks.fold) == wanted
+
+
+def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_same_bytes(
+    cluttered,
+):
+    messages, truth = cluttered
+    halves = [folded(messages[:count]).fold for count in (40, 80)]
+    nodes = [len(each.main.graph.landmarks) for each in halves]
+    false = [40 // 2, 80 // 2]
+    assert nodes[1] - nodes[0] < 0.3 * (false[1] - false[0])
+    fold = halves[1]
+    confirmed = {id_: of for id_, of in fold.landmarks.present.items() if of.size > 1}
+    assert len({truth[of.first.name] for of in confirmed.values()}) == 16
+    assert fold.landmarks.present.keys() == fold.main.graph.landmarks.keys()
+    assert len(fold.landmarks.sets) == 16 + false[1]
+    late = TickFold(CONFIG)
+    for each in [*messages[:50], *messages[51:], messages[50]]:
+        late.add(each, digest_of(encoded(each)))
+        late.take_until(messages[50].stamp_ns - 1 if each is not messages[50] else float("inf"))
+    assert bits(late.fold) == bits(fold)
+
+
+def test_what_was_given_up_is_there_when_all_is_linearised_again(cluttered):
+    messages, _ = cluttered
+    ticks = folded(messages)
+    again = ticks._inputs.relinearised(ticks.fold, float("inf"), ())
+    assert again.departed == 0
+    assert again.landmarks.present.keys() == again.main.graph.landmarks.keys()
+    assert again.main.graph.landmarks.keys() == ticks.fold.landmarks.sets.keys()
+    cost = again.main.cost / sum(again.main.graph.dimensions)
+    assert cost < 1.1, "each lies where its only submap has it"

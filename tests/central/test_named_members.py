@@ -3,23 +3,40 @@
 import numpy as np
 
 from central.unnamed_landmarks import SHOWN, memberships_of
-from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark
+from team.config import UNNAMED
+from team.estimation.contribution import Contribution
+from team.estimation.map_joining.association.landmarks import (
+    NO_LANDMARKS,
+    Landmarks,
+    MergeRecord,
+    founded,
+    united,
+)
+from team.estimation.submap import LocalMap
 from team.wire.arrays import ids
 
 
 def landmarks(submaps: int) -> Landmarks:
     """Two landmarks that one robot sees in every submap, as one set each."""
-    number, sets = {}, {}
-    for local in range(2):
-        members = tuple(LocalLandmark("r1", 1, k, local) for k in range(submaps))
-        sets[2**31 + local] = members
-        number |= dict.fromkeys(members, 2**31 + local)
-    return Landmarks(number, sets)
+    ids = (UNNAMED + np.arange(2)).astype(np.uint32)
+    local = LocalMap(ids, np.zeros(7), np.eye(7))
+    found = NO_LANDMARKS
+    for k in range(submaps):
+        each = Contribution("r1", 1, k, k, local)
+        found, numbers = founded(found, [each])
+        if not k:
+            first = numbers[each.key]
+            continue
+        pairs = zip(numbers[each.key], first, strict=True)
+        found, _ = united(
+            found, [(own, MergeRecord("track", into, 5.0, k, 0.1, k)) for own, into in pairs]
+        )
+    return found
 
 
 def test_what_a_running_map_names_does_not_grow_with_the_run() -> None:
     for submaps in (100, 1000):
-        (few,) = memberships_of(landmarks(submaps), SHOWN)
+        (few,) = memberships_of(landmarks(submaps), every=False)
         (every,) = memberships_of(landmarks(submaps))
         assert len(ids(few.sequences, "sequences")) == 2 * SHOWN
         assert len(ids(every.sequences, "sequences")) == 2 * submaps
@@ -30,4 +47,4 @@ def test_what_a_running_map_names_does_not_grow_with_the_run() -> None:
 
 def test_a_landmark_of_few_submaps_is_named_as_in_the_final_map() -> None:
     for submaps in (1, 2, SHOWN):
-        assert memberships_of(landmarks(submaps), SHOWN) == memberships_of(landmarks(submaps))
+        assert memberships_of(landmarks(submaps), every=False) == memberships_of(landmarks(submaps))

@@ -9,13 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from team import translate
 from team.pairs import PAIRS
 from team.rejection import Rejection
+from team.robot import node as robot_node
 from team.robot import pace
 from team.robot.node import RobotNode
 from team.wire import channels as ch
+from team.wire import codec
 from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, from_ids
+from team.wire.arrays import floats, from_floats, from_ids, ids
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 from team.wire.digest import digest_of
@@ -413,6 +416,31 @@ def test_under_feedback_a_lost_centre_is_not_waited_for():
     assert not of(out, ch.ROBOT_DONE)
     out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
     assert len(of(out, ch.ROBOT_DONE)) == 1
+
+
+def test_a_sound_map_is_checked_once_and_of_a_spoilt_one_the_rest_is_sent(monkeypatch):
+    checked = []
+
+    def noted(message):
+        checked.append(message)
+        return codec.unsound(message)
+
+    for module in (robot_node, translate):
+        monkeypatch.setattr(module, "unsound", noted)
+    sent = of(driven(RobotNode(config()), MEASUREMENTS), ch.OWN_MAP)
+    assert len(sent) > 1
+    assert [x for x in checked if isinstance(x, m.MapEstimate)] == sent
+
+    def spoilt(covariance, *, joint):
+        blocks = translate.blocks_of(covariance)
+        blocks[0, 0, 1] = blocks[0, 1, 0] = 1e9
+        return translate.block_bytes(blocks)
+
+    monkeypatch.setattr(translate, "covariance_bytes", spoilt)
+    rest = of(driven(RobotNode(config()), MEASUREMENTS), ch.OWN_MAP)
+    assert [ids(x.ids, "ids")[1:].tolist() for x in sent] == [
+        ids(x.ids, "ids").tolist() for x in rest
+    ]
 
 
 def test_the_final_map_ends_it():

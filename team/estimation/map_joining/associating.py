@@ -66,11 +66,11 @@ class IslandView:
         nodes = np.array([node for _, node in ordered], np.int64)
         self.place = np.full(len(graph.fixed), -1, np.int64)
         self.place[nodes] = np.arange(len(nodes))
-        self.seen_by = [self.place[each.landmarks] for each in graph.observed]
+        self.seen_by = [self.place[each.known] for each in graph.observed]
         mean, covariance = joint_marginal(island, nodes.tolist())
         self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
         self._beside = self.place[graph.memory.pairs]
-        apart = _apart(graph, self.seen_by, self.ids, landmarks, self.place_of)
+        apart = _apart(graph, self.place, self.ids, landmarks, self.place_of)
         one, two = self._beside[graph.memory.distinct].T
         apart[one, two] = apart[two, one] = True
         points = mean.reshape(-1, 2)
@@ -92,9 +92,10 @@ class IslandView:
 
     def views(self, k: int) -> list[Indices]:
         """Indices of the unnamed landmarks that each keyframe of submap k observed together."""
-        local = self.island.graph.observed[k].contribution.local
-        places = self.seen_by[k][local.ids >= UNNAMED]
-        return [places[each] for each in local.unnamed.views]
+        seen = self.island.graph.observed[k]
+        nodes = seen.landmarks[seen.contribution.local.ids >= UNNAMED]
+        views = (nodes[each] for each in seen.contribution.local.unnamed.views)
+        return [self.place[view[view >= 0]] for view in views]
 
     def take(self, pairs: Iterable[Pair], joint: Joint, kind: str) -> None:
         """Records the pairs that were merged, and the step (`kind`) that merged them."""
@@ -184,7 +185,7 @@ class IslandView:
 
 def _apart(
     graph: Graph,
-    seen_by: Sequence[Indices],
+    place: Indices,
     ids: Sequence[int],
     landmarks: Landmarks,
     place_of: Mapping[int, int],
@@ -194,9 +195,10 @@ def _apart(
     """
     named = np.array(ids) < UNNAMED
     apart = named[:, None] & named[None, :]
-    for submap, places in zip(graph.observed, seen_by, strict=True):
-        one, two = submap.contribution.local.distinct
-        apart[places[one], places[two]] = True
+    for submap in graph.observed:
+        one, two = (submap.landmarks[each] for each in submap.contribution.local.distinct)
+        both = (one >= 0) & (two >= 0)
+        apart[place[one[both]], place[two[both]]] = True
     for first, second, same in landmarks.verdicts:
         here, there = (place_of.get(landmarks.identity(each) or -1) for each in (first, second))
         if not same and here is not None and there is not None:
@@ -282,8 +284,9 @@ def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]
 
 
 def _unnamed(view: IslandView, k: int) -> Int64[np.ndarray, " _"]:
-    ids = view.island.graph.observed[k].contribution.local.ids
-    places: Int64[np.ndarray, " _"] = view.seen_by[k][ids >= UNNAMED]
+    seen = view.island.graph.observed[k]
+    nodes = seen.landmarks[seen.contribution.local.ids >= UNNAMED]
+    places: Int64[np.ndarray, " _"] = view.place[nodes[nodes >= 0]]
     return places
 
 

@@ -73,9 +73,9 @@ def share_now(fold: Fold, opened: Opened) -> float | None:
         of = submap.contribution
         first, last = newer.get(of.stream, (OPEN, -OPEN))
         if first <= of.sequence <= last:
-            sides[0, submap.landmarks] = True
+            sides[0, submap.known] = True
         elif not first - margin <= of.sequence <= last + margin:
-            sides[1, submap.landmarks] = True
+            sides[1, submap.known] = True
     known = [graph.landmarks[id_] for id_ in sorted(graph.landmarks)]
     both = [node for node in known if sides[:, node].all()]
     at = _points(island, both)

@@ -32,7 +32,7 @@ from team.estimation.map_joining.condensed_factor import (
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
-from team.estimation.map_joining.memory import MOST, Observed
+from team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
 from team.estimation.map_joining.path_elimination import (
     MarkedFactors,
     nodes_of,
@@ -58,12 +58,13 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
 
     Nothing is condensed whose poses can not be eliminated. Unnamed landmarks stay nodes: nothing is
     condensed while a team that has some has fewer submaps than landmarks. What is condensed is then
-    remembered (`memory`), all of it until the last closure can no longer be undone.
+    remembered (`memory`), all of it until the last closure can no longer be undone; landmarks that
+    hardly anything confirms are given up.
     """
     key = fold.main_key
     if key is None or fold.size <= begin:
         return fold
-    unnamed = bool(fold.landmarks.number)
+    unnamed = fold.landmarks.are_there
     island = fold.islands[key]
     if unnamed:
         lag = max(lag, island.settings.association.recent)
@@ -74,13 +75,17 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
         return fold
     others = (each for at, each in fold.islands.items() if at != key)
     apart = {id_ for each in others for id_ in each.graph.landmarks}
+    memory, given_up = NOTHING, np.zeros(0, np.int64)
+    if unnamed:
+        memory, given_up = _memory(island.graph, leaving, fold)
     try:
-        smaller = _condensed(island, leaving, apart, ALL_AWAKE if unnamed else first)
+        smaller = _condensed(island, leaving, apart, ALL_AWAKE if unnamed else first, given_up)
     except UNSOLVABLE:
         return fold
     if unnamed:
-        smaller = _remembering(smaller, island.graph, leaving, forgets=not fold.audits)
+        smaller = _remembering(smaller, memory, island.graph, forgets=not fold.audits)
     gone = smaller.graph.gone
+    left = island.graph.landmarks.keys() - smaller.graph.landmarks.keys()
     return replace(
         fold,
         islands={**fold.islands, key: smaller},
@@ -88,22 +93,44 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
             each for each in fold.contributions if each.sequence >= gone.get(each.stream, 0)
         ),
         waiting=tuple(each for each in fold.waiting if each.sequence >= gone.get(each.stream, 0)),
+        landmarks=fold.landmarks.without(left) if len(given_up) else fold.landmarks,
         departed=fold.departed + int(leaving.sum()),
     )
 
 
-def _remembering(
-    smaller: Island, before: Graph, leaving: Bool[np.ndarray, " F"], *, forgets: bool
-) -> Island:
-    """The condensed island with a memory of the submaps that it had before."""
+def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[Memory, Indices]:
+    """The graph's memory with the submaps that leave, and the landmarks that are given up: none
+    while a closure is audited, and none that an operator has judged.
+    """
+    counts, stays = np.zeros(len(graph.fixed), np.int64), np.zeros(len(graph.fixed), np.bool_)
+    before = {} if graph.condensed is None else graph.condensed.departed.believed
+    for id_, node in graph.landmarks.items():
+        counts[node] = before.get(id_, 0)
+    taken = []
+    for submap, leaves in zip(graph.submaps, leaving.tolist(), strict=True):
+        nodes = submap.landmarks
+        if leaves:
+            counts[nodes] += 1
+            taken.append(Observed(submap.contribution, nodes, counts[nodes]))
+        else:
+            stays[nodes] = True
+    memory = graph.memory.longer(taken)
+    if fold.audits:
+        return memory, np.zeros(0, np.int64)
+    for member in (each for verdict in fold.landmarks.verdicts for each in verdict[:2]):
+        judged = fold.landmarks.identity(member)
+        if judged is not None and judged in graph.landmarks:
+            stays[graph.landmarks[judged]] = True
+    return memory, memory.given_up(counts, stays, MOST)
+
+
+def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
+    """The condensed island with this memory, which has the nodes of the graph before."""
     graph = smaller.graph
     node_of = np.full(len(before.fixed), -1, np.int64)
     for id_, node in before.landmarks.items():
-        node_of[node] = graph.landmarks[id_]
-    taken = (before.submaps[f] for f in np.flatnonzero(leaving))
-    memory = graph.memory.longer(
-        [Observed(each.contribution, node_of[each.landmarks]) for each in taken]
-    )
+        node_of[node] = graph.landmarks.get(id_, -1)
+    memory = memory.renumbered(node_of)
     if forgets:
         memory = memory.shortened(len(graph.fixed), MOST)
     return replace(smaller, graph=replace(graph, memory=memory))
@@ -128,12 +155,16 @@ def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
 
 
 def _condensed(
-    island: Island, leaving: Bool[np.ndarray, " F"], apart: Collection[int], first: int
+    island: Island,
+    leaving: Bool[np.ndarray, " F"],
+    apart: Collection[int],
+    first: int,
+    given_up: Indices,
 ) -> Island:
     graph, before = island.graph, island.graph.condensed
     rests = idle(graph, ~leaving, apart, first)
     eliminated = _eliminated(graph, leaving)
-    eliminated[rests] = True
+    eliminated[rests] = eliminated[given_up] = True
     seen = np.array(
         [eliminated[each.observer] or eliminated[each.teammate] for each in graph.sightings],
         np.bool_,
@@ -162,7 +193,7 @@ def _condensed(
         cost=cost - parts.lowered,
         submaps=int(leaving.sum()) + (0 if before is None else before.submaps),
         redundancy=measured - unknowns + (0 if before is None else before.redundancy),
-        departed=_departed(island, leaving, seen, prior),
+        departed=_departed(island, leaving, seen, prior, given_up),
         resting=beside(island, union, parts, rests),
     )
     stays = np.repeat(~eliminated, np.diff(graph.offset))
@@ -190,6 +221,7 @@ def _departed(
     leaving: Bool[np.ndarray, " F"],
     seen: Bool[np.ndarray, " S"],
     prior: Bool[np.ndarray, " priors"],
+    given_up: Indices,
 ) -> Departed:
     graph = island.graph
     before = NOBODY if graph.condensed is None else graph.condensed.departed
@@ -201,6 +233,8 @@ def _departed(
         nodes = graph.submaps[f].landmarks[island.landmark_weight[begin:end] >= BELIEVED]
         for id_ in (id_of[node] for node in nodes.tolist()):
             believed[id_] = believed.get(id_, 0) + 1
+    for node in given_up.tolist():
+        believed.pop(id_of[node], None)
     submaps = (*before.submaps, *_chosen(now.submaps, leaving))
     robots = _sums(before, now, leaving, seen, prior)
     return Departed(robots, newest(submaps), believed, _paths(island, before, leaving))

@@ -58,7 +58,7 @@ def recognised(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
     """The fold after data association of a tick's submaps; unchanged where no landmark is
     unnamed.
     """
-    if not fold.landmarks.sets:
+    if not fold.landmarks.are_there:
         return fold
     fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
     return matched(associated(fold, contributions), contributions)
@@ -160,9 +160,9 @@ def _by_members(
     landmarks: Landmarks, pairs: Sequence[tuple[int, int]]
 ) -> tuple[tuple[LocalLandmark, LocalLandmark], ...]:
     """Pairs of landmarks by their smallest members; pairs with one named landmark are left out."""
-    sets = landmarks.sets
+    of = landmarks.present
     return tuple(
-        (sets[one][0], sets[two][0]) for one, two in pairs if sets.get(one) and sets.get(two)
+        (of[one].first.name, of[two].first.name) for one, two in pairs if one in of and two in of
     )
 
 

@@ -5,6 +5,12 @@ has: which landmarks it has, which of them a keyframe saw together, and by that 
 newest MOST submaps of each landmark are remembered whole, and no others: how many they are depends
 on the landmarks, not on the duration of the run. Whatever counts submaps counts no farther than
 that. Of the forgotten ones the pairs of landmarks remain that they kept apart.
+
+False detections found landmarks that hardly anything observes again; remembered for ever, they
+would slow a team down for as long as it runs. A landmark of n < MOST submaps is given up when every
+landmark of MOST or more, that was observed with it when it was observed last, has been observed by
+MOST n submaps since: of those that look there fewer than one in MOST have found it. What is there
+nevertheless is founded anew when it is observed.
 """
 
 from collections.abc import Sequence
@@ -22,11 +28,24 @@ MOST = 8
 """Number of newest condensed submaps of each landmark that are remembered."""
 
 
+NO_COUNTS: Indices = np.zeros(0, np.int64)
+
+
 class Observed(NamedTuple):
-    """A submap, and the node of each of its landmarks."""
+    """A submap, and the node of each of its landmarks; −1 for one that was given up.
+
+    counts: of each landmark, how many condensed submaps had it, this one included; none of a submap
+        that is not condensed.
+    """
 
     contribution: Contribution
     landmarks: Indices
+    counts: Indices
+
+    @property
+    def known(self) -> Indices:
+        """The nodes of its landmarks without those that were given up."""
+        return self.landmarks[self.landmarks >= 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +62,38 @@ class Memory:
     distinct: Bool[np.ndarray, " P"] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def renumbered(self, node_of: Indices) -> "Memory":
-        """The same with other numbers of nodes; two landmarks that become one are no pair."""
-        submaps = tuple(each._replace(landmarks=node_of[each.landmarks]) for each in self.submaps)
-        return replace(_unique(node_of[self.pairs], self.distinct), submaps=submaps)
+        """The same with other numbers of nodes, −1 for one that is given up; two landmarks that
+        become one are no pair.
+        """
+        to = np.append(node_of, -1)
+        submaps = tuple(each._replace(landmarks=to[each.landmarks]) for each in self.submaps)
+        return replace(_unique(to[self.pairs], self.distinct), submaps=submaps)
 
     def longer(self, submaps: Sequence[Observed]) -> "Memory":
         """With these submaps behind the others."""
         return replace(self, submaps=(*self.submaps, *submaps))
+
+    def given_up(self, counts: Indices, stays: Bool[np.ndarray, " nodes"], most: int) -> Indices:
+        """The nodes of the landmarks that are given up, ascending.
+
+        counts: by node, how many condensed submaps have had it. stays: which are not given up.
+        """
+        if not self.submaps:
+            return np.zeros(0, np.int64)
+        size = [len(each.landmarks) for each in self.submaps]
+        of = np.repeat(np.arange(len(size)), size)
+        node = np.concatenate([each.landmarks for each in self.submaps])
+        before = np.concatenate([each.counts for each in self.submaps])
+        of, node, before = (each[node >= 0] for each in (of, node, before))
+        now = counts[node]
+        well_known = now >= most
+        since = np.full(len(size), -1)
+        since[of[well_known]] = np.iinfo(np.int64).max
+        np.minimum.at(since, of[well_known], (now - before)[well_known])
+        last = np.zeros(len(counts), np.int64)
+        np.maximum.at(last, node, of)
+        gone = ~well_known & ~stays[node] & (last[node] == of) & (since[of] >= most * now)
+        return np.unique(node[gone])
 
     def shortened(self, nodes: int, most: int) -> "Memory":
         """Without the submaps that are among the newest `most` of none of their landmarks.
@@ -59,8 +103,8 @@ class Memory:
         newer = np.zeros(nodes, np.int64)
         remembered, forgotten = [], []
         for each in reversed(self.submaps):
-            if (newer[each.landmarks] < most).any():
-                newer[each.landmarks] += 1
+            if (newer[each.known] < most).any():
+                newer[each.known] += 1
                 remembered.append(each)
             else:
                 forgotten.append(each)
@@ -86,7 +130,7 @@ def _unique(pairs: Int64[np.ndarray, "P 2"], distinct: Bool[np.ndarray, " P"]) -
     if not len(pairs):
         return NOTHING
     pairs = np.sort(pairs, axis=1)
-    two = pairs[:, 0] != pairs[:, 1]
+    two = (pairs[:, 0] != pairs[:, 1]) & (pairs[:, 0] >= 0)
     pairs, distinct = pairs[two], distinct[two]
     order = np.lexsort((~distinct, pairs[:, 1], pairs[:, 0]))
     pairs, distinct = pairs[order], distinct[order]

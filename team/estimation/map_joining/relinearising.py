@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from team.estimation.contribution import Contribution, Key, Stream
-from team.estimation.geometry import compose
+from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.association.landmarks import Landmarks, members_of
 from team.estimation.map_joining.condensed_factor import EliminatedPath
 from team.estimation.map_joining.condensing import BEGIN
 from team.estimation.map_joining.gauss_newton import (
@@ -28,7 +27,7 @@ from team.estimation.map_joining.gauss_newton import (
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.landmark_view import known, points_of
 from team.estimation.map_joining.merging import ages, sighted
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
 
 Values = Float[np.ndarray, " _"]
 
@@ -65,10 +64,12 @@ def relinearised(
     old = None if key is None else fold.islands[key].graph.condensed
     if key is None or old is None or fold.refused or fold.set_aside:
         return fold
-    island = fold.islands[key]
+    island, landmarks, numbers = fold.islands[key], fold.landmarks, NO_NUMBERS
+    if landmarks.are_there:
+        landmarks, numbers = landmarks.restored(contributions)
     try:
         with np.errstate(all="ignore"):
-            raw = _raw(island, fold, contributions, old.departed.paths)
+            raw = _raw(island, fold, contributions, old.departed.paths, numbers)
             raw, waiting = sighted(raw, sightings)
             for _ in range(SOLVED):
                 raw = iterated(raw)
@@ -83,6 +84,7 @@ def relinearised(
         islands={**fold.islands, key: raw},
         contributions=tuple(sorted([*active, *contributions], key=lambda each: each.key)),
         waiting=tuple(sorted([*others, *waiting], key=lambda each: each.key)),
+        landmarks=landmarks,
         departed=0,
     )
 
@@ -92,6 +94,7 @@ def _raw(
     fold: Fold,
     contributions: Sequence[Contribution],
     paths: Mapping[Stream, EliminatedPath],
+    numbers: Mapping[Key, Sequence[int]],
 ) -> Island:
     """The graph of all submaps, each node at its state in the island or where it was when
     condensed.
@@ -104,7 +107,7 @@ def _raw(
         fold.starts,
         settings.bias_sigma,
         settings.common_bias_sigma,
-        _numbers(fold.landmarks, contributions),
+        numbers,
     )
     state, fixed = state.copy(), full.fixed.copy()
 
@@ -120,11 +123,16 @@ def _raw(
         path = [*left.poses, *(value(node) for node in nodes)]
         for node, pose in zip(full.streams[stream], path, strict=True):
             put(node, pose)
-    for contribution, members, *_ in full.submaps:
-        start = state[full.offset[members[0]] : full.offset[members[0]] + 3]
-        for at, local in zip(members[2:].tolist(), contribution.local.nodes, strict=False):
-            put(at, compose(start, local))
     ids = known(island)
+    given_up = {full.landmarks[id_] for id_ in full.landmarks.keys() - set(ids)}
+    for submap in full.submaps:
+        local, members = submap.contribution.local, submap.nodes
+        start = state[full.offset[members[0]] : full.offset[members[0]] + 3]
+        for at, pose in zip(members[2:].tolist(), local.nodes, strict=False):
+            put(at, compose(start, pose))
+        for at, point in zip(submap.landmarks.tolist(), local.landmarks, strict=True):
+            if at in given_up:
+                put(at, transformed(start, point))
     for id_, point in zip(ids, points_of(island, ids), strict=True):
         put(full.landmarks[id_], point)
     pairs = [(full.biases[of], node) for of, node in graph.biases.items()]
@@ -133,16 +141,3 @@ def _raw(
         put(node, value(own))
     age = np.full(len(full.submaps), FULL_AGE)
     return Island(replace(full, fixed=fixed), state, age, ages(0), settings)
-
-
-def _numbers(landmarks: Landmarks, contributions: Sequence[Contribution]) -> dict[Key, list[int]]:
-    """For submaps with unnamed landmarks, the present identity of each of their landmarks."""
-    if not landmarks.number:
-        return {}
-    numbers = {}
-    for each in contributions:
-        members = zip(each.local.ids.tolist(), members_of(each), strict=True)
-        numbers[each.key] = [
-            id_ if member is None else landmarks.identity(member) or id_ for id_, member in members
-        ]
-    return numbers

@@ -22,7 +22,7 @@ from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
 from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
-from team.estimation.map_joining.memory import NOTHING, Memory, Observed
+from team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from team.estimation.map_joining.priors_kernel import PriorFactors
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
@@ -152,7 +152,7 @@ class Graph:
         """The submaps that data association examines: the condensed ones that are remembered, then
         the others.
         """
-        own = (Observed(each.contribution, each.landmarks) for each in self.submaps)
+        own = (Observed(each.contribution, each.landmarks, NO_COUNTS) for each in self.submaps)
         return (*self.memory.submaps, *own)
 
     @cached_property

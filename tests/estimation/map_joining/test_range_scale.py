@@ -226,8 +226,8 @@ def hidden(submaps, starts, options):
     unnamed = [replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids)) for x in submaps]
     fold = folded(started(started(EMPTY_FOLD, starts[0]), starts[1]), unnamed, options)
     assert len(fold.main.graph.landmarks) == 5 * len(unnamed)
-    number = fold.landmarks.number
-    first = {each.local: own for each, own in reversed(number.items())}
+    number = {members[0]: own for own, members in fold.landmarks.sets.items()}
+    first = {each.local: own for each, own in sorted(number.items(), reverse=True)}
     becomes = {own: first[each.local] for each, own in number.items()}
     graph, state = tied(fold.main.graph, fold.main.state, becomes)
     united = replace(fold.main, graph=graph, state=state)

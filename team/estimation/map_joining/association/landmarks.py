@@ -7,45 +7,33 @@ depends only on the order in which submaps are added.
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
+
+import numpy as np
 
 from team.config import UNNAMED
 from team.estimation.contribution import Contribution, Key, Stream, named
+from team.estimation.map_joining.association.member_log import (
+    LocalLandmark,
+    MemberLog,
+    MemberRecord,
+    MemberSummary,
+    MergeRecord,
+    record_of,
+)
+
+__all__ = [
+    "LocalLandmark",
+    "MergeRecord",
+]
 
 OPEN = 2**62
 """The last submap of a side that all later submaps belong to."""
 MOST_DECISIONS = 400
 """Number of newest decisions that are stored."""
-
-
-class LocalLandmark(NamedTuple):
-    """One local landmark of one submap."""
-
-    robot: str
-    incarnation: int
-    sequence: int
-    local: int
-
-    def __str__(self) -> str:
-        """`r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark."""
-        return f"{self.robot}/{self.incarnation}/{self.sequence}/{self.local}"
-
-
-class MergeRecord(NamedTuple):
-    """Why the set with this number was united with another: by which step and with which figures.
-
-    rival: the best log-likelihood ratio of a pair that excludes it.
-    stamp_ns: the last end of a submap in the tick.
-    """
-
-    kind: str
-    into: int
-    llr: float
-    rival: float
-    sd: float
-    stamp_ns: int
 
 
 class Decision(NamedTuple):
@@ -94,31 +82,79 @@ class Opened(NamedTuple):
 class Landmarks:
     """The sets of unnamed landmarks.
 
-    number: of each member, given when its submap was added.
-    sets: the members of each identity, ascending.
-    ties: the unions, by the number that was given up.
+    present: the members of each landmark that a map has, by its identity.
+    log: all members that there have ever been, those of landmarks that were given up included.
+    names: names that an operator has declared to be another one.
     waits: the last failed attempt of each stream.
     opened: the closures of the last tick.
     undone: closures that are not accepted again.
     """
 
-    number: Mapping[LocalLandmark, int] = field(default_factory=dict)
-    sets: Mapping[int, tuple[LocalLandmark, ...]] = field(default_factory=dict)
-    ties: Mapping[int, MergeRecord] = field(default_factory=dict)
+    present: Mapping[int, MemberSummary] = field(default_factory=dict)
+    log: MemberLog = field(default_factory=MemberLog)
+    names: Mapping[int, int] = field(default_factory=dict)
     decisions: tuple[Decision, ...] = ()
     waits: Mapping[tuple[Stream, Stream], Decision] = field(default_factory=dict)
     verdicts: tuple[Verdict, ...] = ()
     opened: tuple[Opened, ...] = ()
     undone: tuple[Opened, ...] = ()
 
+    @property
+    def are_there(self) -> bool:
+        """Whether any submap has had an unnamed landmark."""
+        return bool(self.log.streams)
+
+    @cached_property
+    def sets(self) -> Mapping[int, tuple[LocalLandmark, ...]]:
+        """All members of each identity, ascending; its time grows with the run."""
+        sets: dict[int, list[LocalLandmark]] = {}
+        identities = self.identities()
+        for stream, sequence, rows in self.log.all_rows():
+            for local, number in zip(rows["local"].tolist(), rows["number"].tolist(), strict=True):
+                member = LocalLandmark(*stream, sequence, local)
+                sets.setdefault(identities[number], []).append(member)
+        return {id_: tuple(sets[id_]) for id_ in sorted(sets)}
+
+    def identities(self) -> Mapping[int, int]:
+        """The identity of each number that was ever given; its time grows with the run."""
+        return {number: self._name_now(id_) for number, id_ in self.log.identities().items()}
+
     def identity(self, member: LocalLandmark) -> int | None:
         """The number of the landmark that a member belongs to; None where there is no such
         member.
         """
-        number = self.number.get(member)
-        while number is not None and number in self.ties:
-            number = self.ties[number].into
+        found = self.log.identity(member)
+        return None if found is None else self._name_now(found)
+
+    def _name_now(self, number: int) -> int:
+        while number in self.names:
+            number = self.names[number]
         return number
+
+    def without(self, ids: Collection[int]) -> "Landmarks":
+        """The landmarks without those that a map gives up."""
+        present = {id_: of for id_, of in self.present.items() if id_ not in ids}
+        return replace(self, present=present)
+
+    def restored(
+        self, contributions: Iterable[Contribution]
+    ) -> tuple["Landmarks", dict[Key, list[int]]]:
+        """The landmarks with those of these submaps that were given up; and the present identities
+        of each submap's landmarks.
+        """
+        identities, numbers = self.identities(), {}
+        back: dict[int, MemberSummary] = {}
+        for each in contributions:
+            found = each.local.ids.tolist()
+            at = len(found)
+            for row in reversed(self.log.rows(each.stream, each.sequence).tolist()):
+                at -= 1
+                id_ = found[at] = identities[row[1]]
+                if id_ not in self.present:
+                    one = MemberSummary(1, record_of(each.stream, each.sequence, row))
+                    back[id_] = back[id_].united(one) if id_ in back else one
+            numbers[each.key] = found
+        return replace(self, present={**self.present, **back}), numbers
 
     def decided(self, *decisions: Decision) -> "Landmarks":
         """The landmarks with further decisions, of which the newest are stored."""
@@ -149,34 +185,45 @@ def members_of(contribution: Contribution) -> list[LocalLandmark | None]:
 
 
 def founded(
-    landmarks: Landmarks, contributions: Iterable[Contribution]
+    landmarks: Landmarks, contributions: Sequence[Contribution]
 ) -> tuple[Landmarks, dict[Key, list[int]]]:
     """Adds each unnamed landmark of the submaps as a set of its own; returns also the numbers, per
     submap.
     """
-    numbers: dict[Key, list[int]] = {}
-    number, sets = None, None
-    for contribution in contributions:
-        ids = contribution.local.ids
-        if not len(ids) or ids[-1] < UNNAMED:
-            continue
-        if number is None or sets is None:
-            number, sets = dict(landmarks.number), dict(landmarks.sets)
-        given = []
-        for id_, member in zip(ids.tolist(), members_of(contribution), strict=True):
-            if member is None:
-                given.append(id_)
-                continue
-            own = number_of(member)
-            while own in sets or own in landmarks.ties:  # each number ever given is in either
-                own = UNNAMED | (own + 1) % UNNAMED
-            number[member] = own
-            sets[own] = (member,)
-            given.append(own)
-        numbers[contribution.key] = given
-    if number is None or sets is None:
-        return landmarks, numbers
-    return replace(landmarks, number=number, sets=sets), numbers
+    members = {each.key: members_of(each) for each in contributions}
+    names = [each for of in members.values() for each in of if each is not None]
+    if not names:
+        return landmarks, {}
+    present, log = dict(landmarks.present), landmarks.log
+    number = dict(zip(names, _numbers(log, names), strict=True))
+    for own in (tuple(each for each in of if each is not None) for of in members.values()):
+        if own:
+            robot, incarnation, sequence, _ = own[0]
+            locals_, numbers = [each.local for each in own], [number[each] for each in own]
+            log = log.founded((robot, incarnation), sequence, locals_, numbers)
+    present |= {own: MemberSummary(1, MemberRecord(each)) for each, own in number.items()}
+    return replace(landmarks, present=present, log=log), {
+        each.key: [
+            id_ if member is None else number[member]
+            for id_, member in zip(each.local.ids.tolist(), members[each.key], strict=True)
+        ]
+        for each in contributions
+        if len(each.local.ids) and each.local.ids[-1] >= UNNAMED
+    }
+
+
+def _numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[int]:
+    """The numbers of new members; one that was given before is passed over."""
+    numbers = [number_of(each) for each in members]
+    if len(set(numbers)) == len(numbers) and not log.given(np.array(numbers, np.uint32)).any():
+        return numbers
+    taken = set[int]()
+    for k, own in enumerate(numbers):
+        while own in taken or log.given(np.array([own], np.uint32))[0]:
+            own = UNNAMED | (own + 1) % UNNAMED
+        taken.add(own)
+        numbers[k] = own
+    return numbers
 
 
 def number_of(member: LocalLandmark) -> int:
@@ -194,7 +241,7 @@ def united(
         the number of its smallest member; where that is the identity to be given up, the tie is
         recorded in the other direction.
     """
-    sets, all_ties = dict(landmarks.sets), dict(landmarks.ties)
+    present, log, names = dict(landmarks.present), landmarks.log, dict(landmarks.names)
     becomes: dict[int, int] = {}
 
     def now(number: int) -> int:
@@ -202,15 +249,27 @@ def united(
             number = becomes[number]
         return number
 
+    def order(number: int) -> tuple[bool, tuple[LocalLandmark, ...]]:
+        return number >= UNNAMED, (present[number].first.name,) if number in present else ()
+
     for number, tie in ties:
         one, two = now(number), now(tie.into)
         if one == two:
             continue
-        stays, goes = sorted((one, two), key=lambda each: (each >= UNNAMED, sets.get(each, ())))
-        sets[stays] = tuple(sorted((*sets.get(stays, ()), *sets.pop(goes, ()))))
+        stays, goes = sorted((one, two), key=order)
+        tie = tie._replace(into=stays)
+        left = present.pop(goes, None)
+        if goes < UNNAMED:
+            names[goes] = stays
+        elif left is not None:
+            into = present[stays].first.name if stays >= UNNAMED else None
+            log = log.united(left.first.name, tie, into)
+            left = left._replace(first=left.first._replace(tie=tie))
+        if left is not None:
+            present[stays] = present[stays].united(left) if stays in present else left
         becomes[goes] = stays
-        all_ties[goes] = tie._replace(into=stays)
-    return replace(landmarks, sets=sets, ties=all_ties), {each: now(each) for each in becomes}
+    after = replace(landmarks, present=present, log=log, names=names)
+    return after, {each: now(each) for each in becomes}
 
 
 def between(one: Stream, two: Stream) -> str:

@@ -73,4 +73,5 @@ def wrong(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
 
 def duplicates(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
     """Sets beyond one of each true landmark."""
-    return len(landmarks.sets) - len({truth[member] for member in landmarks.number})
+    members = (member for of in landmarks.sets.values() for member in of)
+    return len(landmarks.sets) - len({truth[member] for member in members})
