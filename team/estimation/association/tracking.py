@@ -218,7 +218,8 @@ class Tracker:
         HpD = dense.product(Hp, loose + tight)
         offsets = points[:, None] - seen[None]
         near = elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach
-        least = MOST * max(int(near.any(axis=1).sum()), SLIP_DETECTIONS)
+        possible = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
+        least = MOST * max(possible, SLIP_DETECTIONS)
         known = np.nonzero(found != NOBODY)[0]
         before, _ = squared_distances(
             offsets[known, found[known]], spread[found[known]] + covariances[known]

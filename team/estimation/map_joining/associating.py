@@ -32,7 +32,6 @@ from team.estimation.map_joining.association.growing import (
     Pair,
     conditioned,
     grow,
-    likelihoods,
 )
 from team.estimation.map_joining.association.hypotheses import jointly
 from team.estimation.map_joining.association.landmarks import (
@@ -69,9 +68,8 @@ class IslandView:
         self.seen_by = [self.place[each.known] for each in graph.observed]
         mean, covariance = joint_marginal(island, nodes.tolist())
         self.place_of = {id_: at for at, id_ in enumerate(self.ids)}
-        self._beside = self.place[graph.memory.pairs]
         apart = _apart(graph, self.place, self.ids, landmarks, self.place_of)
-        one, two = self._beside[graph.memory.distinct].T
+        one, two = self.place[graph.memory.pairs[graph.memory.distinct]].T
         apart[one, two] = apart[two, one] = True
         points = mean.reshape(-1, 2)
         counts = np.bincount(
@@ -81,14 +79,22 @@ class IslandView:
         around = Crowd((each.contribution.local for each in graph.observed), points[counts > 1])
         self.profile = around.bounded(island.settings.association)
         unseen = overlooked(points, self.seen_by, self.profile.same)
-        self.joint = Joint(points, covariance, apart, around, unseen)
         self.gone = np.zeros(len(nodes), np.bool_)
         self.sees = np.zeros((len(self.seen_by), len(nodes)), np.bool_)
         for row, places in zip(self.sees, self.seen_by, strict=True):
             row[places] = True
-        self._seen, self._now = self.sees.copy(), np.arange(len(nodes))
+        in_window = _apart_in_window(self.sees, self.place[graph.memory.pairs])
+        self.joint = Joint(points, covariance, apart, around, unseen, in_window)
+        self._now = np.arange(len(nodes))
         self.ties: list[tuple[int, MergeRecord]] = []
         self.stamp_ns = max((s.contribution.end_ns for s in graph.submaps), default=0)
+
+    def unnamed(self, k: int) -> Indices:
+        """Indices of the unnamed landmarks of submap k."""
+        seen = self.island.graph.observed[k]
+        nodes = seen.landmarks[seen.contribution.local.ids >= UNNAMED]
+        places: Indices = np.unique(self.place[nodes[nodes >= 0]])
+        return places
 
     def views(self, k: int) -> list[Indices]:
         """Indices of the unnamed landmarks that each keyframe of submap k observed together."""
@@ -129,7 +135,7 @@ class IslandView:
         """Merges the pairs of submap k and one other submap after the other on which all likely
         joint assignments of the two agree.
         """
-        own = self.now(_unnamed(self, k))
+        own = self.now(self.unnamed(k))
         others = self.sees.copy()
         others[k] = False
         for candidates in comparable(self.joint, own, others, self.profile, most_sd):
@@ -157,19 +163,8 @@ class IslandView:
         if len(later):
             one, two = at[later], at[earlier]
             x, y = (self.joint.mean[one] - self.joint.mean[two]).T
-            close = (elementwise.hypot(x, y) < self.profile.same) & ~self._left_apart(one, two)
+            close = elementwise.hypot(x, y) < self.profile.same
             self._grow("sweep", one[close], two[close], self.profile.tight)
-
-    def _left_apart(self, one: Indices, two: Indices) -> Bool[np.ndarray, " k"]:
-        """Marks pairs that one window observed and kept apart, unless the evidence now favours one
-        landmark.
-        """
-        seen = self._seen.astype(np.float32)
-        own = seen.T @ seen > 0.0  # exact: sums of ones
-        first, second = self._beside.T
-        own[first, second] = own[second, first] = True
-        at = likelihoods(self.joint, one, two, self.profile)
-        return np.asarray(own[one, two] & (at.llr < self.profile.odds))
 
     def agreed(self, landmarks: Landmarks) -> None:
         """Merges the landmarks that an operator has declared to be one."""
@@ -181,6 +176,18 @@ class IslandView:
                 continue
             joint = conditioned(self.joint, one, two, self.profile)
             self.take([Pair(one, two, np.inf, 0.0, -np.inf)], joint, "verdict")
+
+
+def _apart_in_window(
+    sees: Bool[np.ndarray, "K n"], pairs: Int64[np.ndarray, "_ 2"]
+) -> Bool[np.ndarray, "n n"]:
+    """Marks pairs of landmarks that one submap has, these pairs of condensed submaps among them."""
+    of = sees.astype(np.float32)
+    apart = np.asarray(of.T @ of > 0.0)  # exact: sums of ones
+    first, second = pairs.T
+    apart[first, second] = apart[second, first] = True
+    np.fill_diagonal(apart, False)
+    return apart
 
 
 def _apart(
@@ -227,7 +234,7 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
         k = order.get(id(contribution))
         if k is None or not len(contribution.local.unnamed.counts):
             continue
-        fresh = _unnamed(view, k)
+        fresh = view.unnamed(k)
         before = recent(
             island.graph, contribution.stream, contribution.sequence, view.profile.recent
         )
@@ -281,13 +288,6 @@ def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]
         if each.contribution.stream == stream
         and sequence - count <= each.contribution.sequence < sequence
     ]
-
-
-def _unnamed(view: IslandView, k: int) -> Int64[np.ndarray, " _"]:
-    seen = view.island.graph.observed[k]
-    nodes = seen.landmarks[seen.contribution.local.ids >= UNNAMED]
-    places: Int64[np.ndarray, " _"] = view.place[nodes[nodes >= 0]]
-    return places
 
 
 def union(of: Iterable[Indices]) -> Int64[np.ndarray, " _"]:

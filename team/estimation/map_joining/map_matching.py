@@ -14,6 +14,7 @@ from jaxtyping import Float
 from team.association import AssociationProfile
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import compose, inverse
+from team.estimation.map_joining.assigning import assigned
 from team.estimation.map_joining.associating import IslandView, applied, associated, union
 from team.estimation.map_joining.association.absence import renumbered, rows
 from team.estimation.map_joining.association.closing import (
@@ -112,16 +113,16 @@ def _closed(fold: Fold, stream: Stream, last: int, views: IslandViews) -> Fold:
     submaps = _patch(view, stream, last)
     patch = union(view.seen_by[k] for k in submaps)
     target = _reachable(view, patch)
-    if min(len(patch), len(target)) < profile.closure_pairs:
-        return fold
-    others = sorted({*range(len(view.seen_by))}.difference(submaps))
-    sides = _patch_side(view, patch, submaps), _side(view, target, others)
-    found = closure(
-        *sides,
-        lambda _: (view.joint, sides[1]),
-        profile,
-        Tests(profile.closure_pairs, profile.closure_llr),
-    )
+    found = assigned(view, submaps[-_step(fold, key) :]) if len(target) else None
+    if found is None and min(len(patch), len(target)) >= profile.closure_pairs:
+        others = sorted({*range(len(view.seen_by))}.difference(submaps))
+        sides = _patch_side(view, patch, submaps), _side(view, target, others)
+        found = closure(
+            *sides,
+            lambda _: (view.joint, sides[1]),
+            profile,
+            Tests(profile.closure_pairs, profile.closure_llr),
+        )
     if found is None:
         return fold
     pairs = [(view.ids[pair.first], view.ids[pair.second]) for pair in found.pairs]
@@ -362,11 +363,11 @@ def _merged(
     fold = _tidied(fold, stays)
     views = IslandViews()
     for stream in streams:
-        for last in range(fold.next_sequence(stream) - 1, -1, -max(1, _step(fold, stays))):
+        for last in range(fold.next_sequence(stream) - 1, -1, -_step(fold, stays)):
             fold = _closed(fold, stream, last, views)
     return fold
 
 
 def _step(fold: Fold, key: Stream) -> int:
     profile: AssociationProfile = fold.islands[key].settings.association
-    return profile.recent // 2
+    return max(1, profile.recent // 2)

@@ -119,6 +119,24 @@ def test_a_slip_of_the_odometry_is_named_and_costs_no_landmark(reach):
     assert np.allclose(slip.by[:2], [-0.3, -0.25], atol=0.1)
 
 
+def test_a_slip_among_as_many_new_landmarks_as_known_ones_is_found():
+    known = np.array([[2.0, 0.5], [1.0, 2.0], [2.5, -2.0]])
+    slip = np.array([0.15, 0.2])
+    scans = [known] * 6 + [np.concatenate([known, known + np.array([0.0, 0.45])]) - slip] * 2
+    n = sum(map(len, scans))
+    still = Scans(
+        np.zeros((8, 3)),
+        np.tile(np.diag([0.01, 0.01, 0.01]) ** 2, (8, 1, 1)),
+        np.repeat(np.arange(8), list(map(len, scans))),
+        np.concatenate(scans),
+        np.tile(0.03**2 * np.eye(2), (n, 1, 1)),
+        np.full(n, NOBODY),
+    )
+    result = associated(still, AssociationSettings(slip_m=0.6))
+    assert [each.keyframe for each in result.slips] == [6]
+    assert len(result.counts) == 6, "three before the slip, and three beside them since"
+
+
 def test_named_detections_are_believed_beside_those_without_a_name():
     scans, labels = window(4)
     tags = np.where(labels % 3 == 0, labels + 7, NOBODY)

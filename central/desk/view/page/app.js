@@ -67,7 +67,7 @@ map.onPick = (x, y) => {
   $('why').hidden = i < 0;
   if (i < 0) return;
   const lines = shown.why && shown.why[i].length
-    ? [`landmark ${shown.ids[i]}, ${shown.n[i] === 1 ? 'tentative: one submap has it' : `confirmed by ${shown.n[i]}${shown.n[i] === 12 ? ' or more' : ''} submaps`}`, ...shown.why[i]]
+    ? [`landmark ${shown.ids[i]}, ${shown.n[i] === 1 ? 'tentative: one submap has it' : `confirmed by ${shown.n[i]}${!shown.final && shown.n[i] === 12 ? ' or more' : ''} submaps`}`, ...shown.why[i]]
     : [`landmark ${shown.ids[i]}, known by its name`];
   $('why').textContent = lines.join('\n');
 };

@@ -30,6 +30,12 @@ connect landmarks to neighbours that are one spacing off.
 """
 
 
+SPLIT = 1.0
+"""What two landmarks that one window has as two need beyond others to be one: a window seldom
+splits a landmark.
+"""
+
+
 class Joint(NamedTuple):
     """Landmarks with their joint covariance, in one frame.
 
@@ -40,6 +46,7 @@ class Joint(NamedTuple):
     crowd: their local density; None: the density of the profile.
     unseen: of one map's landmarks, the probability that all windows which saw each of them missed
         another one beside it; the density of the profile is then an upper bound of the map's own.
+    apart_in_window: which two one submap has as two, symmetric; None: unknown.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -47,6 +54,7 @@ class Joint(NamedTuple):
     apart: Bool[np.ndarray, "n n"]
     crowd: Crowd | None = None
     unseen: Float[np.ndarray, " n"] | None = None
+    apart_in_window: Bool[np.ndarray, "n n"] | None = None
 
 
 class Pair(NamedTuple):
@@ -114,9 +122,25 @@ def likelihoods(
     return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))
 
 
+def needed(
+    joint: Joint,
+    first: Indices,
+    second: Indices,
+    sd: Float[np.ndarray, " k"],
+    profile: AssociationProfile,
+) -> Float[np.ndarray, " k"]:
+    """The log-likelihood ratio with which each pair is one landmark where it has no rival: more
+    where the standard deviation is large, and by SPLIT more where one submap has it as two.
+    """
+    least = np.where(sd < profile.tight, profile.llr_tight, profile.llr_loose)
+    if joint.apart_in_window is not None:
+        least = least + SPLIT * joint.apart_in_window[first, second]
+    return least
+
+
 def conditioned(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
-    """The joint Gaussian given that two landmarks are one, which keeps apart from what either kept
-    apart.
+    """The joint Gaussian given that two landmarks are one, which is two with whatever either was
+    two with.
     """
     n = len(joint.mean)
     P = joint.covariance
@@ -126,10 +150,20 @@ def conditioned(joint: Joint, first: int, second: int, profile: AssociationProfi
     weighted = dense.solve(S, gain.T)
     difference = joint.mean[first] - joint.mean[second]
     mean = joint.mean - (dense.product(weighted.T, difference)).reshape(n, 2)
-    apart = joint.apart.copy()
-    both = apart[first] | apart[second]
-    apart[second], apart[:, second] = both, both
-    return Joint(mean, P - dense.product(gain, weighted), apart, joint.crowd, joint.unseen)
+    in_window = joint.apart_in_window
+    return joint._replace(
+        mean=mean,
+        covariance=P - dense.product(gain, weighted),
+        apart=_of_both(joint.apart, first, second),
+        apart_in_window=in_window if in_window is None else _of_both(in_window, first, second),
+    )
+
+
+def _of_both(relation: Bool[np.ndarray, "n n"], first: int, second: int) -> Bool[np.ndarray, "n n"]:
+    """A symmetric relation, of which the second has what either has."""
+    out = relation.copy()
+    out[second] = out[:, second] = relation[first] | relation[second]
+    return out
 
 
 def grow(
@@ -167,9 +201,9 @@ def grow(
     doubtful = 0
     while len(first):
         at = likelihoods(joint, first, second, profile)
-        needed = np.where(at.sd < profile.tight, profile.llr_tight, profile.llr_loose)
+        least = needed(joint, first, second, at.sd, profile)
         limit = min(most_sd, sure_sd) if len(taken) >= SURE_AFTER else most_sd
-        fits = (at.chi2 < profile.gate) & (at.llr >= needed) & (at.sd <= limit)
+        fits = (at.chi2 < profile.gate) & (at.llr >= least) & (at.sd <= limit)
         if not fits.any():
             doubtful = 0
             break

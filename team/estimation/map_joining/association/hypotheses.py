@@ -22,6 +22,7 @@ from team.estimation.map_joining.association.growing import (
     Pair,
     conditioned,
     likelihoods,
+    needed,
 )
 
 MOST_ASSIGNED = 10
@@ -57,6 +58,7 @@ def jointly(
     order = _order(first, sd)
     taken = np.isin(first, order)
     involved = np.unique(np.concatenate((first[taken], second[taken])))
+    in_window = joint.apart_in_window
     part = Joint(
         joint.mean[involved],
         joint.covariance.reshape(len(joint.mean), 2, -1, 2)[involved][:, :, involved].reshape(
@@ -65,6 +67,7 @@ def jointly(
         joint.apart[np.ix_(involved, involved)],
         joint.crowd,
         None if joint.unseen is None else joint.unseen[involved],
+        None if in_window is None else in_window[np.ix_(involved, involved)],
     )
     place = {int(each): k for k, each in enumerate(involved)}
     assigned, lost = [_Assignment(0.0, (), part)], 0.0
@@ -123,7 +126,8 @@ def _fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[
     n = len(joint.mean)
     at = likelihoods(joint, np.full(n, landmark), np.arange(n), profile)
     near = elementwise.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
-    one = (at.llr >= profile.llr_tight) & near & ~joint.apart[landmark]
+    least = needed(joint, np.full(n, landmark), np.arange(n), np.zeros(n), profile)
+    one = (at.llr >= least) & near & ~joint.apart[landmark]
     return {landmark, *np.flatnonzero(one).tolist()}
 
 

@@ -80,6 +80,21 @@ def test_the_fold_is_the_same_bits_again_and_submaps_with_names_cost_it_nothing(
     assert _folded(named[:5]).landmarks == Landmarks() or not _folded(named[:5]).landmarks.sets
 
 
+def test_a_loop_that_is_nearly_known_closes_by_a_few_landmarks_that_agree() -> None:
+    rng, world = np.random.default_rng(3), np.zeros((0, 2))
+    while len(world) < 34:
+        angle, r = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(6.0, 10.0)
+        point = np.array([r * np.cos(angle), r * np.sin(angle)])
+        if (np.hypot(*(world - point).T) > 1.5).all():
+            world = np.vstack([world, point])
+    path = circle((0.0, 0.0), 8.0, 20, 1.15)
+    submaps, truth = drive("r1", path, world, rng, reach=4.0, pose_sd=(0.06, 0.06, 0.02))
+    landmarks = _folded(submaps).landmarks
+    assert [each.kind for each in landmarks.decisions] == ["closure"]
+    assert landmarks.decisions[0].pairs < SETTINGS.association.closure_pairs
+    assert wrong(landmarks, truth) == duplicates(landmarks, truth) == 0
+
+
 def test_robots_with_unknown_initial_poses_become_one_map_by_what_they_see() -> None:
     world, rng = _world(5), np.random.default_rng(8)
     one, first = drive("r1", circle((0.0, 0.0), 20.0, 12, 0.6), world, rng)

@@ -3,6 +3,7 @@ import pytest
 
 from team.association import AssociationProfile
 from team.estimation.map_joining.association.growing import (
+    SPLIT,
     Joint,
     conditioned,
     grow,
@@ -81,3 +82,20 @@ def test_what_one_scan_saw_as_two_is_never_one_and_this_is_passed_on_to_whom_the
     after = conditioned(joint, 0, 2, PROFILE)
     assert after.apart[2, 1]
     assert after.apart[1, 2]
+
+
+def test_what_one_window_has_as_two_needs_more_and_so_do_those_whom_either_joins():
+    joint = _joint([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0)], sd=0.08)
+    one, two = np.array([0]), np.array([1])
+    llr = likelihoods(joint, one, two, PROFILE).llr[0]
+    assert PROFILE.llr_tight < llr < PROFILE.llr_tight + SPLIT
+    split = np.zeros((3, 3), np.bool_)
+    split[0, 1] = split[1, 0] = True
+    for beside, pairs in ((None, 1), (split, 0)):
+        found = grow(joint._replace(apart_in_window=beside), (one, two), PROFILE)
+        assert found is not None
+        assert len(found.pairs) == pairs
+    after = conditioned(joint._replace(apart_in_window=split), 1, 2, PROFILE).apart_in_window
+    assert after is not None
+    assert after[0, 2]
+    assert after[2, 0]

@@ -22,6 +22,7 @@ def drive(
     rng: np.random.Generator,
     reach: float = 6.0,
     named: bool = False,
+    pose_sd: tuple[float, float, float] = POSE_SD,
 ) -> tuple[list[Contribution], dict[LocalLandmark, int]]:
     """A submap between each two poses of a path of all landmarks within reach, and its truth.
 
@@ -35,7 +36,7 @@ def drive(
         if not named:
             seen = rng.permutation(seen)
         local = [transformed(inverse(start), world[at]) for at in seen]
-        sd = np.concatenate([POSE_SD, np.full(2 * len(seen), LANDMARK_SD)])
+        sd = np.concatenate([pose_sd, np.full(2 * len(seen), LANDMARK_SD)])
         mean = np.concatenate([between(start, end), np.ravel(local)])
         ids = seen if named else UNNAMED + np.arange(len(seen))
         unnamed = Unnamed(
