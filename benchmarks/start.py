@@ -3,7 +3,7 @@
     python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone:
+measurement on the bus; command_first_s: from the start of the command `launch`. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone:
 router, recorder and robot started by hand, when they are ready and nothing comes: their resident
 memory, that without pages of files, and their CPU. Of times only ratios are held against
 benchmarks/start.json: the machine is in both halves.
@@ -21,9 +21,10 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.baseline import concluded
+from sim.launch.ahead import PROGRAM
 from sim.launch.launch import launch
 from sim.launch.plan import Plan
-from sim.launch.processes import PROGRAM, Starter
+from sim.launch.processes import Starter
 from sim.scenarios.scenario import Scenario, load, with_options
 from team.recording.reader import open_log
 from team.wire.channels import SENSORS
@@ -44,7 +45,7 @@ def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> 
     with Starter(began_ns, warm, folder / "template.log") as starter:
         outcome = launch(plan, starter, lambda watch: None)
     assert outcome.failures == [], outcome.failures
-    first = min(sample.wall_ns for sample in open_log(plan.log).samples(SENSORS))
+    first = first_ns(plan.log)
     robots = [used for name, used in outcome.used.items() if name.startswith("robot-")]
     return {
         "first_s": 1e-9 * (first - began_ns),
@@ -53,6 +54,19 @@ def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> 
         "robot_pss_mb": mean(used.pss_mb or 0.0 for used in robots),
         "peak_rss_mb": {name: used.peak_rss_mb for name, used in outcome.used.items()},
     }
+
+
+def first_ns(log: Path) -> int:
+    """When the first measurement of a log was published, by the wall clock."""
+    return min(sample.wall_ns for sample in open_log(log).samples(SENSORS))
+
+
+def command_first_s(words: list[str], folder: Path) -> float:
+    """Time [s] from the start of `teamslam launch` to the first measurement."""
+    began_ns = time.time_ns()
+    command = [*PROGRAM, "launch", *words, "--no-views", "--no-report", "--output", str(folder)]
+    subprocess.run(command, check=True, capture_output=True)
+    return 1e-9 * (first_ns(folder / "log.mcap") - began_ns)
 
 
 def alone(folder: Path) -> dict[str, dict[str, float]]:
@@ -123,18 +137,20 @@ def bare_s() -> float:
     return min(took)
 
 
-def measured(scenario: Scenario) -> dict[str, Any]:
+def measured(scenario: Scenario, words: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         pair = (scenario.estimator, scenario.fusion)
         launched(scenario, Path(folder) / "first", pair)  # compiles what is not compiled
         forked = launched(scenario, Path(folder) / "forked", pair)
         scratch = launched(scenario, Path(folder) / "scratch", None)
+        first_s = min(command_first_s(words, Path(folder) / f"command-{k}") for k in range(3))
         bare = bare_s()
         by_hand = alone(Path(folder) / "alone")
     return {
         "robots": len(scenario.robots),
         "forked": forked,
         "scratch": scratch,
+        "command_first_s": first_s,
         "alone": by_hand,
         **{f"{name}_alone_mb": used["rss_mb"] for name, used in by_hand.items()},
         "robot_alone_in_bare_starts": by_hand["robot"]["cpu_s"] / bare_cpu_s(),
@@ -151,7 +167,8 @@ def main() -> int:
     parser.add_argument("--robots", type=int)
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
-    figures = measured(with_options(load(told.scenario), robots=told.robots))
+    words = [told.scenario, *([] if told.robots is None else ["--robots", str(told.robots)])]
+    figures = measured(with_options(load(told.scenario), robots=told.robots), words)
     return concluded(figures, "start", told.json)
 
 

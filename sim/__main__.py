@@ -2,11 +2,32 @@
 
 import sys
 
-from sim.cli.main import command, main
 
-if sys.argv[1:2] == ["template"]:
-    from sim.launch.template import become_a_process, end_by
+def main() -> None:
+    """Run a command. Of `launch` the template is started before anything else is imported."""
+    if sys.argv[1:2] == ["launch"] and "--help" not in sys.argv:
+        from sim.launch.ahead import end_ahead, start_ahead
 
-    become_a_process(command)  # returns in a forked process, with the words of its own command
-    end_by(main)
-main()
+        start_ahead()
+        try:
+            _run()
+        finally:
+            end_ahead()
+    else:
+        _run()
+
+
+def _run() -> None:
+    from sim.cli.main import main as run
+
+    run()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["template"]:
+        from sim.cli.main import command
+        from sim.launch.template import become_a_process, end_by
+
+        become_a_process(command)  # returns in a forked process, with the words of its own command
+        end_by(_run)
+    main()

@@ -145,7 +145,7 @@ def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
 
 def test_the_wheel_installs_the_command_and_carries_the_licence(wheel: zipfile.ZipFile) -> None:
     about = f"teamslam-{PROJECT['version']}.dist-info"
-    assert "teamslam = sim.cli.main:main" in wheel.read(f"{about}/entry_points.txt").decode()
+    assert "teamslam = sim.__main__:main" in wheel.read(f"{about}/entry_points.txt").decode()
     assert "Apache License" in wheel.read(f"{about}/licenses/LICENSE").decode()
 
 
@@ -271,6 +271,7 @@ HEAVY = (
 COMPUTES = {"asyncio", "jaxtyping", "llvmlite", "numba", "numpy", "scipy", "ssl"}
 PROCESSES: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "any command": (("sim.cli.main",), set()),
+    "a template's start": (("sim.launch.ahead",), set()),
     "router": ((), {"zenoh"}),
     "record": ((), {"mcap", "zenoh"}),
     "robot": (("team.robot.main", "team.robot.hybrid"), COMPUTES),

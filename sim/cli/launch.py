@@ -117,8 +117,6 @@ def launch(
 
     Every robot, the world, the central computer, the recorder and the router are processes.
     """
-    from sim.scenarios.source import with_present_robots
-
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     if dataset is not None and is_foreign(dataset):
@@ -139,8 +137,7 @@ def launch(
     )
     if pieces is not None:
         check_pieces(resolved)
-    resolved, missing = with_present_robots(resolved)
-    streams = _checked_world(resolved)
+    resolved, missing, streams = _checked_world(resolved)
     if name == ASSUMED_NAME and dataset is not None and streams is not None:
         typer.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == ANY_PORT:
@@ -182,7 +179,7 @@ def launch(
 
 
 def _launched(plan: "Plan") -> "Outcome":
-    """Start the template first: it imports modules while this process does."""
+    """Name the kernels to the template first: it loads them while this process imports modules."""
     from sim.launch.processes import Starter
 
     scenario = plan.scenario
@@ -212,12 +209,20 @@ def _keep_showing(url: str, log: Path) -> None:
         stop.wait()
 
 
-def _checked_world(scenario: Scenario) -> "WorldStreams | None":
-    """The streams of a data set, which is checked before any process starts."""
-    from sim.scenarios.source import streams_of
-    from sim.world.config import FolderWorld, UtiasWorld
+def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
+    """The scenario with the robots that its data set has, a note on the others, and the streams.
 
-    return streams_of(scenario) if isinstance(scenario.world, UtiasWorld | FolderWorld) else None
+    A data set is read before any process starts. What is simulated needs none of this.
+    """
+    from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UtiasWorld
+
+    if isinstance(scenario.world, SimulatedWorld | LiveWorld):
+        return scenario, None, None
+    from sim.scenarios.source import streams_of, with_present_robots
+
+    present, missing = with_present_robots(scenario)
+    is_checked = isinstance(present.world, UtiasWorld | FolderWorld)
+    return present, missing, streams_of(present) if is_checked else None
 
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:

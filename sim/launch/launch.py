@@ -186,6 +186,7 @@ def _endpoint(service: Supervised) -> str:
 
 
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
+    """The processes but for the router. The world comes early: it makes its streams meanwhile."""
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
     robots = [
@@ -194,6 +195,7 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
     ]
     return [
         ("recorder", ["record", *common, "--output", str(plan.log)]),
+        *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),
         *(
             [("central", ["central", *common, *plan.stores("central")])]
             if plan.scenario.centre
@@ -201,5 +203,4 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
         ),
         *robots,
         *([("viewer", ["viewer", *common])] if plan.views else []),
-        *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),
     ]

@@ -12,31 +12,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
+from sim.launch.ahead import ONE_THREAD, PROGRAM, Template, taken
 from sim.launch.linux import adopt_orphans
 from team.shell import PARENT
 from team.the_end import SINCE
 
-# -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
-PROGRAM = (sys.executable, "-P", "-m", "sim")
-TEMPLATE = "template"
-"""`python -m sim template FD ESTIMATOR RULE`: started by `launch`, no command for users."""
 LOOK_S = 0.005
 """Time [s] between two checks of a process that is to end."""
 PATIENCE_S = 600.0
 """Time [s] within which a template answers, though it may have to compile all kernels before."""
 _LARGEST_ANSWER = 64
-_ROOM = 4_096
-"""Bytes of a forked process's command line; the template is started with that many spaces."""
-_ONE_THREAD = dict.fromkeys(
-    (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-        "NUMBA_NUM_THREADS",
-    ),
-    "1",
-)
+KERNELS = "kernels"
+"""The first request of a template: `kernels ESTIMATOR RULE SINCE`, with the file for its errors."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +97,11 @@ class Process:
 class Starter:
     """Starts the processes of one run; a context that ends the template.
 
-    warm: the estimator and the rule whose kernels a template loads, from which all are forked. With
-    None, on a system that can not adopt orphans, and after a template has died, each process is
-    started from scratch. log: the file for the template's errors. compiled: called while the
-    template compiles kernels, with the number compiled and the estimated total.
+    warm: the estimator and the rule whose kernels a template loads, from which all are forked: the
+    one that was started ahead, if there is one. With None, on a system that can not adopt orphans,
+    and after a template has died, each process is started from scratch. log: the file for the
+    template's errors. compiled: called while the template compiles kernels, with the number
+    compiled and the estimated total.
     """
 
     def __init__(
@@ -128,7 +116,7 @@ class Starter:
         self._template: Process | None = None
         self._asks: socket.socket | None = None
         if warm is not None and adopt_orphans():
-            self._start_template(warm, log)
+            self._use_template(warm, log, since_ns)
 
     def __enter__(self) -> Self:
         return self
@@ -172,21 +160,17 @@ class Starter:
                     self._compiled(self._done, max(self._done, int(of)))
         raise ConnectionResetError("the template has ended")
 
-    def _start_template(self, warm: tuple[str, str], log: Path) -> None:
-        self._asks, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._asks.settimeout(PATIENCE_S)
-        number = str(theirs.fileno())
-        with theirs, log.open("wb") as file:
-            started = subprocess.Popen(  # noqa: S603 - our own program, no shell
-                [*PROGRAM, TEMPLATE, number, *warm, " " * _ROOM],
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env=self._environment,
-                start_new_session=True,
-                pass_fds=[theirs.fileno()],
-            )
-        self._template = Process(started.pid, started)
+    def _use_template(self, warm: tuple[str, str], log: Path, since_ns: int) -> None:
+        with log.open("wb") as file:
+            template = taken() or Template(file.fileno())
+            self._template = Process(template.process.pid, template.process)
+            self._asks = template.asks
+            self._asks.settimeout(PATIENCE_S)
+            words = [KERNELS, *warm, str(since_ns)]
+            try:
+                socket.send_fds(self._asks, [json.dumps(words).encode()], [file.fileno()])
+            except OSError:
+                self._end_template()
 
     def _end_template(self) -> None:
         if self._asks is not None:
@@ -204,4 +188,4 @@ def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
     since_ns: the beginning of the run, for a child that is started again after the end of the run.
     """
     tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
-    return {**mine, **_ONE_THREAD, **tied}
+    return {**mine, **ONE_THREAD, **tied}

@@ -21,15 +21,21 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import NoReturn
 
+from sim.launch.ahead import TEMPLATE
 from sim.launch.linux import end_with_parent, threads, write_command_line
-from sim.launch.processes import TEMPLATE
+from sim.launch.processes import KERNELS
+from team.shell import PARENT
+from team.the_end import SINCE
 
 LARGEST_REQUEST = 65_536
-LIGHT = ("team.keys.roster", "team.shell", "team.wire.zenoh.bus")
-"""Modules that the router needs: it is forked before anything else is imported."""
-HEAVY = (
-    "central.desk.view.viewer",
+MODULES = (
+    "team.keys.roster",
+    "team.wire.zenoh.bus",
+    "numpy",
+    "numba",
+    "team.translate",
     "central.main",
+    "team.robot.node",
     "sim.in_memory.team",
     "sim.publisher.main",
     "team.keys.credentials",
@@ -38,7 +44,10 @@ HEAVY = (
     "team.recording.shell",
     "team.robot.main",
 )
-"""Modules that all other processes need."""
+"""What the processes of a team import, in the order in which it is loaded: the router's first.
+
+Between two of them the template looks whether it is asked for a router.
+"""
 
 
 @dataclass(frozen=True)
@@ -57,24 +66,36 @@ def become_a_process(prepare: Callable[[], object]) -> None:
     every process would do first.
     """
     end_with_parent(signal.SIGKILL)
-    launch, estimator, rule = os.getppid(), sys.argv[3], sys.argv[4]
+    gc.disable()  # what is imported stays
+    launch = os.getppid()
     write_command_line(sys.orig_argv[: sys.orig_argv.index(TEMPLATE) + 1])
     asked = socket.socket(fileno=int(sys.argv[2]))
     prepare()
-    for module in LIGHT:
+    pair: list[str] = []
+    for module in MODULES:
         importlib.import_module(module)
-    while _is_asked(asked, 0.0):  # the router does not wait for the others' imports
-        if _serve(asked, launch):
-            return
-    for module in HEAVY:
-        importlib.import_module(module)
-    _load_kernels(estimator, rule, asked)
+        while _is_asked(asked, 0.0):  # the router does not wait for the others' imports
+            pair = pair or _noted(_received(asked), launch)
+            if pair and _is_asked(asked, 0.0) and _serve(_received(asked), asked, launch):
+                return
+    pair = pair or _noted(_received(asked), launch)
+    _load_kernels(pair[0], pair[1], asked)
     # What lives now stays where it is: the collector of a forked process does not touch it.
-    gc.collect()
     gc.freeze()
     while True:
-        if _serve(asked, launch):
+        if _serve(_received(asked), asked, launch):
             return
+
+
+def _noted(request: _Request, launch: int) -> list[str]:
+    """The estimator and the rule of the first request, which gives the template its file, too."""
+    kind, estimator, rule, since_ns = request.words
+    assert kind == KERNELS
+    os.environ |= {PARENT: str(launch), SINCE: since_ns}
+    for stream in (1, 2):
+        os.dup2(request.output, stream)
+    os.close(request.output)
+    return [estimator, rule]
 
 
 def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
@@ -84,8 +105,11 @@ def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
     from sim.launch import warm_up
     from team.estimation.compiling import compilations
 
+    is_warm = warm_up.is_warm(estimator, rule)
+    if not is_warm:
+        gc.enable()  # compiling makes much that does not stay
     with compilations(lambda done, of: asked.sendall(f"compiled {of}".encode())):
-        if (estimator, rule) == ("hybrid", "join") and not warm_up.is_warm(estimator, rule):
+        if (estimator, rule) == ("hybrid", "join") and not is_warm:
             if (centre := os.fork()) == 0:
                 with suppress(Exception):  # then this process compiles what is lacking
                     warm_up.fold_made_up_submaps()
@@ -119,9 +143,8 @@ def _is_asked(asked: socket.socket, patience_s: float) -> bool:
     return bool(select.select([asked], [], [], patience_s)[0])
 
 
-def _serve(asked: socket.socket, launch: int) -> bool:
+def _serve(request: _Request, asked: socket.socket, launch: int) -> bool:
     """Fork the process that is asked for; returns True in that process."""
-    request = _received(asked)
     if threads() != 1:
         sys.exit(f"the template has {threads()} threads: a fork would not be safe")
     read, write = os.pipe()
@@ -163,6 +186,7 @@ def _fork_again(write: int, launch: int) -> None:
 
 def _begin(request: _Request) -> None:
     """Become the requested process: its session, its streams, its command line."""
+    gc.enable()
     os.setsid()
     nothing = os.open(os.devnull, os.O_RDONLY)
     for source, target in ((nothing, 0), (request.output, 1), (request.output, 2)):

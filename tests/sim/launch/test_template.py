@@ -19,7 +19,7 @@ def test_nothing_is_forked_from_a_process_that_has_threads(monkeypatch: pytest.M
         thread.start()
         socket.send_fds(asks, [b'["router"]'], [asks.fileno()])
         with pytest.raises(SystemExit, match="threads: a fork would not be safe"):
-            template._serve(asked, os.getpid())
+            template._serve(template._received(asked), asked, os.getpid())
         done.set()
         thread.join()
     assert forks == []
