@@ -3,10 +3,11 @@
     python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus; command_first_s: from the start of the command `launch`. cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone:
-router, recorder and robot started by hand, when they are ready and nothing comes: their resident
-memory, that without pages of files, and their CPU. Of times only ratios are held against
-benchmarks/start.json: the machine is in both halves.
+measurement on the bus; command_first_s: from the start of the command `launch`, the least of three.
+cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone: router, recorder and
+robot started by hand, when they are ready and nothing comes: their resident memory, that without
+pages of files, and their CPU. Of times only ratios are held against benchmarks/start.json: the
+machine is in both halves.
 """
 
 import argparse

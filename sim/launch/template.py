@@ -46,7 +46,8 @@ MODULES = (
 )
 """What the processes of a team import, in the order in which it is loaded: the router's first.
 
-Between two of them the template looks whether it is asked for a router.
+Between two of them the template looks whether it is asked for the router; all other processes wait
+until everything is there that they share.
 """
 
 
@@ -72,11 +73,14 @@ def become_a_process(prepare: Callable[[], object]) -> None:
     asked = socket.socket(fileno=int(sys.argv[2]))
     prepare()
     pair: list[str] = []
+    has_router = False
     for module in MODULES:
         importlib.import_module(module)
-        while _is_asked(asked, 0.0):  # the router does not wait for the others' imports
-            pair = pair or _noted(_received(asked), launch)
-            if pair and _is_asked(asked, 0.0) and _serve(_received(asked), asked, launch):
+        if not pair and _is_asked(asked, 0.0):
+            pair = _noted(_received(asked), launch)
+        if pair and not has_router and _is_asked(asked, 0.0):
+            has_router = True
+            if _serve(_received(asked), asked, launch):
                 return
     pair = pair or _noted(_received(asked), launch)
     _load_kernels(pair[0], pair[1], asked)
