@@ -13,10 +13,7 @@ docs/decisions/0029.
 
 import dis
 import hashlib
-import importlib
 import inspect
-import pickle
-import sys
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import cache, lru_cache, partial
@@ -26,10 +23,9 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
-from numba.core import environment
 from numba.core.caching import IndexDataCacheFile
 
+from team.estimation.cached_code import load_alone, loads_alone, unpickled
 from team.estimation.compiled_once import compile_once
 from team.sources import sources_of
 
@@ -72,7 +68,7 @@ def _cache_of_its_own(dispatcher: Any) -> Path:
     files: Any = _CacheFile
     cached._cache_file = files(cached._cache_path, name, program)
     if loads_alone():
-        cached.load_overload = partial(_load_alone, cached)
+        cached.load_overload = partial(load_alone, cached)
     return Path(cached._cache_path) / f"{name}.lock"
 
 
@@ -104,56 +100,7 @@ class _CacheFile(IndexDataCacheFile):
         if not loads_alone():
             return super()._load_data(name)  # type: ignore[no-untyped-call] # Numba's
         with open(self._data_path(name), "rb") as file:  # type: ignore[no-untyped-call] # Numba's
-            return _Unpickler(file).load()
-
-
-class _Unpickler(pickle.Unpickler):
-    """Reads cached code without importing the modules of Numba whose functions are compiled in."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """The environment of such a function, instead of its own, else as ever."""
-        if (module, name) == (environment.__name__, "_rebuild_env"):
-            return _environment
-        return super().find_class(module, name)
-
-
-def _environment(module: str, constants: Sequence[object], name: str) -> Any:
-    """A compiled function's constants; its module's names are for interpreted code only."""
-    found = environment.lookup_environment(name)  # type: ignore[no-untyped-call] # Numba's
-    if found is None:
-        known = sys.modules.get(module)
-        names = {"__name__": module} if known is None else vars(known)
-        found = environment.Environment._memo[name] = environment.Environment(names)
-        found.consts[:] = constants
-        found.env_name = name
-    return found
-
-
-def loads_alone() -> bool:
-    """Whether cached code can be loaded without what only compiling needs: docs/decisions/0120.
-
-    It is known of these versions of Numba; with another one a kernel is loaded as Numba does it.
-    """
-    return str(numba.__version__).startswith("0.68.")
-
-
-def _load_alone(files: Any, signature: Any, target: Any) -> Any:
-    """Loads one form of a kernel from its cache; returns None where it is not there.
-
-    Numba itself would first import all that it could compile, 30 MB and a quarter of a second;
-    it does so when it compiles.
-    """
-    _name_runtime()
-    with files._guard_against_spurious_io_errors():
-        return files._load_overload(signature, target)
-
-
-@cache
-def _name_runtime() -> None:
-    """Tells the linker where the functions of Numba's runtime are, which cached code calls."""
-    runtime: Any = importlib.import_module("numba.core.runtime._nrt_python")
-    for name, address in runtime.c_helpers.items():
-        binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+            return unpickled(file)
 
 
 _NAMES = b"parts numbered at random"
