@@ -2,19 +2,29 @@
 
 import sys
 
+INTERRUPTED = 130
+"""The exit status of a command that Ctrl-C has ended, as a shell has it."""
+
 
 def main() -> None:
     """Run a command. Of `launch` the template is started before anything else is imported."""
-    if sys.argv[1:2] == ["launch"] and "--help" not in sys.argv:
-        from sim.launch.ahead import end_ahead, start_ahead
-
-        start_ahead()
-        try:
+    try:
+        if sys.argv[1:2] == ["launch"] and "--help" not in sys.argv:
+            _launch()
+        else:
             _run()
-        finally:
-            end_ahead()
-    else:
+    except KeyboardInterrupt:  # while modules are imported; later a command says what it ended
+        sys.exit(INTERRUPTED)
+
+
+def _launch() -> None:
+    from sim.launch.ahead import end_ahead, start_ahead
+
+    start_ahead()
+    try:
         _run()
+    finally:
+        end_ahead()
 
 
 def _run() -> None:

