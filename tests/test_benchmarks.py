@@ -12,7 +12,7 @@ from tests.support import ROOT
 
 def test_each_baseline_says_how_it_is_measured_and_what_may_be_worse() -> None:
     known = baselines()
-    assert {"growth", "ratios", "recorder", "start"} <= set(known)
+    assert {"growth", "in_memory", "ratios", "recorder", "start"} <= set(known)
     for name, told in known.items():
         program = name.partition("-")[0]  # one program may have a second baseline: growth-large
         assert shlex.split(told["command"])[:3] == ["python", "-m", f"benchmarks.{program}"]
