@@ -1,6 +1,7 @@
 """The folds after the ticks that have been taken: few enough to keep, near enough to go back to."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
@@ -8,6 +9,8 @@ from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
 NEWEST = 8
 """Number of newest ticks whose checkpoints are all kept; of older ones as many for each doubling
 of the age."""
+NEAR = 4
+"""Number of newest checkpoints that keep what their next tick is added to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,7 +18,8 @@ class Checkpoint:
     """The fold after a tick; tested: its number of submaps when suspects were last tested.
 
     number: of the ticks that were taken, this one included. raw: nothing was condensed in any of
-    them.
+    them. ahead: the same fold condensed, once it was asked for: a tick that is taken again, since
+    more of it has come, is added to the same.
     """
 
     tick: int
@@ -23,6 +27,7 @@ class Checkpoint:
     tested: int
     number: int
     raw: bool
+    ahead: Fold | None = None
 
 
 class Checkpoints:
@@ -55,7 +60,20 @@ class Checkpoints:
         number = 1 if last is None else last.number + 1
         new = Checkpoint(tick, fold, self.tested, number, self.is_raw and not fold.departed)
         older = () if last is None else (*before, replace(last, fold=compacted(last.fold)))
-        self.taken = thinned((*older, new))
+        keep = thinned((*older, new))
+        self.taken = (*(replace(each, ahead=None) for each in keep[:-NEAR]), *keep[-NEAR:])
+
+    def ahead(self, fold: Fold, condense: Callable[[Fold], Fold]) -> Fold:
+        """The condensed fold; that of a newest checkpoint is computed once."""
+        *before, last = self.taken or (None,)
+        if last is None or last.fold is not fold:
+            return condense(fold)
+        if last.ahead is not None:
+            return last.ahead
+        ahead = condense(fold)
+        if ahead is not fold:
+            self.taken = (*before, replace(last, ahead=ahead))
+        return ahead
 
     def note_tested(self, size: int) -> None:
         """Note that suspects were tested in the last fold, which has this number of submaps."""

@@ -251,7 +251,7 @@ class TickFold:
         coming = self._inputs.size(tick, self._gone)
         if fold.departed and is_due(fold.size, fold.size + coming):
             fold = self._inputs.relinearised(fold, tick - 1, self._gone)
-        return condensed(fold)
+        return self.checkpoints.ahead(fold, condensed)
 
     # Who contradicts the rest.
 

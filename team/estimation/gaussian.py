@@ -62,22 +62,34 @@ NOT_FINITE, NOT_POSITIVE, NOT_SYMMETRIC = 1, 2, 3
 
 
 @compiled
-def factor_or_fault(P: Matrix) -> tuple[Matrix, int]:
-    """The factor of `cholesky_factor`, and the index in FAULTS of why there is none."""
+def fault_of(P: Matrix) -> tuple[int, Float[np.ndarray, " n"]]:
+    """The index in FAULTS of what is seen of a matrix without factoring it; and the roots of its
+    diagonal.
+    """
     n = len(P)
+    sigmas = np.empty(n)
     for i in range(n):
         for j in range(n):
             if not math.isfinite(P[i, j]):
-                return P, NOT_FINITE
-    sigmas = np.empty(n)
+                return NOT_FINITE, sigmas
     for i in range(n):
         if not P[i, i] > 0.0:
-            return P, NOT_POSITIVE
+            return NOT_POSITIVE, sigmas
         sigmas[i] = math.sqrt(P[i, i])
     for i in range(n):
         for j in range(i):
             if abs(P[i, j] - P[j, i]) > 1e-9 * sigmas[i] * sigmas[j]:
-                return P, NOT_SYMMETRIC
+                return NOT_SYMMETRIC, sigmas
+    return 0, sigmas
+
+
+@compiled
+def factor_or_fault(P: Matrix) -> tuple[Matrix, int]:
+    """The factor of `cholesky_factor`, and the index in FAULTS of why there is none."""
+    n = len(P)
+    fault, sigmas = fault_of(P)
+    if fault:
+        return P, fault
     factor, definite = factored(P.T.copy())
     if not definite:
         return P, NOT_POSITIVE

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from central import tick_fold
-from central.checkpoints import Checkpoint, thinned
+from central.checkpoints import NEAR, Checkpoint, thinned
 from central.config import CentralConfig
 from central.tick_fold import TickFold
 from team import translate
@@ -85,6 +85,21 @@ def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(expect
     assert bits(ticks.provisional()) == expected
     ticks.take_until(float("inf"))
     assert bits(ticks.fold) == expected
+
+
+def test_what_a_late_submap_does_not_change_is_condensed_once(monkeypatch):
+    ticks, made = fresh(), []
+    *all_but_one, last = SUBMAPS.every()
+    for each in all_but_one:
+        add(ticks, each)
+    ticks.take_until(float("inf"))
+    condense = tick_fold.condensed
+    monkeypatch.setattr(tick_fold, "condensed", lambda fold: made.append(fold) or condense(fold))
+    add(ticks, last)
+    ticks.take_until(float("inf"))
+    assert not made
+    assert bits(ticks.fold) == bits(straight().fold)
+    assert sum(each.ahead is not None for each in ticks.checkpoints.taken) <= NEAR
 
 
 def test_the_full_solution_is_that_of_the_raw_set_to_the_bit():

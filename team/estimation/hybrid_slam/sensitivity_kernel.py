@@ -8,9 +8,9 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import Bias
 from team.estimation import elementary
+from team.estimation.arrow_kernel import solve_arrow
 from team.estimation.compiled import compiled
-from team.estimation.dense_kernel import solve_lower, solve_stack, solve_upper
-from team.estimation.gaussian import factor_or_fault
+from team.estimation.dense_kernel import solve_stack
 from team.estimation.geometry import adjoint, between
 from team.estimation.hybrid_slam.moments import mean_path
 from team.estimation.models import NEAREST_M
@@ -115,11 +115,9 @@ def columns_of_all(
     rows = _measurement_rows(path, landmarks, at, slots, own, noise)
     _add_motions(A, right, path, metrics, shifts)
     _add_measurements(A, right, rows, at, slots, 3 * count)
-    L, fault = factor_or_fault(A)
+    fault = solve_arrow(A, right, 3 * count)
     if fault:
         return poses, none, fault
-    solve_lower(L, right)
-    solve_upper(L, right)
     twists = right[: 3 * count].T.copy().reshape(biases, count, 3)
     for k in range(count):
         s, c = elementary.sin_and_cos(path[k, 2])

@@ -12,9 +12,11 @@ from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation import geometry
+from team.estimation import dense, geometry
+from team.estimation.arrow_kernel import solve_arrow
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
+from team.estimation.gaussian import FAULTS
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.sensitivity_kernel import BIASES, carried_on
 from team.estimation.map_joining import joining, marginals
@@ -100,6 +102,26 @@ def test_columns_change_nothing_else():
     assert np.array_equal(made[0].mean, made[1].mean)
     assert np.array_equal(made[0].covariance, made[1].covariance)
     assert made[0].biases == ()
+
+
+def test_an_arrow_is_solved_to_the_bits_of_a_dense_matrix():
+    random, poses, rows = np.random.default_rng(1), 13, []
+    for k in range(poses):
+        seen = 3 * poses + 2 * random.integers(4)
+        for own in (
+            range(max(3 * k - 3, 0), 3 * k + 3),
+            [*range(3 * k, 3 * k + 3), seen, seen + 1],
+        ):
+            row = np.zeros(3 * poses + 8)
+            row[list(own)] = random.normal(size=len(own))
+            rows.append(np.outer(row, row))
+    A = sum(rows) + np.eye(3 * poses + 8)
+    right = random.normal(size=(len(A), 4))
+    expected = dense.solve_factored(dense.cholesky(A), right)
+    assert solve_arrow(A.copy(), right, 3 * poses) == 0
+    assert right.tobytes() == expected.tobytes()
+    A[2, 2] = -1.0
+    assert FAULTS[solve_arrow(A, right, 3 * poses)] == "not positive definite"
 
 
 @settings(deadline=None)
