@@ -13,6 +13,7 @@ from team.wire.arrays import (
     check_blocks,
     check_finite,
     check_pose_covariance,
+    check_ranges,
     check_semidefinite,
     floats,
     ids,
@@ -106,9 +107,7 @@ class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1")
 
     def check(self) -> None:  # noqa: D102
         n = len(ids(self.ids, "ids"))
-        check_finite(self.ranges, "ranges", n)
-        if n and floats(self.ranges, "ranges").min() < 0.0:
-            raise ValueError("out of bounds: a range is negative")
+        check_ranges(self.ranges, "ranges", n)
         check_angles(self.bearings, "bearings", n)
         if self.covariances:
             check_blocks(self.covariances, n, "covariances")
@@ -154,9 +153,7 @@ class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
 
     def check(self) -> None:  # noqa: D102
         n = len(floats(self.ranges, "ranges"))
-        check_finite(self.ranges, "ranges")
-        if n and floats(self.ranges, "ranges").min() < 0.0:
-            raise ValueError("out of bounds: a range is negative")
+        check_ranges(self.ranges, "ranges")
         check_angles(self.bearings, "bearings", n)
         if self.covariances:
             check_blocks(self.covariances, n, "covariances")
@@ -172,9 +169,7 @@ class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):
     bearings: Floats
 
     def check(self) -> None:  # noqa: D102
-        check_finite(self.ranges, "ranges", len(self.teammates))
-        if self.teammates and floats(self.ranges, "ranges").min() < 0.0:
-            raise ValueError("out of bounds: a range is negative")
+        check_ranges(self.ranges, "ranges", len(self.teammates))
         check_angles(self.bearings, "bearings", len(self.teammates))
 
 
