@@ -94,10 +94,13 @@ class Intervals(NamedTuple):
 
     def first(self, count: int) -> "Intervals":
         """The first `count` of them."""
-        if count >= len(self.forward):
+        return self.part(0, count)
+
+    def part(self, begin: int, end: int) -> "Intervals":
+        """Those from `begin` to `end` − 1."""
+        if not begin and end >= len(self.forward):
             return self
-        ends_ns, durations_ns, forward, yaw_rates = self
-        return Intervals(ends_ns[:count], durations_ns[:count], forward[:count], yaw_rates[:count])
+        return Intervals(*(column[begin:end] for column in self))
 
     @property
     def last(self) -> OdometryInterval:

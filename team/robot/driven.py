@@ -18,13 +18,10 @@ def driven(
     out: list[Outgoing] = []
     at = 0
     while at < block.size:
-        # The first one behind another measurement, and the one that stops a run, lead to more.
-        out += give(block.message(at))
-        at += 1
-        reports = True
-        while reports and at < block.size:
-            count, answer = node.drive_on(block.part(at, block.size))
-            out += answer
-            at += count
-            reports = bool(answer)  # it stopped to report its progress, and can go on
+        count, answer = node.drive_on(block.part(at, block.size))
+        out += answer
+        at += count
+        if not answer and at < block.size:  # it did not stop to report: the next one leads to more
+            out += give(block.message(at))
+            at += 1
     return out

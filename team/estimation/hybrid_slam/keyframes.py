@@ -175,23 +175,39 @@ class Segmenter:
         return keyframes
 
     def quiet(self, intervals: Intervals) -> int:
-        """Number of the first intervals that only move the robot: no scan, no pose node and no
-        end of a keyframe is in them.
+        """Number of the first intervals that lead to no keyframe: no pose node and no end of a
+        keyframe is in them, and no scan that is one or ends one.
         """
         grid = self._grid
         if self._sensor.is_mounted or (grid is not None and grid.carries):
             return 0
-        until_ns = [scan.stamp_ns for scan in self._waiting[:1]]
-        until_ns += [] if grid is None else [grid.quiet_until_ns]
-        until_ns += [self._keyframe_start_ns + self._keyframe_ns] if self._keyframe else []
+        until_ns = [] if grid is None else [grid.quiet_until_ns]
+        full_ns = self._keyframe_start_ns + self._keyframe_ns
+        if self._keyframe:
+            until_ns.append(full_ns)
+        elif self._waiting:
+            stamp_ns = self._waiting[0].stamp_ns
+            until_ns.append(max(stamp_ns, full_ns) if self._keyframe_ns else stamp_ns)
         ends_ns = intervals.ends_ns
         return int(ends_ns.searchsorted(min(until_ns))) if until_ns else len(ends_ns)
 
     def drive_on(self, intervals: Intervals) -> None:
         """Take some of the `quiet` intervals, as `drive` takes each of them."""
-        self._last, self._unmeasured = intervals.last, None
-        self._run.add_all(intervals)
-        self.now_ns = self._last.end_ns
+        while self._waiting and self._waiting[0].stamp_ns <= intervals.ends_ns[-1]:
+            covers = int(intervals.ends_ns.searchsorted(self._waiting[0].stamp_ns))
+            self._go_over(intervals.part(0, covers))
+            self.drive(intervals.part(covers, covers + 1).last)
+            intervals = intervals.part(covers + 1, len(intervals.ends_ns))
+            if not len(intervals.ends_ns):
+                return
+        self._go_over(intervals)
+
+    def _go_over(self, intervals: Intervals) -> None:
+        """Take intervals without a scan in them."""
+        if len(intervals.ends_ns):
+            self._last, self._unmeasured = intervals.last, None
+            self._run.add_all(intervals)
+            self.now_ns = self._last.end_ns
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
         """Close the window here: returns its last keyframe, if one is open, and the motion after
