@@ -25,19 +25,20 @@ def solve_arrow(A: Matrix, right: Panel, poses: int) -> int:
     """Overwrite `right` with A⁻¹ right; returns why there is no solution, an index in
     `gaussian.FAULTS`.
 
-    poses: number of A's first unknowns that are poses, three for each. A is overwritten.
+    poses: number of A's first unknowns that are poses, three for each. The lower triangle is read.
     """
     fault, sigmas = fault_of(A)
     if fault:
         return fault
-    if not _factor(A, poses):
+    U = A.T.copy()
+    if not _factor(U, poses):
         return NOT_POSITIVE
-    for i in range(len(A)):
-        pivot = A[i, i] / sigmas[i]
-        if pivot * pivot <= len(A) * EPSILON:
+    for i in range(len(U)):
+        pivot = U[i, i] / sigmas[i]
+        if pivot * pivot <= len(U) * EPSILON:
             return NOT_POSITIVE
-    _solve_lower(A, right, poses)
-    _solve_upper(A, right, poses)
+    _solve_lower(U, right, poses)
+    _solve_upper(U, right, poses)
     return 0
 
 
