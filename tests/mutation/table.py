@@ -43,7 +43,10 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
         ),
     ),
     "team/estimation/hybrid_slam/moments.py": (6, WINDOW),
-    "team/estimation/arrow_kernel.py": (6, ("estimation/hybrid_slam/test_sensitivity.py",)),
+    "team/estimation/hybrid_slam/arrow_kernel.py": (
+        6,
+        ("estimation/hybrid_slam/test_sensitivity.py",),
+    ),
     "team/estimation/hybrid_slam/landmarks_along_paths.py": (
         8,
         (*WINDOW, "estimation/hybrid_slam/test_correlated_measurements.py"),

@@ -8,10 +8,10 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import Bias
 from team.estimation import elementary
-from team.estimation.arrow_kernel import solve_arrow
 from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import solve_stack
 from team.estimation.geometry import adjoint, between
+from team.estimation.hybrid_slam.arrow_kernel import solve_arrow
 from team.estimation.hybrid_slam.moments import mean_path
 from team.estimation.models import NEAREST_M
 

@@ -13,11 +13,11 @@ from sim.world.simulator import simulated
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation import dense, geometry
-from team.estimation.arrow_kernel import solve_arrow
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import FAULTS
 from team.estimation.hybrid_slam import window as windows
+from team.estimation.hybrid_slam.arrow_kernel import solve_arrow
 from team.estimation.hybrid_slam.sensitivity_kernel import BIASES, carried_on
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
