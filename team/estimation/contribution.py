@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt32
 
 from team.estimation.gaussian import information
-from team.estimation.submap import LocalMap
+from team.estimation.submap import LocalMap, Unnamed
 
 Stream: TypeAlias = tuple[str, int]
 """(robot, incarnation): one unbroken life of a robot's sensor stream."""
@@ -19,6 +19,20 @@ Key: TypeAlias = tuple[int, str, int, int]
 def named(stream: Stream) -> str:
     """`r3 (incarnation 2)`."""
     return f"{stream[0]} (incarnation {stream[1]})"
+
+
+class Observation(NamedTuple):
+    """Which landmarks a submap has: what data association asks of it, without its measurements.
+
+    unnamed, spacings, distinct: see `LocalMap`.
+    """
+
+    stream: Stream
+    sequence: int
+    ids: UInt32[np.ndarray, " L"]
+    unnamed: Unnamed
+    spacings: Float[np.ndarray, "U U"]
+    distinct: Bool[np.ndarray, "L L"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +54,12 @@ class Contribution:
     def key(self) -> Key:
         """Place in the canonical order: (end stamp, robot, incarnation, sequence)."""
         return (self.end_ns, self.robot, self.incarnation, self.sequence)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """Which landmarks it has."""
+        of = self.local
+        return Observation(self.stream, self.sequence, of.ids, of.unnamed, of.spacings, of.distinct)
 
     @cached_property
     def information(self) -> Float[np.ndarray, "n n"]:

@@ -114,7 +114,7 @@ class LocalMap:
         """Landmark positions in the start frame [m]."""
         return self.mean[3 + 3 * len(self.node_stamps) :].reshape(-1, 2)
 
-    @cached_property
+    @property
     def spacings(self) -> Float[np.ndarray, "U U"]:
         """Distances between landmarks without names that one keyframe saw [m]; ∞ between others."""
         x, y = self.landmarks[self.ids >= UNNAMED].T
@@ -124,19 +124,16 @@ class LocalMap:
         np.fill_diagonal(away, np.inf)
         return np.asarray(away)
 
-    @cached_property
-    def distinct(self) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-        """The pairs of landmarks, by their places in `ids`, that can not be one: two that one
-        keyframe observed, and all pairs with a landmark that has a name. Empty where all have.
+    @property
+    def distinct(self) -> Bool[np.ndarray, "L L"]:
+        """Which two landmarks, by their places in `ids`, can not be one: two that one keyframe
+        observed, and all pairs with a landmark that has a name. None where all have.
         """
         unnamed = self.ids >= UNNAMED
-        if not unnamed.any():
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        together = np.ones((len(self.ids), len(self.ids)), np.bool_)
+        together = np.full((len(self.ids), len(self.ids)), bool(unnamed.any()))
         masks = self.unnamed.seen.astype(np.float32)
         together[np.ix_(unnamed, unnamed)] = masks @ masks.T > 0.0
-        one, two = np.nonzero(together)
-        return one, two
+        return together
 
     @property
     def nodes(self) -> Float[np.ndarray, "K 3"]:

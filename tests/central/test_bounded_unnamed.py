@@ -88,7 +88,7 @@ def folded(messages, bounded=True, watermarks=()):
 
 def bits(fold):
     old = fold.main.graph.condensed
-    seen = [str(each.contribution.key) for each in fold.main.graph.observed]
+    seen = [str(each.observation[:2]) for each in fold.main.graph.observed]
     parts = [fold.main.state.tobytes(), *map(str.encode, seen), str(fold.landmarks.sets).encode()]
     parts.append(str(fold.landmarks.present).encode())
     return b"".join(parts if old is None else [*parts, old.information.tobytes()])

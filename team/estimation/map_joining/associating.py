@@ -76,7 +76,7 @@ class IslandView:
             np.concatenate([np.zeros(0, np.int64), *map(np.unique, self.seen_by)]),
             minlength=len(points),
         )
-        around = Crowd((each.contribution.local for each in graph.observed), points[counts > 1])
+        around = Crowd((each.observation.spacings for each in graph.observed), points[counts > 1])
         self.profile = around.bounded(island.settings.association)
         unseen = overlooked(points, self.seen_by, self.profile.same)
         self.gone = np.zeros(len(nodes), np.bool_)
@@ -92,15 +92,15 @@ class IslandView:
     def unnamed(self, k: int) -> Indices:
         """Indices of the unnamed landmarks of submap k."""
         seen = self.island.graph.observed[k]
-        nodes = seen.landmarks[seen.contribution.local.ids >= UNNAMED]
+        nodes = seen.landmarks[seen.observation.ids >= UNNAMED]
         places: Indices = np.unique(self.place[nodes[nodes >= 0]])
         return places
 
     def views(self, k: int) -> list[Indices]:
         """Indices of the unnamed landmarks that each keyframe of submap k observed together."""
         seen = self.island.graph.observed[k]
-        nodes = seen.landmarks[seen.contribution.local.ids >= UNNAMED]
-        views = (nodes[each] for each in seen.contribution.local.unnamed.views)
+        nodes = seen.landmarks[seen.observation.ids >= UNNAMED]
+        views = (nodes[each] for each in seen.observation.unnamed.views)
         return [self.place[view[view >= 0]] for view in views]
 
     def take(self, pairs: Iterable[Pair], joint: Joint, kind: str) -> None:
@@ -203,9 +203,10 @@ def _apart(
     named = np.array(ids) < UNNAMED
     apart = named[:, None] & named[None, :]
     for submap in graph.observed:
-        one, two = (submap.landmarks[each] for each in submap.contribution.local.distinct)
-        both = (one >= 0) & (two >= 0)
-        apart[place[one[both]], place[two[both]]] = True
+        known = submap.landmarks >= 0
+        places = place[submap.landmarks[known]]
+        one, two = np.nonzero(submap.observation.distinct[known][:, known])
+        apart[places[one], places[two]] = True
     for first, second, same in landmarks.verdicts:
         here, there = (place_of.get(landmarks.identity(each) or -1) for each in (first, second))
         if not same and here is not None and there is not None:
@@ -228,10 +229,10 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
     """Tracks, merges nearby landmarks and sweeps, for the new submaps of one island."""
     island = fold.islands[key]
     view = IslandView(island, fold.landmarks)
-    order = {id(each.contribution): k for k, each in enumerate(island.graph.observed)}
+    order = {each.observation[:2]: k for k, each in enumerate(island.graph.observed)}
     view.agreed(fold.landmarks)
     for contribution in arrived:
-        k = order.get(id(contribution))
+        k = order.get((contribution.stream, contribution.sequence))
         if k is None or not len(contribution.local.unnamed.counts):
             continue
         fresh = view.unnamed(k)
@@ -249,12 +250,12 @@ def _followed(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
 
 
 def _again(
-    view: IslandView, order: Mapping[int, int], arrived: Sequence[Contribution]
+    view: IslandView, order: Mapping[tuple[Stream, int], int], arrived: Sequence[Contribution]
 ) -> list[int]:
     """Indices of older submaps near the tick's ones with landmarks that may be one with others: a
     pair that was undecided may be decidable now.
     """
-    fresh = [k for each in arrived if (k := order.get(id(each))) is not None]
+    fresh = [k for each in arrived if (k := order.get((each.stream, each.sequence))) is not None]
     near = np.flatnonzero(view.sees[fresh].any(axis=0))
     if not len(near):
         return []
@@ -285,8 +286,8 @@ def recent(graph: Graph, stream: Stream, sequence: int, count: int) -> list[int]
     return [
         k
         for k, each in enumerate(graph.observed)
-        if each.contribution.stream == stream
-        and sequence - count <= each.contribution.sequence < sequence
+        if each.observation.stream == stream
+        and sequence - count <= each.observation.sequence < sequence
     ]
 
 

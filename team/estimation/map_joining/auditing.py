@@ -70,7 +70,7 @@ def share_now(fold: Fold, opened: Opened) -> float | None:
     newer = {stream: (first, last) for stream, first, last in opened.newer}
     sides = np.zeros((2, len(graph.fixed)), np.bool_)
     for submap in graph.observed:
-        of = submap.contribution
+        of = submap.observation
         first, last = newer.get(of.stream, (OPEN, -OPEN))
         if first <= of.sequence <= last:
             sides[0, submap.known] = True

@@ -111,7 +111,7 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
         nodes = submap.landmarks
         if leaves:
             counts[nodes] += 1
-            taken.append(Observed(submap.contribution, nodes, counts[nodes]))
+            taken.append(Observed(submap.contribution.observation, nodes, counts[nodes]))
         else:
             stays[nodes] = True
     memory = graph.memory.longer(taken)

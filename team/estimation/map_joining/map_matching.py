@@ -101,7 +101,7 @@ def _patch(view: IslandView, stream: Stream, last: int) -> list[int]:
     return [
         k
         for k, submap in enumerate(view.island.graph.observed)
-        if submap.contribution.stream == stream and first < submap.contribution.sequence <= last
+        if submap.observation.stream == stream and first < submap.observation.sequence <= last
     ]
 
 

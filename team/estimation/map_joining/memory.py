@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from team.estimation.contribution import Contribution
+from team.estimation.contribution import Observation
 
 Indices = Int64[np.ndarray, " _"]
 
@@ -38,7 +38,7 @@ class Observed(NamedTuple):
         that is not condensed.
     """
 
-    contribution: Contribution
+    observation: Observation
     landmarks: Indices
     counts: Indices
 
@@ -112,9 +112,7 @@ class Memory:
             return self
         pairs, distinct = [self.pairs], [self.distinct]
         for each in forgotten:
-            one, two = each.contribution.local.distinct
-            marks = np.zeros((len(each.landmarks), len(each.landmarks)), np.bool_)
-            marks[one, two] = True
+            marks = each.observation.distinct
             one, two = np.triu_indices(len(marks), 1)
             pairs.append(np.column_stack([each.landmarks[one], each.landmarks[two]]))
             distinct.append(marks[one, two])

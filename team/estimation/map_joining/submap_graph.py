@@ -152,7 +152,10 @@ class Graph:
         """The submaps that data association examines: the condensed ones that are remembered, then
         the others.
         """
-        own = (Observed(each.contribution, each.landmarks, NO_COUNTS) for each in self.submaps)
+        own = (
+            Observed(each.contribution.observation, each.landmarks, NO_COUNTS)
+            for each in self.submaps
+        )
         return (*self.memory.submaps, *own)
 
     @cached_property

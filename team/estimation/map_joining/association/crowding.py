@@ -19,7 +19,6 @@ from jaxtyping import Float
 
 from team.association import AssociationProfile
 from team.estimation import elementary, elementwise
-from team.estimation.submap import LocalMap
 
 CLOSE = 0.1
 """Quantile of the landmarks' spacing that is taken as the spacing within groups."""
@@ -29,16 +28,20 @@ SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
 """Upper bounds of a profile's lengths, in multiples of this spacing."""
 
 
+Spacings = Float[np.ndarray, "U U"]
+
+
 class Crowd:
     """The spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
+    spacings: of each submap (`LocalMap.spacings`).
     confirmed: positions of the landmarks that several submaps have observed [m].
     """
 
     def __init__(
-        self, submaps: Iterable[LocalMap], confirmed: Float[np.ndarray, "n 2"] | None = None
+        self, spacings: Iterable[Spacings], confirmed: Float[np.ndarray, "n 2"] | None = None
     ) -> None:
-        each = [local.spacings for local in submaps]
+        each = list(spacings)
         self.landmarks = sum(len(away) for away in each)
         nearest = np.concatenate(
             [np.zeros(0), *(away.min(axis=1, initial=np.inf) for away in each)]

@@ -54,16 +54,16 @@ def test_a_profiles_lengths_are_bounded_by_the_spacing_of_what_is_seen_together(
     rng = np.random.default_rng(2)
     groups = np.repeat(rng.uniform(0.0, 12.0, (8, 2)), 2, axis=0)
     groups[1::2] += [0.2, 0.0]
-    crowd = Crowd([_submap(groups, together=True)])
+    crowd = Crowd([_submap(groups, together=True).spacings])
     bounded = crowd.bounded(AssociationProfile(same=1.7, tight=0.5, slack=0.1))
     assert bounded.same == pytest.approx(0.3)
     assert (bounded.tight, bounded.slack) == pytest.approx((0.1, 0.036))
     assert bounded.near == PROFILE.near
     within = crowd.density(np.array([0.3]))[0]
     assert within == pytest.approx(1.0 / (np.pi * 0.3**2), rel=0.1)
-    few = Crowd([_submap(groups[:3], together=True)]).bounded(AssociationProfile(same=1.7))
+    few = Crowd([_submap(groups[:3], together=True).spacings]).bounded(AssociationProfile(same=1.7))
     assert few.same == pytest.approx(0.3)
-    nobody = Crowd([_submap(groups, together=False)])
+    nobody = Crowd([_submap(groups, together=False).spacings])
     assert nobody.bounded(PROFILE) == PROFILE
     assert nobody.density(np.array([0.3]))[0] < 0.1 * within
 
@@ -76,7 +76,7 @@ def test_two_places_are_one_landmark_sooner_where_the_maps_landmarks_stand_far_a
     llr = {"the profile's density": float(likelihoods(strangers, *pair, PROFILE).llr[0])}
     for name, spacing in (("far apart", 2.0), ("close", 0.3)):
         at = spacing * np.array([(i, j) for i in range(10) for j in range(10)], float)
-        crowd = Crowd([_submap(at, together=True)], at)
+        crowd = Crowd([_submap(at, together=True).spacings], at)
         of_one_map = strangers._replace(crowd=crowd, unseen=np.ones(2))
         llr[name] = float(likelihoods(of_one_map, *pair, PROFILE).llr[0])
         between = likelihoods(strangers._replace(crowd=crowd), *pair, PROFILE).llr[0]
