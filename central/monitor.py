@@ -117,8 +117,9 @@ def finding(agreement: Agreement, normal: float = 1.0) -> Finding:
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
     """The covariance scale of the team (the empty name) and of each robot, where there is one."""
-    chi2, dof = np.array([(each.chi2, each.dof) for each in submaps]).reshape(-1, 2).T
-    robots = np.array([each.stream[0] for each in submaps])
+    chi2 = np.array([chi2 for _, _, chi2, _, _ in submaps])
+    dof = np.array([dof for *_, dof, _ in submaps])
+    robots = np.array([stream[0] for stream, *_ in submaps])
     chosen = {"": np.ones(len(submaps), dtype=np.bool_)}
     chosen |= {str(robot): robots == robot for robot in np.unique(robots)}
     half = np.asarray(chi2_quantile(0.5, dof))
@@ -158,7 +159,7 @@ def _misscale(scale: Scale, limit: float) -> str:
 
 def _level(chi2: float, dof: float) -> str | None:
     ratio = chi2 / dof
-    if ratio <= max(WARN, _bound(round(dof, 1), QUANTILE)):
+    if ratio <= WARN or ratio <= _bound(round(dof, 1), QUANTILE):
         return None
     if ratio > FAIL:
         return f"above {FAIL}: its covariances are not to be trusted"

@@ -59,14 +59,15 @@ class SentPriors:
 
 def _has_changed(old: _Sent, now: LandmarkBlocks, needed: Int64[np.ndarray, " k"]) -> bool:
     ids = now.ids[needed]
-    if not np.isin(ids, old.ids).all():
-        return True
     if not len(needed):
         return False
+    at = np.searchsorted(old.ids, ids)
+    if at.max() == len(old.ids) or (old.ids[at] != ids).any():
+        return True
     before = np.searchsorted(old.blocks.ids, ids)
     moved = now.means[needed] - old.blocks.means[before]
     variances, were = (
-        np.trace(each, axis1=1, axis2=2)
+        each[:, 0, 0] + each[:, 1, 1]
         for each in (now.covariances[needed], old.blocks.covariances[before])
     )
     share = 2.0 * (moved * moved).sum(axis=1) / variances

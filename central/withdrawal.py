@@ -26,9 +26,9 @@ Without = Callable[[Collection[str]], Agreement | None]
 def disagreement(agreement: Agreement) -> dict[str, float]:
     """The median of χ²/dof over the submaps of each robot that has enough of them."""
     ratios: dict[str, list[float]] = {}
-    for each in agreement.submaps:
-        if each.dof >= 1.0:
-            ratios.setdefault(each.stream[0], []).append(each.chi2 / each.dof)
+    for (robot, _), _, chi2, dof, _ in agreement.submaps:
+        if dof >= 1.0:
+            ratios.setdefault(robot, []).append(chi2 / dof)
     return {r: median(ratios[r]) for r in sorted(ratios) if len(ratios[r]) >= LEAST_SUBMAPS}
 
 

@@ -1,6 +1,7 @@
 """Gaussians as (mean, covariance), and the checks and packings of covariance matrices."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ from team.estimation.geometry import tangent
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
+
+SMALL = 128
+"""Largest matrix whose triangle's places are kept."""
 
 
 class PoseGaussian(NamedTuple):
@@ -142,15 +146,25 @@ def carried_along(
     return np.concatenate([moved, new_mean]), 0.5 * (joint + joint.T)
 
 
+def upper_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+    """Rows and columns of the upper triangle of an n × n matrix, row by row; not to be changed."""
+    return _small_triangle(n) if n <= SMALL else np.triu_indices(n)
+
+
+@lru_cache(maxsize=SMALL)
+def _small_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+    return np.triu_indices(n)
+
+
 def packed(covariance: Matrix) -> Float[np.ndarray, " m"]:
     """The upper triangle row by row: n(n+1)/2 numbers."""
-    return np.ascontiguousarray(covariance[np.triu_indices(len(covariance))])
+    return np.ascontiguousarray(covariance[upper_triangle(len(covariance))])
 
 
 def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
     """The symmetric n × n matrix of a packed upper triangle."""
     upper = np.zeros((n, n))
-    upper[np.triu_indices(n)] = triangle
+    upper[upper_triangle(n)] = triangle
     return upper + np.triu(upper, 1).T
 
 

@@ -11,7 +11,7 @@ from central.tick_fold import TickFold
 from team import translate
 from team.association import AssociationProfile
 from team.config import UNNAMED
-from team.estimation.map_joining import auditing, condensing
+from team.estimation.map_joining import auditing, condensing, marginals
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.relinearising import is_due
 from team.estimation.submap import LocalMap, Unnamed
@@ -104,6 +104,21 @@ def test_the_running_fold_is_bounded_and_the_full_solution_is_that_of_the_raw_se
     one, other = bounded.solved(), full.solved()
     assert bits(one) == bits(other)
     assert one.departed == other.departed == 0
+
+
+def test_the_full_solution_of_a_large_set_has_the_running_folds_identities(world, monkeypatch):
+    messages, _ = world
+    ticks, raw = folded(messages), folded(messages, bounded=False).solved()
+    taken = []
+    monkeypatch.setattr(tick_fold, "taken", lambda *_: taken.append(_))
+    monkeypatch.setattr(tick_fold, "FULL_UNNAMED", len(messages) - 1)
+    solved = ticks.solved()
+    assert not taken, "no tick is taken again"
+    assert solved.departed == 0
+    assert solved.landmarks.sets == raw.landmarks.sets
+    one, two = marginals.landmark_map(solved), marginals.landmark_map(raw)
+    apart = (one.means - two.means).ravel()
+    assert apart @ np.linalg.solve(two.covariance, apart) < 1e-3 * len(apart)
 
 
 def test_a_closure_of_what_is_condensed_is_solved_with_all_of_it_linearised_again(

@@ -8,9 +8,10 @@ where the poses that occur in no other factor are eliminated (Schur complement).
 for the linearisation point, which stays `at`, and the robust weights, which keep their values.
 """
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -86,13 +87,15 @@ class Departed(NamedTuple):
 
 def newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
     """The costs of the last HISTORY submaps of each stream, in their order."""
-    counts: dict[Stream, int] = defaultdict(int)
+    counts = Counter(stream for stream, *_ in submaps)
+    older = {stream: count - HISTORY for stream, count in counts.items() if count > HISTORY}
     found = []
-    for each in reversed(submaps):
-        counts[each.stream] += 1
-        if counts[each.stream] <= HISTORY:
+    for each in submaps:
+        if older.get(each[0], 0) > 0:
+            older[each[0]] -= 1
+        else:
             found.append(each)
-    return tuple(reversed(found))
+    return tuple(found)
 
 
 NOBODY = Departed({}, (), {}, {})
@@ -113,6 +116,11 @@ class Resting:
     means: Values
     gain: Float[np.ndarray, "r n"]
     covariance: Float[np.ndarray, "r r"]
+
+    @cached_property
+    def place(self) -> Mapping[int, int]:
+        """The place of each id in the order."""
+        return {id_: k for k, id_ in enumerate(self.ids.tolist())}
 
 
 def nobody_rests(numbers: int) -> Resting:

@@ -145,11 +145,11 @@ def _sorted_out(
 
     Raises KeyError for an id that the island has not.
     """
-    landmarks, rest = island.graph.landmarks, resting_of(island)
-    awake = np.array([id_ in landmarks for id_ in ids], np.bool_)
-    nodes = np.array([landmarks[id_] for id_ in ids if id_ in landmarks], np.int64)
+    landmarks = island.graph.landmarks
+    found = np.array([landmarks.get(id_, -1) for id_ in ids], np.int64)
+    awake = found >= 0
     if awake.all():
-        return awake, nodes, np.zeros(0, np.int64)
-    place = {id_: k for k, id_ in enumerate(rest.ids.tolist())}
-    at = np.array([place[id_] for id_ in ids if id_ not in landmarks], np.int64)
-    return awake, nodes, at
+        return awake, found, np.zeros(0, np.int64)
+    place = resting_of(island).place
+    at = [place[id_] for id_, is_node in zip(ids, awake.tolist(), strict=True) if not is_node]
+    return awake, found[awake], np.array(at, np.int64)
