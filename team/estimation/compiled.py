@@ -97,10 +97,15 @@ class _CacheFile(IndexDataCacheFile):
         self._save_index({**self._load_index(), key: name})  # type: ignore[no-untyped-call]
 
     def _load_data(self, name: str) -> Any:
-        if not loads_alone():
-            return super()._load_data(name)  # type: ignore[no-untyped-call] # Numba's
-        with open(self._data_path(name), "rb") as file:  # type: ignore[no-untyped-call] # Numba's
-            return unpickled(file)
+        """The code of one form. What can not be read counts as not there: it raises OSError."""
+        try:
+            if not loads_alone():
+                return super()._load_data(name)  # type: ignore[no-untyped-call] # Numba's
+            path = self._data_path(name)  # type: ignore[no-untyped-call] # Numba's
+            with open(path, "rb") as file:
+                return unpickled(file)
+        except Exception as error:  # a damaged pickle raises what its bytes happen to mean
+            raise OSError(f"{name} is damaged, or names what has another name now") from error
 
 
 _NAMES = b"parts numbered at random"
@@ -110,12 +115,14 @@ _CALLERS: ContextVar[tuple[Callable[..., object], ...]] = ContextVar("callers", 
 
 
 class CircularKernelsError(TypeError):
-    """Kernels call each other in a circle, so that the program of one would contain itself."""
+    """A kernel calls itself, or several each other: the program of one would contain itself."""
 
     def __init__(self, circle: Sequence[Callable[..., object]]) -> None:
         self.circle = tuple(circle)
         names = " -> ".join(f"{each.__module__}.{each.__qualname__}" for each in circle)
-        super().__init__(f"kernels call each other in a circle: {names}; make them one kernel")
+        super().__init__(
+            f"kernels call each other in a circle: {names}; make them one kernel with a loop"
+        )
 
 
 @cache
@@ -123,8 +130,9 @@ def program_of(kernel: Callable[..., object]) -> str:
     """Digest of a kernel's byte code and of all that its names refer to: kernels and constants.
 
     Of a named tuple only its fields matter. A name of anything else, such as a class, adds all
-    sources that the kernel's module imports. A kernel that calls itself adds no more by that.
-    Raises CircularKernelsError where kernels call each other in a circle.
+    sources that the kernel's module imports.
+    Raises CircularKernelsError where kernels call each other in a circle, or one calls itself: code
+    of it that is loaded from the cache ends the process.
     """
     callers = _CALLERS.get()
     if kernel in callers:
@@ -188,9 +196,7 @@ def _add_meant(
             value = getattr(value, attribute)
     digest.update(".".join(chain).encode())
     function = getattr(value, "py_func", None)
-    if function is kernel:
-        digest.update(b"itself")
-    elif function is not None:
+    if function is not None:
         digest.update(program_of(function).encode())
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())

@@ -313,14 +313,14 @@ def odd(n: int) -> bool:
 """
 
 
-def test_a_kernel_may_call_itself_and_a_circle_of_kernels_is_named(
+def test_a_kernel_that_calls_itself_and_a_circle_of_kernels_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "calling_kernels.py").write_text(CALLS)
     module = importlib.import_module("calling_kernels")
-    assert len(program_of(module.factorial.py_func)) == 16
-    assert module.factorial(5) == 120
+    with pytest.raises(CircularKernelsError, match=r"kernels\.factorial -> .*factorial; make them"):
+        program_of(module.factorial.py_func)
     with pytest.raises(CircularKernelsError, match=r"kernels\.even -> .*odd -> .*even; make them"):
         program_of(module.even.py_func)
 
@@ -339,3 +339,25 @@ def test_code_that_names_a_class_that_is_gone_is_compiled_anew(
     assert list(index._load_index().values()) == ["kernel.1.nbc"]
     del module.Record
     assert index._load_index() == {}
+
+
+def test_code_that_can_not_be_read_counts_as_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of machine code that was cut off, or that names a class that is gone: every call of
+    the kernel failed until somebody removed the file.
+    """
+    module = ModuleType("names_in_kernels")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec("class Record: pass", vars(module))
+    files = _CacheFile(str(tmp_path), "kernel", "program")
+    files.save("form", module.Record)
+    assert files.load("form") is module.Record
+    (code,) = tmp_path.glob("*.nbc")
+    whole = code.read_bytes()
+    for damaged in (b"", whole[:-3], b"\0" * len(whole)):
+        code.write_bytes(damaged)
+        assert files.load("form") is None
+    code.write_bytes(whole)
+    del module.Record
+    assert files.load("form") is None
