@@ -142,7 +142,8 @@ def launch(
         typer.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == ANY_PORT:
         listen = LOOPBACK  # drivers have to find it
-    for text in (*scenario_warnings(resolved), *([missing] if missing else [])):
+    warnings = [*scenario_warnings(resolved), *([missing] if missing else []), *_paces(streams)]
+    for text in warnings:
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
@@ -214,15 +215,24 @@ def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStre
 
     A data set is read before any process starts. What is simulated needs none of this.
     """
-    from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UtiasWorld
+    from sim.world.config import LiveWorld, SimulatedWorld
 
     if isinstance(scenario.world, SimulatedWorld | LiveWorld):
         return scenario, None, None
     from sim.scenarios.source import streams_of, with_present_robots
 
     present, missing = with_present_robots(scenario)
-    is_checked = isinstance(present.world, UtiasWorld | FolderWorld)
-    return present, missing, streams_of(present) if is_checked else None
+    return present, missing, streams_of(present)
+
+
+def _paces(streams: "WorldStreams | None") -> list[str]:
+    """Notes on robots whose times are probably not in seconds."""
+    if streams is None:
+        return []
+    from sim.datasets.folder_odometry import PACE
+
+    notes = ((each.robot, note) for each in streams.streams for note in each.notes)
+    return [f"{robot}: {note}" for robot, note in notes if note.startswith(PACE)]
 
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:

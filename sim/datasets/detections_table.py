@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import UInt32
 
 from sim.datasets.csv_table import CsvTable, cells_of, read_table
+from sim.datasets.folder_files import shown
 from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
 from sim.datasets.some_rows import covariances_of
 from sim.datasets.tables import File
@@ -32,8 +33,9 @@ def detections_of(place: File, robot: str) -> Detections | None:
     table = _read(place, FILES[0], robot, COLUMNS)
     if table is None or not len(table):
         return None
-    if not table.has(*POLAR):
-        raise table.fault(f"no detection in its columns; give t_s,{','.join(POLAR)}")
+    lacking = [column for column in ("t_s", *POLAR) if not table.has(column)]
+    if lacking:
+        raise table.fault(f"no column {', '.join(lacking)}; it needs t_s,{','.join(POLAR)}")
     stamps = table.stamps("t_s")
     if (np.diff(stamps) < 0).any():
         raise table.fault("its rows are not in order of time")
@@ -112,12 +114,14 @@ def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTabl
     file = place / name
     if not file.is_file():
         return None
-    return read_table(file, f"{robot}/{name}" if robot else name, columns)
+    return read_table(file, shown(place, file, robot), columns)
 
 
 def _labels(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:
     if table is None:
         return np.full(rows, NO_LABEL, np.uint32)
+    if not table.has(*LABELS):
+        raise table.fault(f"no column {LABELS[0]}")
     labels = table.numbers(*LABELS)[:, 0].astype(np.int64)
     if len(labels) != rows:
         raise table.fault(f"{len(labels)} rows, {rows} in detections.csv: row by row, one for each")

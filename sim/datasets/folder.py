@@ -24,7 +24,7 @@ from jaxtyping import Float, Int64
 from sim.datasets import folder_tables as rows
 from sim.datasets.csv_table import CsvTable, read_table
 from sim.datasets.detections_table import detections_of, together
-from sim.datasets.folder_files import EXPECTED, left_out, opened_folder
+from sim.datasets.folder_files import EXPECTED, left_out, opened_folder, shown
 from sim.datasets.folder_odometry import intervals_of
 from sim.datasets.some_rows import POSE_COVARIANCE
 from sim.datasets.tables import DatasetError, File
@@ -108,10 +108,6 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     )
 
 
-LONG_STEP_S = 5.0
-"""Median step [s] of an odometry whose times are probably in other units."""
-
-
 @dataclass(frozen=True)
 class RobotRows:
     """One robot's tables in order of time.
@@ -169,12 +165,6 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
     driven = None
     if len(intervals.end_ns):
         driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
-        step_s = 1e-9 * float(np.median(intervals.duration_ns))
-        if step_s > LONG_STEP_S:
-            notes.append(
-                f"most rows of its odometry are {step_s:,.0f} s apart: times are in seconds; a map "
-                "of columns makes them of others (scale = 1e-3)"
-            )
     else:
         notes.append("no odometry: only what it saw is given")
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
@@ -227,7 +217,7 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     file = place / f"{kind}.csv"
     if not file.is_file():
         return None
-    table = read_table(file, f"{robot}/{file.name}" if robot else file.name, TABLES[kind])
+    table = read_table(file, shown(place, file, robot), TABLES[kind])
     for column in REQUIRED[kind]:
         if not table.has(column):
             raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")

@@ -89,6 +89,11 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
+def shown(place: File, file: File, robot: str) -> str:
+    """A table as errors name it: with its robot's folder, where it lies in one."""
+    return f"{robot}/{file.name}" if place.name == robot else file.name
+
+
 def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
     """Notes on CSV files without a table's name, and on folders with tables but none of a robot."""
     known = {*tables, "detections", "labels"}

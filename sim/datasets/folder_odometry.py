@@ -23,6 +23,8 @@ MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))
 LONG_GAP_NS = 2_000_000_000
 JUMP_NS = 86_400 * 10**9
 """A longer step between two rows is a jump of the clock."""
+PACE = "most rows of its odometry are"
+"""How the note on times in other units begins."""
 WHIRLING_RAD_S = 2.0 * np.pi
 """A median yaw rate above this [rad/s] is probably not in radians."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0
@@ -87,9 +89,21 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
             _judge_speeds(rows, INCREMENTS, motions, duration)
     else:
         intervals = moved(ends, duration, steps, claims)
-    _judge_pace(rows, duration)
+    rows.notes += pace_notes(duration)
     _judge_speeds(rows, form, steps, duration)
     return intervals, rows.notes
+
+
+def pace_notes(duration_ns: Int64[np.ndarray, " I"]) -> list[str]:
+    """A note on odometry whose usual interval says that its times are not in seconds."""
+    usual_s = 1e-9 * float(np.median(duration_ns)) if len(duration_ns) else SHORTEST_S
+    if SHORTEST_S <= usual_s <= LONGEST_S:
+        return []
+    usual = f"{usual_s:,.0f}" if usual_s > 1.0 else f"{usual_s:.3g}"
+    return [
+        f"{PACE} {usual} s apart: times are taken for seconds; of times in other units a "
+        "map of columns makes seconds (scale = 1e-3 for milliseconds)"
+    ]
 
 
 def _drop_other_clocks(rows: Rows) -> None:
@@ -183,18 +197,6 @@ def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
     rows.note(
         off, "whose duration_s is not the time since the row before: it is taken to last as long"
     )
-
-
-def _judge_pace(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
-    """Note intervals whose usual length says that times are not in seconds."""
-    if not len(duration):
-        return
-    usual_s = float(np.median(duration)) * 1e-9
-    if not SHORTEST_S <= usual_s <= LONGEST_S:
-        rows.notes.append(
-            f"an odometry interval lasts {usual_s:.3g} s most of the time: of times in other units "
-            "a map of columns makes seconds (scale = 1e-3 for milliseconds)"
-        )
 
 
 def _judge_speeds(

@@ -18,6 +18,8 @@ def kind_of(path: str | Path) -> Kind:
         return "unlabelled"
     if folder_files.has_tables(path):
         return "folder"
+    if (Path(path) / unlabelled.FILES[1]).is_file():
+        return "unlabelled"  # reading it says what is missing
     try:
         with tables.opened(str(path), UTIAS_MARKER):
             return "utias"

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.folder_odometry import pace_notes
 from sim.datasets.tables import DatasetError
 from sim.world.config import UnlabelledWorld
 from sim.world.streams import (
@@ -33,17 +34,29 @@ COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 CAR = ("t_s", "rear_wheel_speed_m_s", "steering_rad")
 STEPS = ("step", "dx_m", "dy_m", "dtheta_rad")
 STEP_NS = 1_000_000_000
+POLAR = ("t_s", "range_m", "bearing_rad")
+POINTS = ("step", "x_m", "y_m", "c_xx", "c_xy", "c_yy")
 EXPECTED = "expected a folder with odometry.csv and detections.csv"
 
 
 def is_unlabelled(path: str | Path) -> bool:
-    """Whether a folder has the tables of such a set."""
-    return all((Path(path) / name).is_file() for name in FILES)
+    """Whether a folder has the tables of such a set, or its odometry.csv alone."""
+    root = Path(path)
+    if not (root / FILES[0]).is_file() or (root / "observations.csv").is_file():
+        return False
+    if (root / FILES[1]).is_file():
+        return True
+    try:
+        odometry = _table(root, FILES[0])
+    except DatasetError:
+        return False
+    return any(odometry.has(column) for column in (STEPS[0], CAR[1]))
 
 
 def is_car(path: str | Path) -> bool:
     """Whether its odometry is that of a car; raises DatasetError."""
-    return _table(Path(path), "odometry.csv").has(*CAR)
+    file = Path(path) / FILES[0]
+    return file.is_file() and _form(_table(Path(path), FILES[0]))[0] == CAR
 
 
 def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
@@ -51,10 +64,18 @@ def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
 
     The pieces follow each other in the log, and begin at one time here. Raises DatasetError.
     """
-    if not world.path or not is_unlabelled(world.path):
-        raise DatasetError(f"{world.path or 'no data set'}: {EXPECTED}")
+    if not world.path:
+        raise DatasetError(f"no data set given: name it with --dataset FOLDER; {EXPECTED}")
     root = Path(world.path)
+    lacking = [name for name in FILES if not (root / name).is_file()]
+    if lacking:
+        raise DatasetError(f"{root}: no {' and no '.join(lacking)} in it; {EXPECTED}")
     whole = _stream(root, world)
+    if robots > len(whole.intervals.end_ns):
+        raise DatasetError(
+            f"{root}: {len(whole.intervals.end_ns)} odometry intervals can not be cut into "
+            f"{robots} pieces"
+        )
     ids, positions = _reference(root)
     return WorldStreams(
         streams=pieces(whole, robots) if robots > 1 else (whole,),
@@ -64,22 +85,35 @@ def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
     )
 
 
-def _table(root: Path, name: str) -> CsvTable:
-    return read_table(root / name, name)
+def _table(root: Path, name: str, *needed: str) -> CsvTable:
+    table = read_table(root / name, name)
+    lacking = [column for column in needed if not table.has(column)]
+    if lacking:
+        raise table.fault(f"no column {', '.join(lacking)}; it needs {','.join(needed)}")
+    return table
+
+
+def _form(odometry: CsvTable) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The columns of odometry.csv and of detections.csv, by what is special to the former."""
+    own = {CAR: CAR[1:], STEPS + COVARIANCE: STEPS}
+    form = max(own, key=lambda each: sum(odometry.has(column) for column in own[each]))
+    if not any(odometry.has(column) for column in own[form]):
+        raise odometry.fault(
+            f"columns of neither kind; it needs {','.join(CAR)} or {','.join(STEPS + COVARIANCE)}"
+        )
+    return form, POLAR if form == CAR else POINTS
 
 
 def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
-    odometry, detections = _table(root, "odometry.csv"), _table(root, "detections.csv")
+    form, seen_form = _form(_table(root, "odometry.csv"))
+    odometry, detections = (
+        _table(root, name, *needed) for name, needed in zip(FILES, (form, seen_form), strict=True)
+    )
     labels = _labels(root, len(detections))
-    if odometry.has(*CAR) and detections.has("t_s", "range_m", "bearing_rad"):
-        intervals, seen = _of_car(odometry, detections, labels)
-    elif odometry.has(*STEPS, *COVARIANCE) and detections.has("step", "x_m", "y_m"):
-        intervals, seen = _of_steps(odometry, detections, labels)
-    else:
-        raise DatasetError(
-            f"{root}: columns of neither kind; odometry.csv has {','.join(CAR)} or "
-            f"{','.join(STEPS + COVARIANCE)}, detections.csv the same time column"
-        )
+    take = _of_car if form == CAR else _of_steps
+    intervals, seen = take(odometry, detections, labels)
+    if not len(intervals.end_ns):
+        raise odometry.fault("no odometry interval in its rows: there is nothing to run")
     start_ns = int(intervals.end_ns[0] - intervals.duration_ns[0])
     end_ns = int(intervals.end_ns[-1])
     outside = int(np.sum((seen.stamps_ns < start_ns) | (seen.stamps_ns > end_ns)))
@@ -92,6 +126,9 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     if world.identities == "known":
         seen = _named(seen)
     gps_ns, gps = _positions(root)
+    notes = [f"{outside} scans are outside the time of the odometry"] if outside else []
+    if form == CAR:
+        notes += pace_notes(intervals.duration_ns)
     return robot_stream(
         robot="r1",
         start_ns=start_ns,
@@ -100,7 +137,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
         observations=seen,
         sightings=_nothing(),
         teammates=("r1",),
-        notes=(f"{outside} scans are outside the time of the odometry",) if outside else (),
+        notes=notes,
         positions_ns=gps_ns,
         positions=gps,
     )
@@ -111,6 +148,8 @@ def _of_car(
 ) -> tuple[Intervals, Detections]:
     """A row of odometry holds until the next one; the first also before its own time."""
     stamps, seen_ns = odometry.stamps("t_s"), detections.stamps("t_s")
+    if not len(stamps):
+        raise odometry.fault("no row")
     first = min(int(seen_ns.min(initial=stamps[0])), int(stamps[0]))
     values = odometry.numbers(*CAR[1:])
     if first < stamps[0]:
@@ -210,7 +249,7 @@ def _scans(
 def _labels(root: Path, rows: int) -> UInt32[np.ndarray, " R"]:
     if not (root / "labels.csv").is_file():
         return np.full(rows, NO_LABEL, np.uint32)
-    table = _table(root, "labels.csv")
+    table = _table(root, "labels.csv", "landmark")
     labels = table.numbers("landmark")[:, 0].astype(np.int64)
     if len(labels) != rows:
         raise table.fault(f"{len(labels)} rows, {rows} in detections.csv: row by row, one for each")
@@ -250,7 +289,7 @@ def _nothing() -> Detections:
 def _reference(root: Path) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     if not (root / "reference_landmarks.csv").is_file():
         return np.empty(0, np.uint32), np.empty((0, 2))
-    table = _table(root, "reference_landmarks.csv")
+    table = _table(root, "reference_landmarks.csv", "landmark", "x_m", "y_m")
     ids = table.names("landmark")
     order = np.argsort(ids)
     return ids[order], table.numbers("x_m", "y_m")[order]
@@ -261,7 +300,7 @@ def _positions(
 ) -> tuple[Int64[np.ndarray, " G"] | None, Float[np.ndarray, "G 2"] | None]:
     if not (root / "gps.csv").is_file():
         return None, None
-    table = _table(root, "gps.csv")
+    table = _table(root, "gps.csv", "t_s", "x_m", "y_m")
     return table.stamps("t_s"), table.numbers("x_m", "y_m")
 
 

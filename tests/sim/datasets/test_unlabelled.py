@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from sim.calibration.data import scan_of
 from sim.calibration.source import measurements_of
+from sim.cli.launch import _paces
+from sim.cli.main import app
 from sim.datasets.kinds import kind_of
 from sim.datasets.tables import DatasetError
 from sim.datasets.unlabelled import unlabelled
@@ -129,7 +132,20 @@ def test_the_command_lines_options_make_the_pieces(steps):
     ("table", "text", "why"),
     [
         ("labels", "landmark\n1\n", "1 rows, 24 in detections.csv"),
-        ("odometry", "step,dx_m,dy_m\n0,1,0\n", "columns of neither kind"),
+        ("labels", "name\n1\n", "labels.csv, line 1: no column landmark"),
+        ("odometry", "step,dx_m,dy_m\n0,1,0\n", "no column dtheta_rad, c_xx, c_xy, c_yy, c_xt"),
+        ("odometry", "t,v\n0,1\n", "columns of neither kind; it needs t_s,rear_wheel_speed_m_s,s"),
+        (
+            "odometry",
+            "step,dx_m,dy_m,dtheta_rad,c_xx,c_xy,c_yy,c_xt,c_yt,c_tt\n",
+            "no odometry int",
+        ),
+        ("detections", "t_s,range_m,bearing_rad\n0,1,1\n", "it needs step,x_m,y_m,c_xx,c_xy,c_yy"),
+        (
+            "detections",
+            "step,x_m,y_m\n0,1,1\n",
+            "line 1: no column c_xx, c_xy, c_yy",
+        ),
         ("detections", "step,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,0,1\n0,1,1,1,0,1\n", "order of time"),
     ],
 )
@@ -139,3 +155,38 @@ def test_what_is_wrong_with_a_table_is_named(steps, table, text, why):
         (steps / "labels.csv").unlink()
     with pytest.raises(DatasetError, match=why):
         streams(steps)
+
+
+def launched(*words):
+    """The error with which `teamslam launch` ends before any process starts."""
+    result = CliRunner().invoke(app, ["launch", *map(str, words)])
+    assert isinstance(result.exception, DatasetError), result.output
+    return str(result.exception)
+
+
+def test_launch_checks_a_log_of_one_robot_before_any_process_starts(steps, car):
+    assert "--dataset FOLDER" in launched("victoria")
+    text = (car / "detections.csv").read_text()
+    (car / "detections.csv").write_text(text.replace("10.0", "abc"))
+    assert "line 2, column range_m: 'abc' is not a number" in launched("--dataset", car)
+    (steps / "labels.csv").write_text("landmark\n1\n")
+    assert "1 rows, 24 in detections.csv" in launched("dlr", "--dataset", steps)
+    (steps / "labels.csv").unlink()
+    cut = launched("dlr", "--dataset", steps, "--pieces", 13)
+    assert "12 odometry intervals can not be cut into 13 pieces" in cut
+
+
+def test_half_of_a_log_of_one_robot_is_told_what_is_missing(steps, car):
+    (steps / "detections.csv").unlink()
+    assert "no detections.csv in it" in launched("--dataset", steps)
+    (car / "odometry.csv").unlink()
+    assert "no odometry.csv in it" in launched("--dataset", car)
+
+
+def test_times_in_milliseconds_are_warned_of_before_the_launch(car):
+    rows = [f"{100 * i},1.0,0.1" for i in range(1, 41)]
+    (car / "odometry.csv").write_text("t_s,rear_wheel_speed_m_s,steering_rad\n" + "\n".join(rows))
+    (warning,) = _paces(streams(car))
+    assert warning.startswith(
+        "r1: most rows of its odometry are 100 s apart: times are taken for s"
+    )

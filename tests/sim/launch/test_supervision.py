@@ -84,3 +84,27 @@ def test_of_many_silent_processes_one_line_says_how_many(monkeypatch: pytest.Mon
     team.hears(7)
     team.after(0.0)
     assert any("robot-r7 (pid 107) is stopped" in text for text in team.after(11.0))
+
+
+class Ending(Quiet):
+    """A process that has ended with this status."""
+
+    def __init__(self, status: int) -> None:
+        self.exit = status  # type: ignore[misc]
+
+
+def test_a_process_that_is_refused_twice_is_given_up_and_one_that_fails_five_times() -> None:
+    def deaths(*statuses: int, name: str = "world") -> list[bool]:
+        service = Service(0)
+        service.name, service.fruitless, service.refusals, service.reached = name, 0, 0, -1.0
+        service.given_up = False
+        given_up = []
+        for status in statuses:
+            service.child = Ending(status)
+            service.died(0.0)
+            given_up.append(service.given_up)
+        return given_up
+
+    assert deaths(2, 2) == [False, True]
+    assert deaths(-9, 2, 1, 2, 1) == [False] * 4 + [True], "the router may have been away"
+    assert not any(deaths(2, 2, 2, 2, name="router")), "its port may become free"
