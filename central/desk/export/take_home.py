@@ -8,10 +8,13 @@ read back to the last bit.
 import csv
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path as FilePath
 from typing import Any
+
+import numpy as np
 
 from central.desk.drawing import landmark_blocks
 from central.desk.evaluation.errors import Path
@@ -19,6 +22,8 @@ from central.desk.evaluation.evaluation import MapResult
 from central.desk.export.tum import seconds, write_tum
 from central.desk.paths import SmoothedPath, smoothed_paths
 from central.desk.verification.recorded import Recorded
+from team.config import UNNAMED
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import ids
 
@@ -41,12 +46,38 @@ class TakenHome:
 
 def taken_home(found: Recorded) -> TakenHome:
     """The paths at keyframe rate and the counts of a log."""
+    return TakenHome(smoothed_paths(found), measurement_counts(found))
+
+
+def measurement_counts(found: Recorded) -> Mapping[int, int]:
+    """By how many measurements each landmark of the final map was seen.
+
+    Of landmarks without names those of a submap's window count that it has given to one of its
+    landmarks.
+    """
     counts = Counter[int]()
     for stream in found.measurements.values():
         for message in stream.values():
             if isinstance(message, m.Observations | m.Points):
-                counts.update(ids(message.ids, "ids").tolist())
-    return TakenHome(smoothed_paths(found), counts)
+                named = ids(message.ids, "ids")
+                counts.update(named[named < UNNAMED].tolist())
+    seen = dict(chain.from_iterable(map(_detections, found.of(ch.SUBMAP))))
+    for fused in found.of(ch.FINAL_MAP)[-1:]:
+        assert isinstance(fused, m.FusedMap)
+        for of in fused.memberships:
+            columns = [ids(each, "members") for each in (of.sequences, of.locals, of.identities)]
+            for sequence, local, identity in np.transpose(columns).tolist():
+                counts[identity] += seen.get((of.robot, of.incarnation, sequence, local), 0)
+    return counts
+
+
+def _detections(submap: m.Message) -> Iterator[tuple[tuple[str, int, int, int], int]]:
+    """The number of detections of each unnamed landmark of a submap."""
+    assert isinstance(submap, m.Submap)
+    numbers = ids(submap.ids, "ids")
+    unnamed = (numbers[numbers >= UNNAMED] - UNNAMED).tolist()
+    for local, count in zip(unnamed, ids(submap.counts, "counts").tolist(), strict=True):
+        yield (submap.robot, submap.incarnation, submap.sequence, local), count
 
 
 def write_map(
@@ -55,7 +86,7 @@ def write_map(
     """Write map.csv and map.json; returns the files.
 
     A landmark's covariance is its own 2 × 2 block; the correlations between landmarks are in the
-    log.
+    log. The number of measurements of a landmark without a name is absent where no submap tells it.
     """
     rows: list[dict[str, Any]] = []
     blocks = landmark_blocks(fused.covariance)
@@ -63,7 +94,7 @@ def write_map(
         fused.ids.tolist(), fused.means.tolist(), blocks.tolist(), strict=True
     ):
         (xx, xy), (_, yy) = block
-        count = measurements.get(landmark, 0)
+        count = measurements.get(landmark, None if landmark >= UNNAMED else 0)
         values = (landmark, x, y, xx, xy, yy, count, fused.frame)
         rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
     table, data = folder / "map.csv", folder / "map.json"

@@ -4,18 +4,31 @@ import csv
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from central.desk.evaluation.errors import Path as Poses
 from central.desk.evaluation.errors import pose_errors
 from central.desk.evaluation.evaluation import evaluate
-from central.desk.export.take_home import MAP_COLUMNS, taken_home, write_map, write_paths
+from central.desk.export.take_home import (
+    MAP_COLUMNS,
+    measurement_counts,
+    taken_home,
+    write_map,
+    write_paths,
+)
 from central.desk.paths import smoothed_paths
 from central.desk.verification.recorded import Recorded
 from sim.in_memory.team import run_team
+from team.config import UNNAMED
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Sample
+from team.wire.codec import encoded
 from tests.sim.logs import scenario, streams
+from tests.support import fused_map, submap
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +100,33 @@ def test_the_tables_come_back_to_the_last_bit(log: list[Sample], tmp_path: Path)
         read = np.array([[float(v) for v in row] for row in list(csv.reader(lines))[1:]])
     np.testing.assert_array_equal(read[:, 1:4], home.paths["r1"].poses)
     np.testing.assert_array_equal(read[:, 5], home.paths["r1"].covariances[:, 0, 1])
+
+
+def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_counted() -> None:
+    def table(*numbers: int) -> bytes:
+        return from_ids(np.array(numbers, np.uint32))
+
+    counted = [
+        msgspec.structs.replace(
+            submap(i),
+            ids=table(UNNAMED, UNNAMED + 4),
+            counts=table(3 + i, 7),
+            seen=b"",
+            keyframes=0,
+        )
+        for i in range(2)
+    ]
+    of = m.Membership(
+        robot="alpha",
+        incarnation=counted[0].incarnation,
+        sequences=table(0, 1, 1),
+        locals=table(0, 0, 4),
+        identities=table(UNNAMED + 1, UNNAMED + 1, UNNAMED + 2),
+        steps=bytes(3),
+        figures=from_floats(np.zeros(9)),
+    )
+    found = Recorded()
+    for each in counted:
+        found.take(Sample(ch.SUBMAP.key("alpha"), encoded(each), each.stamp_ns, 0, 0))
+    found.take(Sample(ch.FINAL_MAP.key(), encoded(fused_map(memberships=(of,))), 0, 0, 0))
+    assert measurement_counts(found) == {UNNAMED + 1: 3 + 4, UNNAMED + 2: 7}
