@@ -23,6 +23,10 @@ class WithdrawError(RuntimeError):
     """The order could not be given, or was not followed; the text says why and what to do."""
 
 
+class NoRobotError(WithdrawError):
+    """The team has no such robot."""
+
+
 def ordered(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
     """Publish an order; with keys its signature after it, for peers that receive it over others."""
     bus.publish(order)
@@ -45,7 +49,7 @@ def withdraw(
         bus.subscribe(channel)
     bus.watch_alive()
     robots: set[str] = set()
-    _await_team(bus, robot, robots)
+    await_team(bus, robot, robots)
     order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)
     ordered(bus, Outgoing(ch.ORDER, robot, order), signer)
     until = time.monotonic() + patience_s
@@ -71,7 +75,7 @@ def give_up(
     for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
     bus.watch_alive()
-    _await_team(bus, robot, set())
+    await_team(bus, robot, set())
     node = ch.robot_node(robot)
     order = m.GivenUp(stamp_ns=0, node=node, by="operator", reason=reason)
     ordered(bus, Outgoing(ch.GIVEN_UP, node, order), signer)
@@ -126,8 +130,12 @@ def await_fold(bus: Bus) -> None:
         _maps(bus, reporters)
 
 
-def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
-    """Wait until a centre, or a peer, is there, and a message of the robot has arrived."""
+def await_team(bus: Bus, robot: str, robots: set[str]) -> None:
+    """Wait until a centre, or a peer, is there, and a message of the robot has arrived.
+
+    robots: those of whom something has arrived; they are added. Raises WithdrawError where there is
+    neither, NoRobotError where there is no such robot.
+    """
     until = time.monotonic() + CENTRE_S
     folds = False
     while time.monotonic() < until:
@@ -138,7 +146,7 @@ def _await_team(bus: Bus, robot: str, robots: set[str]) -> None:
         raise WithdrawError(NO_CENTRE)
     robots.discard(_PEER)
     known = ", ".join(sorted(robots)) or "none"
-    raise WithdrawError(f"the team has no robot {robot}; its robots: {known}")
+    raise NoRobotError(f"the team has no robot {robot}; its robots: {known}")
 
 
 def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:

@@ -3,7 +3,8 @@
 import re
 import time
 
-from central.desk.orders import LOOK_S, PEERS, WithdrawError, await_fold, ordered
+from central.desk.evaluation.verdicts import pair_of
+from central.desk.orders import LOOK_S, PEERS, WithdrawError, await_team, ordered
 from team.keys.roster import ROBOT
 from team.peers.proofs import Signs
 from team.wire import channels as ch
@@ -36,13 +37,15 @@ def judge(
     peer's.
 
     withdrawn: withdraw the verdict, and wait for a map without it. signer: the operator's, where
-    there are keys. Raises WithdrawError where there is neither, or no such map within the time.
+    there are keys. Raises NoRobotError where the team does not have one of the robots,
+    WithdrawError where there is neither centre nor peer, or no such map within the time.
     """
-    for channel in (ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
+    for channel in (ch.ROBOT_CONFIG, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
         bus.subscribe(channel)
     bus.watch_alive()
-    await_fold(bus)
-    robot = judgement.first.robot
+    robot, known = judgement.first.robot, set[str]()
+    for each in (robot, judgement.second.robot):
+        await_team(bus, each, known)
     verdict = m.Verdict(
         stamp_ns=0,
         robot=robot,
@@ -52,19 +55,24 @@ def judge(
         withdrawn=withdrawn,
     )
     ordered(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
-    pair = {judgement.first, judgement.second}
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         for _, _, message in sound(bus.receive(LOOK_S)):
             if not isinstance(message, m.FusedMap):
                 continue
             holds = any(
-                {each.first, each.second} == pair and each.same == judgement.same
+                pair_of(each) == pair_of(judgement) and each.same == judgement.same
                 for each in message.verdicts
             )
             if holds is not withdrawn:
                 return message
             if message.final:
                 raise WithdrawError("the final map was out before the verdict; run the log again")
-    what = "its withdrawal" if withdrawn else "the verdict"
-    raise WithdrawError(f"no map that rests on it within {patience_s:g} s; {what} stands")
+    if withdrawn:
+        raise WithdrawError(
+            f"no map without it within {patience_s:g} s; its withdrawal is recorded, and stands"
+        )
+    raise WithdrawError(
+        f"no map rests on it within {patience_s:g} s; the verdict is recorded, and holds once a "
+        "map has both landmarks: if none ever does, a submap or a landmark is not as named"
+    )

@@ -103,7 +103,8 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
     until it is withdrawn.
     """
-    from central.desk.orders import WithdrawError
+    from central.desk.evaluation.verdicts import contradicted
+    from central.desk.orders import NoRobotError, WithdrawError
     from central.desk.verdicts import judge, local_landmark
     from team.wire.messages import Judgement
 
@@ -122,7 +123,14 @@ def verdict(
             signer = signer_of(keys, "operator", team)
             fused = judge(bus, judgement, reason, patience, signer, withdrawn=withdraw)
         except WithdrawError as error:
-            fail(str(error), FAILED)
+            fail(str(error), WRONG_USE if isinstance(error, NoRobotError) else FAILED)
+    opposite = "different" if word == "same" else "same"
+    if not withdraw and contradicted(judgement, fused.verdicts):
+        remedy = f"`teamslam verdict {opposite} {first} {second} --withdraw` withdraws that"
+        contradiction = f"{first} and {second} were said to be {opposite}, too"
+        if word == "same":
+            fail(f"{contradiction}, which is what holds; {remedy}", FAILED)
+        typer.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
     landmarks = len(ids(fused.ids, "ids"))
     are = "are no more said to be" if withdraw else "are"
     typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")

@@ -35,6 +35,7 @@ from central.desk.evaluation.gps import gps_median
 from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
+from central.desk.evaluation.verdicts import verdicts_given
 from central.team_config import TeamConfig, team_config
 from team import translate
 from team.estimation.gaussian import Matrix
@@ -129,7 +130,7 @@ class Evaluation:
     messages set aside. faults: number of messages set aside. unsound: number of invalid samples.
     arbitrary_frame: no robot knew its initial pose, so the map's frame is not the truth's, and only
     aligned errors are meaningful. decisions: closures and merges by landmarks without identities,
-    from the final map.
+    from the final map. verdicts: an operator's on such landmarks, in words.
     """
 
     scenario: TeamConfig | None
@@ -146,6 +147,7 @@ class Evaluation:
     peers: Mapping[str, PeerResult] = field(default_factory=dict)
     association: AssociationResult | None = None
     decisions: tuple[m.AssociationDecision, ...] = ()
+    verdicts: tuple[str, ...] = ()
     gps_median_m: float | None = None
 
 
@@ -197,6 +199,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         peers=peer_results(log),
         association=association,
         decisions=_decisions(log),
+        verdicts=verdicts_given(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
     )
 
@@ -305,6 +308,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "reference_rmse_m": None
         if errors is None or evaluation.association is None
         else errors.aligned_rmse_m,
+        "verdicts": list(evaluation.verdicts),
         "gps_median_m": evaluation.gps_median_m,
         "gospa": None if fused is None or fused.gospa is None else asdict(fused.gospa),
         "unsound_messages": evaluation.unsound,

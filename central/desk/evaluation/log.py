@@ -36,6 +36,7 @@ _COLLECTED = frozenset(
         ch.CENTRAL_POSE,
         ch.SUBMAP,
         ch.ROBOT_DONE,
+        ch.VERDICT,
     )
 )
 _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE))

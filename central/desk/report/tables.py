@@ -138,6 +138,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += [("joined", words) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons]
+    rows += [("verdict", words) for words in evaluation.verdicts]
     meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
     if meetings:
         rows.append(("rendezvous", f"{sum(meetings)} times a robot sent what it held or was to"))

@@ -1,21 +1,25 @@
 """`teamslam withdraw` and `end`: an operator's order reaches the centre, and what comes of it."""
 
 import threading
+from contextlib import nullcontext
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from central.config import CentralConfig
 from central.desk import orders
+from central.desk.evaluation.evaluation import evaluate
 from central.desk.orders import WithdrawError, give_up, withdraw
+from central.desk.report.tables import team_rows
 from central.desk.verdicts import judge, local_landmark
 from central.node import CentralNode
 from sim.cli.main import app
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from tests.support import examples, on_its_key, wait_until
+from team.wire.codec import encoded
+from tests.support import examples, fused_map, on_its_key, wait_until
 
 FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
 EXAMPLE = next(e for e in examples() if isinstance(e, m.Configuration))
@@ -148,5 +152,72 @@ def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(
         lambda bus: give_up(bus, "r3", "", 0.2),
         lambda bus: judge(bus, judgement, "", 0.2),
     ):
-        with pytest.raises(WithdrawError, match=r"within 0.2 s; the (order|verdict) stands"):
+        with pytest.raises(WithdrawError, match=r"within 0.2 s; the (order stands|verdict is rec)"):
             order(MemoryBus(network))
+
+
+def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgement, ...]) -> Result:
+    """`teamslam verdict` to a team of r3 whose map rests on these verdicts."""
+    monkeypatch.setattr(orders, "CENTRE_S", 2.0)
+    network = MemoryNetwork()
+    bus, over = MemoryBus(network), threading.Event()
+    bus.declare_alive("central")
+
+    def centre() -> None:
+        while not over.wait(0.01):
+            bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
+            bus.publish(Outgoing(ch.FUSED_MAP, "", fused_map(verdicts=rests_on)))
+
+    thread = threading.Thread(target=centre, daemon=True)
+    thread.start()
+    monkeypatch.setattr("sim.cli.orders.connected", lambda *_: nullcontext(MemoryBus(network)))
+    try:
+        return CliRunner().invoke(app, ["verdict", *words, "--team", "t"])
+    finally:
+        over.set()
+        thread.join()
+
+
+def pair(same: bool) -> m.Judgement:
+    first, second = local_landmark("r3/1/2/3"), local_landmark("r3/1/4/5")
+    return m.Judgement(first=first, second=second, same=same)
+
+
+def test_a_verdict_on_a_robot_that_the_team_does_not_have_is_wrong_use(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refused = said(monkeypatch, "same", "r3/1/2/3", "r9/1/77/1", rests_on=())
+    assert refused.exit_code == 2
+    assert "the team has no robot r9; its robots: r3" in refused.stderr
+
+
+def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names, both = ("r3/1/4/5", "r3/1/2/3"), (pair(True), pair(False))
+    alone = said(monkeypatch, "different", *names, rests_on=both[1:])
+    assert (alone.exit_code, alone.stderr) == (0, "")
+    against = said(monkeypatch, "different", *names, rests_on=both)
+    assert against.exit_code == 0
+    assert "were said to be same, too; different is what holds" in against.stderr
+    in_vain = said(monkeypatch, "same", *names, rests_on=both)
+    assert in_vain.exit_code == 1
+    assert "were said to be different, too, which is what holds" in in_vain.stderr
+
+
+def test_a_report_names_the_verdicts_and_which_of_them_the_map_rests_on() -> None:
+    other = m.Judgement(
+        first=local_landmark("r3/1/77/1"), second=local_landmark("r3/1/4/5"), same=True
+    )
+    verdicts = [
+        m.Verdict(stamp_ns=0, robot="r3", judgement=each, by="operator", reason="seen")
+        for each in (pair(True), other)
+    ]
+    log = [Sample(ch.VERDICT.key("r3"), encoded(each), 0, k, k) for k, each in enumerate(verdicts)]
+    final = fused_map(final=True, verdicts=(pair(True),))
+    found = evaluate([*log, Sample(ch.FINAL_MAP.key(), encoded(final), 0, 2, 2)])
+    assert [words for name, words in team_rows(found) if name == "verdict"] == [
+        "r3/1/2/3 and r3/1/4/5 are one landmark: seen",
+        "r3/1/77/1 and r3/1/4/5 are one landmark: seen (not in the map: withdrawn, or it does not "
+        "have both)",
+    ]
