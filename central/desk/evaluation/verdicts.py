@@ -38,15 +38,15 @@ def verdicts_given(log: Collected) -> tuple[str, ...]:
 def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     judgement = verdict.judgement
     first, second = name_of(judgement.first), name_of(judgement.second)
-    said = f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
-    said += f": {verdict.reason}" if verdict.reason else ""
+    text = f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
+    text += f": {verdict.reason}" if verdict.reason else ""
     if verdict.withdrawn:
-        return f"{said} (withdrawn)"
+        return f"{text} (withdrawn)"
     holds = any(
         pair_of(each) == pair_of(judgement) and each.same == judgement.same for each in rests_on
     )
     if not holds:
-        return f"{said} (not in the map: withdrawn, or it does not have both)"
+        return f"{text} (not in the map: withdrawn, or it does not have both)"
     if judgement.same and contradicted(judgement, rests_on):
-        return f"{said} (without effect: they were said to be two, too)"
-    return said
+        return f"{text} (without effect: they were said to be two, too)"
+    return text
