@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from sim.launch.plan import Plan
     from sim.world.streams import WorldStreams
 
+INTERRUPTED = 130
+"""The exit status of a command that Ctrl-C has ended, as a shell has it."""
 COMPILING_S = 3.0
 """Time [s] between two lines about kernels that are being compiled."""
 app = typer.Typer()
@@ -174,7 +176,11 @@ def launch(
     )
     with page as at:
         outcome = _launched(plan)
-        _conclude(resolved, outcome, json_file, report=report)
+        try:
+            _conclude(resolved, outcome, json_file, report=report)
+        except KeyboardInterrupt:
+            again = f"`teamslam report {outcome.log} -o {outcome.folder}` makes the report"
+            fail(f"interrupted: the run is in {outcome.log}; {again}", INTERRUPTED)
         if at is not None:
             _keep_showing(at.url, log)
 
@@ -256,9 +262,22 @@ def _check_writable(path: Path) -> None:
     """Check before the run that the result can be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        is_new = not path.exists()
         path.open("a").close()
+        if is_new:  # whoever waits for the file is to find it whole
+            path.unlink()
     except OSError as error:
         fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all."""
+    if path.exists() and not path.is_file():  # as /dev/stdout
+        path.write_text(text)
+        return
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    part.replace(path)
 
 
 def _new_folder(name: str) -> Path:
@@ -343,6 +362,7 @@ def _conclude(
     from team.recording.reader import LogError, open_log
 
     console = Console()
+    typer.echo("the run is over: scoring it, which for a long log takes a while", err=True)
     extra: dict[str, Any] = {
         "processes": {
             ended.name: {"pid": ended.pid, "exit": ended.exit} | asdict(outcome.used[ended.name])
@@ -368,6 +388,7 @@ def _conclude(
         for note in evaluation.notes:
             console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if report:
+            typer.echo("drawing the pictures and writing the report", err=True)
             home = taken_home(recorded(log))
             run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
             if (line := nis_line(run)) is not None:
@@ -380,8 +401,8 @@ def _conclude(
         text = f"{name} was started again {times} time{'' if times == 1 else 's'}"
         console.print(text, highlight=False)
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
-    console.print(f"{outcome.wall_s:.1f} s of wall time", highlight=False)
+    console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
     if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+        _write_whole(json_file, json.dumps(figures, indent=2) + "\n")
     if outcome.failures:
         fail("\n".join(outcome.failures), FAILED)

@@ -1,0 +1,38 @@
+"""What is left of a launch whose run is over, and which is interrupted as it is scored."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from sim.cli import launch
+from sim.cli.main import app
+from sim.launch.launch import Outcome
+
+
+def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_leaves_no_half_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, figures = tmp_path / "run" / "log.mcap", tmp_path / "figures.json"
+    outcome = Outcome(log=log, folder=log.parent, wall_s=1.0, processes=[])
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(launch, "_launched", lambda *_: outcome)
+    monkeypatch.setattr(launch, "_conclude", interrupted)
+    words = ["launch", "thesis", "-o", str(log.parent), "--json", str(figures)]
+    ended = CliRunner().invoke(app, words)
+    assert ended.exit_code == 130, ended.output
+    assert f"interrupted: the run is in {log}" in ended.stderr
+    assert not figures.exists()
+
+
+def test_figures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    file = tmp_path / "figures.json"
+    file.write_text("old")
+    launch._check_writable(file)
+    assert file.read_text() == "old"
+    launch._write_whole(file, "new")
+    assert [each.name for each in tmp_path.iterdir()] == ["figures.json"]
+    assert file.read_text() == "new"
