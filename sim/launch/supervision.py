@@ -20,6 +20,7 @@ SILENT_S = 10.0
 """A running process without a message for this long [s] is named."""
 FEW = 3
 """Of more silent processes than this it is only said how many there are."""
+COMPUTING = "is computing"
 MANY = "many"
 REPEAT_S = 60.0
 """The silence of one process, or of many, is told again after this time [s] at the earliest."""
@@ -185,7 +186,8 @@ class Silence:
                 self._note(watch, service, "is stopped (SIGSTOP?)", silent_s)
             elif not many and now >= self._last_note.get(service.name, -math.inf) + REPEAT_S:
                 self._last_note[service.name] = now
-                self._note(watch, service, "is there", silent_s)
+                state = COMPUTING if child.is_computing else "is there"
+                self._note(watch, service, state, silent_s)
         if many and new and now >= self._last_note.get(MANY, -math.inf) + REPEAT_S:
             self._last_note[MANY] = now
             named = ", ".join(service.name for service, _ in new[:FEW])
@@ -198,10 +200,11 @@ class Silence:
     @staticmethod
     def _note(watch: Watch, service: Supervised, state: str, silent_s: float) -> None:
         pid = service.child.pid
+        restart = f". To have it started again: kill -9 {pid}"
+        remedy = "" if state == COMPUTING else restart
         watch.note(
-            f"{service.name} (pid {pid}) {state} and has said nothing for "
-            f"{silent_s:.0f} s: the team may wait for it. To have it started again: "
-            f"kill -9 {pid}"
+            f"{service.name} (pid {pid}) {state} and has said nothing for {silent_s:.0f} s: "
+            f"the team may wait for it{remedy}"
         )
 
 

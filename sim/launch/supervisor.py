@@ -86,6 +86,15 @@ class Child:
             return False
         return state in "Tt"
 
+    @property
+    def is_computing(self) -> bool:
+        """Whether the process uses a processor or waits for one, where the system reports it."""
+        try:
+            state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
+        except (OSError, IndexError):
+            return False
+        return state == "R"
+
     def kill(self) -> None:
         """End it, stopped or not, without asking before."""
         self._process.signal(signal.SIGKILL)

@@ -14,7 +14,7 @@ class Quiet(Child):
 
     pid = 0
     exit = None
-    is_stopped = False
+    is_stopped = is_computing = False
 
     def __init__(self, pid: int) -> None:
         self.pid, self.started = pid, 999.0
@@ -24,6 +24,12 @@ class Stopped(Quiet):
     """A process that does not run."""
 
     is_stopped = True
+
+
+class Busy(Quiet):
+    """A process that computes."""
+
+    is_computing = True
 
 
 class Service(Supervised):
@@ -68,6 +74,16 @@ def test_a_few_silent_processes_are_named_each_once_a_minute(
     team.hears(0)
     assert team.after(0.0) == []
     assert len(team.after(60.0)) == 1
+
+
+def test_nobody_is_advised_to_end_a_process_that_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    team = Team(monkeypatch, 2)
+    team.services[1].child = Busy(101)
+    team.hears(0, 1)
+    idle, busy = team.after(11.0)
+    assert idle.endswith("kill -9 100")
+    assert "robot-r1 (pid 101) is computing and has said nothing for 11 s" in busy
+    assert "kill" not in busy
 
 
 def test_of_many_silent_processes_one_line_says_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
