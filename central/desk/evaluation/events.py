@@ -130,7 +130,9 @@ class EventDetector:
 
     def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
         """Changes in the robots that a map contains."""
-        members = {member.robot for member in fused.members}
+        parts = (reason.partition(" not joined: ") for reason in fused.reasons)
+        apart = {name for name, waits, _ in parts if waits}
+        members = {member.robot for member in fused.members} - apart
         events = [
             Event(now_ns, "map", robot_node(robot), f"{robot} is in the team's map")
             for robot in sorted(members - self._members)

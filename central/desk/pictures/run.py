@@ -51,8 +51,14 @@ def map_picture(
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
     colours = robot_colours(evaluation.robots)
+    smoothed = {
+        name for name, each in evaluation.robots.items() if len(each.smoothed_path.stamps_ns)
+    }
     for i, (name, robot) in enumerate(evaluation.robots.items()):
-        _draw_paths(axis, name, robot, colours[name], first=i == 0, dense=paths.get(name))
+        _draw_paths(
+            axis, name, robot, colours[name], first=i == 0, dense=paths.get(name),
+            apart=bool(smoothed) and name not in smoothed,
+        )  # fmt: skip
     _draw_landmarks(axis, evaluation)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
@@ -60,7 +66,7 @@ def map_picture(
     axis.grid(color="#e4e4e4", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.set_title("\n".join(_title(evaluation)), fontsize=12)
-    if any(len(robot.smoothed_path.stamps_ns) for robot in evaluation.robots.values()):
+    if smoothed:
         axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
     axis.plot([], [], color=TRUTH_COLOUR, marker="s", markersize=9, linestyle="", label="starts")
     handles, _ = axis.get_legend_handles_labels()
@@ -147,8 +153,13 @@ def _draw_paths(
     *,
     first: bool,
     dense: SmoothedPath | None,
+    apart: bool,
 ) -> None:
-    """The true path thin, a square at its start; the smoothed path, or else the online one."""
+    """The true path thin, a square at its start; the smoothed path, or else the online one.
+
+    apart: other robots have smoothed paths, and this one none: its online path is in no frame of
+    the map, and is left out.
+    """
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
     line = smoothed if dense is None else _thinned(Path(dense.stamps_ns, dense.poses))
     known = truth if len(truth.stamps_ns) else line
@@ -166,6 +177,8 @@ def _draw_paths(
             *smoothed.poses.T[:2], color=colour, linestyle="", marker="o", markersize=3.5, zorder=3
         )
         axis.plot([], [], color=colour, marker="o", label=name)
+    elif apart:
+        axis.plot([], [], color=colour, linestyle=":", label=f"{name}: not in this map")
     else:
         x, y, _ = _thinned(robot.online_path).poses.T
         axis.plot(x, y, color=colour, linewidth=1.0, zorder=3, label=f"{name}, online")

@@ -63,6 +63,16 @@ def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once() -> N
     ]
 
 
+def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map() -> None:
+    why = "r2 not joined: no landmark is shared"
+    assert told(fused(["r1", "r2"], (why,)), fused(["r1", "r2"])) == [
+        ("map", "r1 is in the team's map"),
+        ("warning", why),
+        ("map", "r2 is in the team's map"),
+        ("map", f"no longer: {why}"),
+    ]
+
+
 def test_a_withdrawal_is_told_once_with_its_reason() -> None:
     said = m.Withdrawal(stamp_ns=3, robot="r2", by="central", reason="its wheels slip")
     assert told(fused(["r1", "r2"]), said, said, fused(["r1"]))[2:] == [

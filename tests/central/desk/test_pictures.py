@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from central.desk.compare import compare_rows
@@ -113,6 +114,24 @@ def test_the_tables_fit_a_terminal_of_80_columns_and_name_their_units(run: Evalu
     for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2", "2 is right", "0% within 95 %"):
         assert words in text
     assert "…" not in text.partition("measurements")[2]
+
+
+def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
+    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The path of a robot that had never joined began at the origin of the others' map."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr("central.desk.pictures.run.save", lambda figure, _: drawn.append(figure))
+    path = run.robots["r2"].smoothed_path
+    nowhere = replace(path, stamps_ns=path.stamps_ns[:0], poses=path.poses[:0])
+    alone = replace(run.robots["r2"], smoothed_path=nowhere)
+    assert map_picture(replace(run, robots={**run.robots, "r2": alone}), tmp_path / "map.png")
+    legend = drawn[0].axes[0].get_legend()
+    assert legend is not None
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert "r1" in labels
+    assert "r2: not in this map" in labels
+    assert not any("online" in label for label in labels)
 
 
 def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
