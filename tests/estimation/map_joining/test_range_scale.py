@@ -18,7 +18,7 @@ from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
 from team.estimation.map_joining.markers import with_markers
 from team.estimation.map_joining.submap_graph import tied
-from team.estimation.submap import LocalMap
+from team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.submap_world import local_truth
 
 OWN, COMMON, MARKER = 0.03, 0.1, 0.04
@@ -223,7 +223,12 @@ def hidden(submaps, starts, options):
     """The fold without the landmarks' names, with those that are one united by hand; and the
     number of each.
     """
-    unnamed = [replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids)) for x in submaps]
+    counts = np.ones(len(LANDMARKS), np.uint32)
+    together = Unnamed(counts, seen=np.ones((len(LANDMARKS), 1), np.bool_))
+    unnamed = [
+        replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids, unnamed=together))
+        for x in submaps
+    ]
     fold = folded(started(started(EMPTY_FOLD, starts[0]), starts[1]), unnamed, options)
     assert len(fold.main.graph.landmarks) == 5 * len(unnamed)
     number = {members[0]: own for own, members in fold.landmarks.sets.items()}
