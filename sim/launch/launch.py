@@ -10,7 +10,7 @@ from pathlib import Path
 from sim.launch.plan import Plan
 from sim.launch.processes import Starter, Used
 from sim.launch.supervision import failure, supervise
-from sim.launch.supervisor import REFUSED, Ended, Supervised, end_all
+from sim.launch.supervisor import Ended, Supervised, end_all
 from sim.launch.watch import Watch
 from sim.scenarios.scenario import dumps
 from team.keys.credentials import Credentials, credentials_of
@@ -25,6 +25,8 @@ slowly.
 """
 POSES = (ch.OWN_POSE, ch.TEAM_POSE)
 """Channels of which an observer that does not keep up may lose messages."""
+REFUSED = 2
+"""The exit status of a command that can not do what it was asked to."""
 
 
 class LaunchError(RuntimeError):

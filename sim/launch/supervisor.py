@@ -15,12 +15,6 @@ GRACE_S = 5.0
 """Time [s] for a process to stop when it is asked to."""
 FRUITLESS = 5
 """A process is given up after this many deaths in a row without progress."""
-REFUSED = 2
-"""The exit status of a command that can not do what it was asked to."""
-REFUSALS = 2
-"""After so many ends with that status in a row a process is given up: once the router may have been
-away.
-"""
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 """Longest wait [s] before a process that has died is started again."""
@@ -130,8 +124,7 @@ class Supervised:
     """A process that is started again by the same command when it dies, after longer and longer
     waits.
 
-    A process that dies FRUITLESS times in a row without progress is given up; REFUSALS times are
-    enough where it says that it can not do what it was asked to. reached: its progress
+    A process that dies FRUITLESS times in a row without progress is given up. reached: its progress
     at its last death, in its own unit. ended_s: when its end was noticed, by a monotonic clock.
     used: the resources of its earlier lives.
     """
@@ -142,7 +135,6 @@ class Supervised:
     starter: Starter
     restarts: int = 0
     fruitless: int = 0
-    refusals: int = 0
     reached: float = -1.0
     given_up: bool = False
     over: bool = False
@@ -168,9 +160,7 @@ class Supervised:
         """Note a death: the process will be started again, or is given up."""
         self.fruitless = 1 if reached > self.reached else self.fruitless + 1
         self.reached = max(self.reached, reached)
-        refused = self.child.exit == REFUSED and self.name != "router"  # its port may become free
-        self.refusals = self.refusals + 1 if refused else 0
-        if self.fruitless >= FRUITLESS or min(self.refusals, self.fruitless) >= REFUSALS:
+        if self.fruitless >= FRUITLESS:
             self.given_up = True
             return
         wait_s = min(FIRST_WAIT_S * 2.0 ** (self.fruitless - 1), LONGEST_WAIT_S)

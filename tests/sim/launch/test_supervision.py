@@ -109,18 +109,13 @@ class Ending(Quiet):
         self.exit = status  # type: ignore[misc]
 
 
-def test_a_process_that_is_refused_twice_is_given_up_and_one_that_fails_five_times() -> None:
-    def deaths(*statuses: int, name: str = "world") -> list[bool]:
-        service = Service(0)
-        service.name, service.fruitless, service.refusals, service.reached = name, 0, 0, -1.0
-        service.given_up = False
-        given_up = []
-        for status in statuses:
-            service.child = Ending(status)
-            service.died(0.0)
-            given_up.append(service.given_up)
-        return given_up
-
-    assert deaths(2, 2) == [False, True]
-    assert deaths(-9, 2, 1, 2, 1) == [False] * 4 + [True], "the router may have been away"
-    assert not any(deaths(2, 2, 2, 2, name="router")), "its port may become free"
+def test_a_process_that_fails_five_times_is_given_up_whatever_it_says() -> None:
+    """No router that answers ends a process with status 2, as wrong use does; it may come back."""
+    service = Service(0)
+    service.fruitless, service.reached, service.given_up = 0, -1.0, False
+    given_up = []
+    for status in (-9, 2, 2, 1, 2):
+        service.child = Ending(status)
+        service.died(0.0)
+        given_up.append(service.given_up)
+    assert given_up == [False] * 4 + [True]
