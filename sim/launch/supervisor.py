@@ -56,6 +56,8 @@ class Child:
         with self.output.open("ab" if life else "wb") as file:
             self._before = self.output.stat().st_size
             self._process = starter.start(arguments, file.fileno())
+        # A short run may be over before the next measurement.
+        self.measure()
 
     @property
     def pid(self) -> int:
