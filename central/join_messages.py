@@ -2,7 +2,7 @@
 their paths.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -18,10 +18,9 @@ from central.sent_priors import SentPriors
 from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
-from team.estimation.contribution import Stream
+from team.estimation.contribution import Stream, named
 from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.associating import IslandView
-from team.estimation.map_joining.association.landmarks import Decision
 from team.estimation.map_joining.distinctness import maybe_the_same
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
@@ -38,7 +37,8 @@ CONFIRMED_BY = 2
 detections in a row look like a landmark in a single window. Running maps show tentative ones,
 too."""
 NAMED = 10
-"""Most landmarks left out of the map, and most refusals, that are named."""
+"""Most landmarks left out of the map, refusals, and robots of an island that are named."""
+NONE_SHARED = "not joined: 0 shared landmarks, "
 
 
 def team_map(
@@ -142,10 +142,9 @@ def reasons(
 ) -> tuple[str, ...]:
     """Why robots and landmarks are not in the map, and warnings about it, in words."""
     return (
-        *(fold.reasons[k] for k in sorted(fold.reasons)),
+        *_apart(fold),
         *_worded(refusals(fold)),
         *fold.warnings,
-        *_worded([_awaited(each) for each in _waiting(fold)]),
         *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
@@ -160,17 +159,22 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
     needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
     pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
     return tuple(
-        f"left out, {why}: {len(named)} of {len(known)} landmarks ({_listed(named)})"
-        for why, named in (
-            (f"{needed} submaps that agree needed", [str(id_) for id_ in out]),
-            ("may be one with another landmark", pairs),
+        f"left out, {why}: {count} of {len(known)} landmarks{_listed(names)}"
+        for why, count, names in (
+            (
+                f"{needed} submaps that agree needed",
+                len(out),
+                [str(id_) for id_ in out if id_ < UNNAMED],
+            ),
+            ("may be one with another landmark", len(pairs), pairs),
         )
-        if named
+        if count
     )
 
 
-def _listed(named: Sequence[str]) -> str:
-    return ", ".join(named[:NAMED]) + (", …" if len(named) > NAMED else "")
+def _listed(names: Sequence[str]) -> str:
+    """The first names in brackets; a landmark without a name has none."""
+    return f" ({', '.join(names[:NAMED])}{', …' * (len(names) > NAMED)})" if names else ""
 
 
 def priors(
@@ -229,14 +233,44 @@ def trajectories(
     return paths
 
 
-def _waiting(fold: Fold) -> list[Decision]:
-    """Merges of robots by their maps that wait, by the robots."""
-    waits = fold.landmarks.waits
-    return [waits[of] for of in sorted(waits) if of[1] in fold.islands and of[0] != of[1]]
+def _apart(fold: Fold) -> Iterator[str]:
+    """Why robots are not in the team's map, for each island beside it.
+
+    Where landmarks have no names it is the test that the island's best attempt has failed, of those
+    with islands that are still there.
+    """
+    frames = {min(fold.islands[key].graph.streams): key for key in fold.islands}
+    for frame in sorted(frames):
+        key = frames[frame]
+        if key == fold.main_key:
+            continue
+        by_name = fold.reasons.get(frame, "")
+        found = _best_attempt(fold, key)
+        if found is None and (
+            by_name and not (fold.landmarks.are_there and NONE_SHARED in by_name)
+        ):
+            yield by_name
+            continue
+        streams = sorted(fold.islands[key].graph.streams)
+        who = ", ".join(map(named, streams[:NAMED])) + ", …" * (len(streams) > NAMED)
+        why = "no place that fits was found in another map" if found is None else found
+        yield f"{who} not joined: {why}"
 
 
-def _awaited(decision: Decision) -> str:
-    return f"{decision.about} not joined by their maps: {decision.why}"
+def _best_attempt(fold: Fold, key: Stream) -> str | None:
+    """The island with which an island has the most pairs, and the test that failed; None where none
+    was tried.
+    """
+    attempts = []
+    for (stream, other), decision in sorted(fold.landmarks.waits.items()):
+        mine = fold.home[stream]
+        if other in fold.islands and mine != other and key in (mine, other):
+            partner = other if mine == key else mine
+            attempts.append((decision.pairs, decision.llr, partner, decision.why))
+    if not attempts:
+        return None
+    *_, partner, why = max(attempts, key=lambda each: each[:2])
+    return f"with {named(min(fold.islands[partner].graph.streams))} {why}"
 
 
 def _worded(words: Sequence[str]) -> tuple[str, ...]:

@@ -203,14 +203,13 @@ def tied(
         frames[stream] = exchange.a_from_b.mean
         del waiting[stream]
     reasons = [
-        f"{robot}, incarnation {incarnation}, not joined: its common landmarks give no place"
-        for robot, incarnation in unsolvable
+        f"{named(stream)} not joined: its common landmarks give no place" for stream in unsolvable
     ]
-    for (robot, incarnation), alone in waiting.items():
+    for stream, alone in waiting.items():
         count = len(np.intersect1d(fused.ids, alone.ids))
         plural = "" if count == 1 else "s"
         needed = f"{count} shared landmark{plural}, {svd_joining.NEEDED} needed"
-        reasons.append(f"{robot}, incarnation {incarnation}, not joined: {needed}")
+        reasons.append(f"{named(stream)} not joined: {needed}")
     return fused, tuple(reasons)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from central.desk.drawing import GREY, robot_colours
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
+from central.desk.names import in_order
 from central.desk.pictures.run import new_figure
 from central.desk.pictures.style import save
 from central.desk.report.tables import shown
@@ -20,7 +21,7 @@ def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
     """(figure, one cell per run); "–" where a run has none."""
     every = list(runs.values())
     rows = [(name, tuple(of(run) for run in every)) for name, of in _TEAM]
-    for robot in sorted({name for run in every for name in run.robots}):
+    for robot in in_order({name for run in every for name in run.robots}):
         results = [run.robots.get(robot) for run in every]
         rows += [
             (f"{robot}: {name}", tuple("–" if r is None else of(r) for r in results))

@@ -1,11 +1,12 @@
 """One palette, one colour per robot and one ellipse, for the pictures, the page and Foxglove."""
 
-import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+
+from central.desk.names import in_order
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,14 +26,6 @@ ELLIPSE_SCALE = float(np.sqrt(5.991))
 """95 % of a Gaussian in the plane lie within this Mahalanobis distance."""
 BENT_RAD = 0.09
 """Between two poses whose headings differ by more, a path is drawn as a curve."""
-_DIGITS = re.compile("([0-9]+)")
-
-
-def in_order(names: Iterable[str]) -> list[str]:
-    """Robots' names as people count them: r2 before r10."""
-    return sorted(
-        names, key=lambda name: [int(p) if p.isdigit() else p for p in _DIGITS.split(name)]
-    )
 
 
 def colour_of(number: int) -> str:

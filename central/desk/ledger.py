@@ -8,10 +8,11 @@ lost.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from central.desk.names import in_order
 from central.desk.verification.recorded import Recorded, RerunError, Stream
 from central.desk.verification.robot import dispositions
 from team.robot.ledger import IN_SIGHTING
@@ -87,7 +88,7 @@ class Ledger:
             for entry in entries
             if entry.submap is not None
         )
-        robots = sorted({robot for robot, _ in self.entries})
+        robots = in_order({robot for robot, _ in self.entries})
         return {
             "measurements": self.measurements,
             "dispositions": self.totals(),
@@ -107,12 +108,16 @@ class Ledger:
         }
 
 
-def ledger(log: Recorded) -> Ledger:
-    """Compute the ledger of a log. Raises RerunError where a robot's configuration is missing."""
+def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> Ledger:
+    """Compute the ledger of a log. Raises RerunError where a robot's configuration is missing.
+
+    progress: is called with each robot's name before its measurements are consumed again.
+    """
     offenders = [f"{_named(r)} is in the log twice, and not the same" for r in log.contradicted]
     streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
     for stream in streams:
+        progress(stream[0])
         intervals, wrong = _intervals(log, stream)
         entries[stream], more = _entries(log, stream, intervals)
         offenders += [*wrong, *more, *_contradictions(log, stream, entries[stream])]

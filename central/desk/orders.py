@@ -2,6 +2,7 @@
 
 import time
 
+from central.desk.names import in_order
 from team.peers.members import Member, about
 from team.peers.proofs import Signs, signed_order
 from team.wire import channels as ch
@@ -145,7 +146,7 @@ def await_team(bus: Bus, robot: str, robots: set[str]) -> None:
     if not folds:
         raise WithdrawError(NO_CENTRE)
     robots.discard(_PEER)
-    known = ", ".join(sorted(robots)) or "none"
+    known = ", ".join(in_order(robots)) or "none"
     raise NoRobotError(f"the team has no robot {robot}; its robots: {known}")
 
 

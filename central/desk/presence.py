@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, field
 from statistics import median
 
+from central.desk.names import in_order
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, opened
@@ -106,7 +107,7 @@ class Presence:
         """The robots that have, or had, a process or a driver."""
         named = (node.partition("/") for node in self.members)
         found = {robot for kind, _, robot in named if kind in ("robot", "source")}
-        return sorted(found | self.heads.keys())
+        return in_order(found | self.heads.keys())
 
     def clocks(self) -> dict[str, float]:
         """The offset [s] of each measuring driver's clock from the median clock of the team."""
@@ -131,12 +132,13 @@ class Presence:
         for robot in [] if world else self.robots:
             advice += self._of_robot(robot)
         clocks = self.clocks()
-        for node, ahead_s in sorted(clocks.items()):
+        for node, ahead_s in ((node, clocks[node]) for node in in_order(clocks)):
             if abs(ahead_s) > APART_S and len(clocks) > 1:
                 way = "ahead of" if ahead_s > 0 else "behind"
                 remedy = _remedy(self.members[node], behind=ahead_s < 0.0)
                 advice.append(f"{node} stamps {abs(ahead_s):.1f} s {way} the others: {remedy}")
-        for node, member in sorted(self.members.items()):
+        for node in in_order(self.members):
+            member = self.members[node]
             if member.alive and member.status is not None:
                 advice += [f"{node}: {warning}" for warning in member.status.warnings]
         return advice

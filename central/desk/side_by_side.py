@@ -17,6 +17,7 @@ from central.desk.drawing import (
     landmark_blocks,
 )
 from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from central.desk.names import in_order
 from central.desk.pictures.style import save
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
         ("final map, its bytes", lambda e: "–" if e.map is None else e.map.payload_sha256[:16]),
     )
     rows = [(name, of(recorded), of(changed)) for name, of in of_the_team]
-    for name in sorted(recorded.robots.keys() | changed.robots.keys()):
+    for name in in_order(recorded.robots.keys() | changed.robots.keys()):
         a, b = (
             None if run.arbitrary_frame else run.robots.get(name) for run in (recorded, changed)
         )

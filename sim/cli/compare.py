@@ -37,11 +37,10 @@ def compare(
         _check_picture(output)
     evaluated = {}
     for path in runs:
-        log = path / "log.mcap" if path.is_dir() else path
         name = path.name if path.is_dir() else path.stem if path.stem != "log" else path.parent.name
         while name in evaluated:
             name += "'"
-        opened = open_log(log)
+        opened = open_log(path)
         warn_of_holes(opened)
         evaluated[name] = evaluate(opened.samples())
     table = Table(box=box.SIMPLE)

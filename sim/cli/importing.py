@@ -117,6 +117,10 @@ def readable(path: Path) -> Iterator[Path]:
     """
     from tempfile import TemporaryDirectory
 
+    from team.recording.reader import log_file
+
+    if log_file(path).is_file():  # a run's folder, or a file
+        path = log_file(path)
     if not (path.suffix == ".db3" or _is_bag_folder(path) or _is_ros2_mcap(path)):
         yield path
         return

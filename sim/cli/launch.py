@@ -3,7 +3,7 @@
 import json
 import time
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +35,7 @@ from sim.cli.options import (
     scenario_for,
     scenario_of,
 )
+from sim.cli.steps import Steps
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
 from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
@@ -355,6 +356,7 @@ def _conclude(
     from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
     from central.desk.evaluation.history import history
     from central.desk.export.take_home import taken_home
+    from central.desk.names import in_order
     from central.desk.report.page import write_report
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
@@ -362,7 +364,9 @@ def _conclude(
     from team.recording.reader import LogError, open_log
 
     console = Console()
-    typer.echo("the run is over: scoring it, which for a long log takes a while", err=True)
+    typer.echo("the run is over: scoring it", err=True)
+    steps = Steps()
+    steps.begin("scoring the run")
     extra: dict[str, Any] = {
         "processes": {
             ended.name: {"pid": ended.pid, "exit": ended.exit} | asdict(outcome.used[ended.name])
@@ -376,7 +380,7 @@ def _conclude(
         "wall_s": outcome.wall_s,
     }
     try:
-        log = open_log(outcome.log)
+        log = replace(open_log(outcome.log), reading=steps.share)
         evaluation = with_holes(evaluate(log.samples()), log)
     except (LogError, OSError) as error:
         outcome.failures.append(f"the log can not be evaluated: {error}")
@@ -388,16 +392,21 @@ def _conclude(
         for note in evaluation.notes:
             console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if report:
-            typer.echo("drawing the pictures and writing the report", err=True)
-            home = taken_home(recorded(log))
+            steps.begin("reading what the robots received")
+            messages = recorded(log)
+            steps.begin("smoothing the paths")
+            home = taken_home(messages, steps.robot)
+            steps.begin("reading the run's history")
             run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
+            typer.echo("drawing the pictures and writing the report", err=True)
             if (line := nis_line(run)) is not None:
                 console.print(line, highlight=False, soft_wrap=True)
             for path in write_report(run, outcome.folder, {**figures, **run_figures(run)}):
                 console.print(f"wrote {path}", highlight=False, soft_wrap=True)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
-    for name, times in sorted(outcome.restarts.items()):
+    for name in in_order(outcome.restarts):
+        times = outcome.restarts[name]
         text = f"{name} was started again {times} time{'' if times == 1 else 's'}"
         console.print(text, highlight=False)
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)

@@ -20,6 +20,7 @@ from sim.cli.options import (
     warn_of_holes,
 )
 from sim.cli.recorded import repair
+from team.extras import install_command
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -214,7 +215,7 @@ def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Expo
     if form is Format.CSV:
         return export_csv
     if find_spec("pyarrow") is None:
-        fail("--format parquet needs pyarrow: pip install 'teamslam[parquet]'", WRONG_USE)
+        fail(f"--format parquet needs pyarrow: {install_command('parquet')}", WRONG_USE)
     return export_parquet
 
 

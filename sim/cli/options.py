@@ -37,7 +37,9 @@ def _either(names: object) -> str:
 ScenarioArgument = Annotated[
     str, typer.Argument(help="A built-in scenario, a .toml file, or a resolved .json.")
 ]
-LogArgument = Annotated[Path, typer.Argument(help="An MCAP log of a team.")]
+LogArgument = Annotated[
+    Path, typer.Argument(help="An MCAP log of a team, or the folder of its run.")
+]
 Connect = Annotated[
     str, typer.Option(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
 ]

@@ -103,7 +103,7 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
     until it is withdrawn.
     """
-    from central.desk.evaluation.verdicts import contradicted
+    from central.desk.evaluation.verdicts import contradicting, said
     from central.desk.orders import NoRobotError, WithdrawError
     from central.desk.verdicts import judge, local_landmark
     from team.wire.messages import Judgement
@@ -125,7 +125,17 @@ def verdict(
         except WithdrawError as error:
             fail(str(error), WRONG_USE if isinstance(error, NoRobotError) else FAILED)
     opposite = "different" if word == "same" else "same"
-    if not withdraw and contradicted(judgement, fused.verdicts):
+    chain = () if withdraw else contradicting(judgement, fused.verdicts)
+    if len(chain) > 1:
+        every = "; ".join(map(said, (*chain[:-1], judgement) if word == "same" else chain))
+        apart = chain[-1] if word == "same" else judgement
+        fail(
+            f"these verdicts contradict each other: {every}; yet {said(apart)}, which is what "
+            "holds, so that one of the others has no effect: withdraw what is wrong by "
+            "`teamslam verdict … --withdraw`",
+            FAILED,
+        )
+    if chain:
         remedy = f"`teamslam verdict {opposite} {first} {second} --withdraw` withdraws that"
         contradiction = f"{first} and {second} were said to be {opposite}, too"
         if word == "same":

@@ -1,6 +1,7 @@
 """Commands on a recorded run: replay, report, repair."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,13 +23,13 @@ from sim.cli.options import (
     refuse_open_door,
     warn_of_holes,
 )
+from sim.cli.steps import Steps
 
 if TYPE_CHECKING:
     from central.desk.ledger import Ledger
+    from central.desk.verification.recorded import Recorded
     from team.recording.reader import Log
 
-LONG_BYTES = 5_000_000
-"""A report of a log from this size on takes a while, and says so."""
 app = typer.Typer()
 
 
@@ -112,15 +113,19 @@ def report(
     from team.recording.reader import open_log
 
     _check_folder(output)
-    opened = open_log(log)
-    if log.stat().st_size > LONG_BYTES:
-        text = "this log is long: proving its ledger takes most of the time"
-        typer.echo(f"{text}, --no-ledger leaves it out" if ledger else "this log is long", err=True)
+    steps = Steps()
+    opened = replace(open_log(log), reading=steps.share)
+    steps.begin("scoring the run")
     evaluation = with_holes(evaluate(opened.samples()), opened)
-    found, why = _ledger(opened) if ledger else (None, Run.no_ledger)
+    steps.begin("reading what the robots received")
+    messages = recorded(opened)
+    found, why = _ledger(messages, steps) if ledger else (None, Run.no_ledger)
     console = Console()
-    home = taken_home(recorded(opened))
+    steps.begin("smoothing the paths")
+    home = taken_home(messages, steps.robot)
+    steps.begin("reading the run's history")
     run = Run(evaluation, history(opened.samples()), opened.metadata, found, why, home)
+    steps.begin("drawing")
     if look or form or picture:
         style = Style(look or Look.SCREEN, form or (Form.PDF if look else Form.PNG), picture)
         drawn = write_pictures(run, output, style)
@@ -157,13 +162,14 @@ def _check_folder(path: Path) -> None:
         fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
 
 
-def _ledger(log: "Log") -> "tuple[Ledger | None, str]":
+def _ledger(messages: "Recorded", steps: Steps) -> "tuple[Ledger | None, str]":
     """The ledger of a log, or the reason why there is none."""
     from central.desk.ledger import ledger
-    from central.desk.verification.recorded import RerunError, recorded
+    from central.desk.verification.recorded import RerunError
 
+    steps.begin("proving the ledger (--no-ledger leaves it out)")
     try:
-        return ledger(recorded(log)), ""
+        return ledger(messages, steps.robot), ""
     except RerunError as error:
         return None, str(error)
 
@@ -176,9 +182,11 @@ def repair(
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from sim.importing.source import is_own_log
     from team.recording.bag_repair import bag_repaired
+    from team.recording.reader import log_file
     from team.recording.repair import repaired
 
     refuse_existing(output)
+    log = log_file(log)
     if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
         bag = bag_repaired(log, output)
         typer.echo(f"{output}: {counted(bag.messages, 'message')}")

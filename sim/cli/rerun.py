@@ -293,6 +293,7 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     from rich.table import Table
 
     from central.desk.ledger import ledger
+    from central.desk.names import in_order
     from central.desk.verification.recorded import RerunError, recorded
     from team.recording.reader import open_log
 
@@ -302,7 +303,7 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
         found = ledger(recorded(opened))
     except RerunError as error:
         fail(f"{log}: {error}", FAILED)
-    robots = sorted({robot for robot, _ in found.entries})
+    robots = in_order({robot for robot, _ in found.entries})
     table = Table("disposition")
     for robot in [*robots, "all"]:
         table.add_column(robot, justify="right")

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from central.desk.names import in_order
 from sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -60,7 +61,8 @@ def status(
 def _rows(presence: Any) -> list[dict[str, Any]]:
     clocks = presence.clocks()
     rows = []
-    for node, member in sorted(presence.members.items()):
+    for node in in_order(presence.members):
+        member = presence.members[node]
         figures = {} if member.status is None else member.status.figures
         rows.append(
             {

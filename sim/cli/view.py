@@ -15,6 +15,7 @@ from sim.cli.options import (
     WRONG_USE,
     Connect,
     Keys,
+    LogArgument,
     ScenarioArgument,
     connected,
     fail,
@@ -61,7 +62,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
 
 @app.command()
 def view(
-    log: Annotated[Path, typer.Argument(help="An MCAP log of a team.")],
+    log: LogArgument,
     port: Port = 0,
     foxglove_port: FoxglovePort = 8765,
     host: Annotated[
@@ -85,9 +86,10 @@ def view(
     and events; nothing is loaded from elsewhere. Foxglove and Lichtblick can connect, too. It ends
     with Ctrl-C.
     """
-    from team.recording.reader import open_log
+    from team.recording.reader import log_file, open_log
     from team.shell import process
 
+    log = log_file(log)
     if not follow or log.exists():
         opened = open_log(log)
         if not follow:

@@ -1,5 +1,6 @@
 """Shows a running team: a live table in a terminal, plain lines elsewhere."""
 
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from central.desk.evaluation.events import without_decimals
-from sim.launch.watch import DRIVERS, Watch, team_time
+from central.desk.names import in_order, short
+from sim.launch import said
+from sim.launch.watch import DRIVERS, Watch
 from team.wire import messages as m
 
 if TYPE_CHECKING:
@@ -26,8 +29,9 @@ REPEAT_S = 60.0
 """Wall time after which a line is repeated that says nothing new."""
 SETTLED_S = 5.0
 """A warning that a node withdraws sooner [s], as while a team starts, is not printed as a line."""
-PATIENCE_S = 8.0
-"""Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
+MOST_ALIKE = 3
+"""Most lines of warnings that differ in their numbers only."""
+_NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
 @contextmanager
@@ -54,6 +58,7 @@ class _Lines:
         self._console = console
         self._due = 0.0
         self._shown: set[str] = set()
+        self._alike: dict[str, int] = {}
         self._since: dict[str, float] = {}
         self._last: Watch | None = None
         self._noted = 0
@@ -68,10 +73,11 @@ class _Lines:
             self._print(watch, note)
         self._noted = len(watch.notes)
         self._warn(watch, SETTLED_S)
-        for words in () if watch.fused is None else watch.fused.joined:
-            if words not in self._shown:
-                self._shown.add(words)
-                self._print(watch, words)
+        for words in () if watch.fused is None or watch.fused.final else watch.fused.joined:
+            who_and_when = words.partition(":")[0]
+            if who_and_when not in self._shown:
+                self._shown.add(who_and_when)
+                self._print(watch, short(words))
         now = time.monotonic()
         if now < self._due or watch.world is None:
             return
@@ -83,35 +89,48 @@ class _Lines:
 
     def _progress(self, watch: Watch, world: m.Status) -> str:
         """The line on how far the team is; of what a live team waits for it says who and what."""
-        robots = [s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")]
+        robots = [s for n, s in watch.statuses.items() if n.startswith("robot/")]
         if world.state == "waiting":
-            lacking = world.warnings if _is_live(watch) and len(robots) >= watch.robots else ()
+            lacking = world.warnings if said.is_live(watch) and len(robots) >= watch.robots else ()
             self._shown |= {without_decimals(f"{DRIVERS}: {text}") for text in lacking}
             return "; ".join(lacking) or f"waiting: {len(robots)} of {watch.robots} robots"
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
-        consistency = _consistency(watch)
+        waiting = ", ".join(who for who, _ in said.apart(watch))
+        apart = f"; not joined yet: {waiting}" if waiting else ""
+        consistency = said.consistency(watch)
         return (
-            f"{_share(watch):>4}  {team_time(world)}, "
+            f"{said.share(watch):>4}  {said.times(watch, world)}, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
-            f"{'; ' if consistency else ''}{consistency}"
+            f"{apart}{'; ' if consistency else ''}{consistency}"
         )
 
     def end(self) -> None:
-        """Print the warnings that are left at the end, however short they have lasted."""
+        """Print the warnings that are left at the end, however short they have lasted, without
+        those of the final map, which the table shows.
+        """
         if self._last is not None:
+            fused = self._last.fused
+            final = fused.reasons if fused is not None and fused.final else ()
+            self._shown |= {without_decimals(f"central: {reason}") for reason in final}
             self._warn(self._last, 0.0)
 
     def _warn(self, watch: Watch, settled_s: float) -> None:
-        now, warnings = time.monotonic(), _warnings(watch)
+        """Print new warnings that have lasted; of many that differ in their numbers the first."""
+        now, warnings = time.monotonic(), said.warnings(watch, silent_s=settled_s)
         self._since = {w: self._since.get(w, now) for w in map(without_decimals, warnings)}
         for warning in warnings:
             key = without_decimals(warning)
             lasting = warning in watch.failures or now - self._since[key] >= settled_s
-            if lasting and key not in self._shown:
-                self._shown.add(key)
-                self._print(watch, f"warning: {warning}")
+            if not lasting or key in self._shown:
+                continue
+            self._shown.add(key)
+            kind = _NUMBERS.sub("#", warning)
+            self._alike[kind] = self._alike.get(kind, 0) + 1
+            if self._alike[kind] <= MOST_ALIKE or warning in watch.failures:
+                more = "; more like this: in the report" * (self._alike[kind] == MOST_ALIKE)
+                self._print(watch, f"warning: {warning}{more}")
 
     def _print(self, watch: Watch, text: str) -> None:
         elapsed = time.monotonic() - watch.began
@@ -120,80 +139,29 @@ class _Lines:
         )
 
 
-def _taken(watch: Watch) -> tuple[float, float]:
-    """How many of the world's measurements the robots have consumed, and their number; the world
-    may be far ahead of them.
-    """
-    total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
-    robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
-    taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
-    return min(taken, total), total
-
-
-def _done(watch: Watch) -> float:
-    """The share of the world's measurements that the robots have consumed."""
-    taken, total = _taken(watch)
-    return taken / total if total else 0.0
-
-
-def _is_live(watch: Watch) -> bool:
-    """Whether drivers measure, and no world."""
-    return watch.world is not None and watch.world.node == DRIVERS
-
-
-def _warnings(watch: Watch) -> list[str]:
-    """The failures, and the nodes' warnings; absent nodes are warned of after PATIENCE_S only.
-
-    While the team starts every node lacks every other: the world's warning stands for all.
-    """
-    if time.monotonic() - watch.began <= PATIENCE_S:
-        return list(watch.failures)
-    world = watch.world
-    statuses = sorted(watch.statuses.items())
-    if world is None:
-        statuses = (
-            [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
-        )
-        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in statuses if s.warnings]
-    elif world.state == "waiting":
-        texts = [f"{world.node}: {w}" for w in world.warnings]
-    else:
-        statuses += [(world.node, world)] if watch.drivers else []
-        texts = [f"{node}: {w}" for node, status in statuses for w in status.warnings]
-    return [*watch.failures, *texts]
-
-
-def _share(watch: Watch) -> str:
-    """The progress in words: it is not known how much drivers will measure yet."""
-    if not _is_live(watch):
-        return f"{_done(watch):.0%}"
-    taken, total = _taken(watch)
-    return f"{taken:,.0f} of {total:,.0f} measurements mapped"
-
-
 def _view(title: str, watch: Watch) -> Group:
     elapsed = time.monotonic() - watch.began
     world = watch.world
     parts: list[Text | Table] = [Text(f"{title}   {elapsed:.1f} s", style="bold")]
     if watch.place:
         parts.append(Text(f"other commands reach the team by {watch.place}", style="dim"))
-    robots = {n: s for n, s in sorted(watch.statuses.items()) if n.startswith("robot/")}
+    robots = {n: watch.statuses[n] for n in in_order(watch.statuses) if n.startswith("robot/")}
     if world is None or world.state == "waiting":
         parts.append(Text(f"starting: {len(robots)} of {watch.robots} robots are there"))
     else:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(
-            ProgressBar(total=1.0, completed=_done(watch), width=36),
-            _share(watch),
-            f"{team_time(world)}, {world.node} {world.state}",
+            ProgressBar(total=1.0, completed=said.done(watch), width=36),
+            said.share(watch),
+            f"{said.times(watch, world)}, {world.node} {world.state}",
         )
         parts.append(bar)
     if robots:
         parts.append(_robots(robots, watch.errors))
     parts += [Text(line) for line in _map_lines(watch)]
-    parts += [Text(words) for words in (() if watch.fused is None else watch.fused.joined)]
+    parts += [Text(short(words)) for words in (() if watch.fused is None else watch.fused.joined)]
     parts += [Text(note) for note in watch.notes[-4:]]
-    parts += [Text(w, style="yellow") for w in _warnings(watch)[-4:]]
+    parts += [Text(w, style="yellow") for w in said.warnings(watch)[-4:]]
     return Group(*parts)
 
 
@@ -259,37 +227,17 @@ def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
 
 def _map_lines(watch: Watch) -> list[str]:
     """The contents of the team's map, and its warnings."""
-    fused, central, world = watch.fused, watch.statuses.get("central"), watch.world
+    fused, central = watch.fused, watch.statuses.get("central")
     if fused is None:
         return ["no fused map yet"]
     figures = {} if central is None else central.figures
-    lag_s = 0.0 if world is None else max(0.0, 1e-9 * (world.stamp_ns - fused.stamp_ns))
     lines = [
-        f"team map by {fused.rule}, {lag_s:.0f} s behind: {len(fused.ids) // 4} landmarks from "
+        f"team map by {fused.rule}: {len(fused.ids) // 4} landmarks from "
         f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
     ]
-    consistency = _consistency(watch)
-    return [*lines, consistency] if consistency else lines
-
-
-def _consistency(watch: Watch) -> str:
-    """The consistency monitor's figures; against the truth NEES and coverage of the map's
-    landmarks.
-    """
-    central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
-    figures = {} if central is None else central.figures
-    parts = [
-        f"{words} {figures[name]:.2f}"
-        for name, words in (
-            ("joint_cost_per_dof", "joint cost per dof"),
-            ("covariance_scale", "covariance scale"),
-        )
-        if name in figures
-    ]
-    if landmarks.count:
-        parts.append(f"landmark NEES per dof {landmarks.mean:.2f}")
-        parts.append(f"{landmarks.coverage:.0%} within 95 %")
-    return ", ".join(parts)
+    consistency = said.consistency(watch)
+    lines += [consistency] if consistency else []
+    return lines + [f"not joined yet: {who}: {why}" for who, why in said.apart(watch)]
 
 
 def _number(value: float | None, form: str) -> str:

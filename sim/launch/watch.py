@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -88,7 +89,7 @@ class Watch:
 
     def _drivers_lacking(self, there: Sequence[m.Status]) -> Iterator[str]:
         """Which drivers of a live team are waited for, and what to do; of `there` the statuses."""
-        missing = sorted(set(self.drivers or ()) - {_robot(status) for status in there})
+        missing = in_order(set(self.drivers or ()) - {_robot(status) for status in there})
         if missing:
             first = missing[0]
             yield (

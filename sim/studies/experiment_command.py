@@ -9,6 +9,7 @@ import typer
 
 from sim.cli.options import FAILED, WRONG_USE, fail
 from sim.studies.experiments.catalogue import ENTRIES, Entry
+from team.extras import install_command
 
 app = typer.Typer(
     name="experiment",
@@ -107,7 +108,7 @@ def _run(
     try:
         import joblib  # noqa: F401 - said before the work, not after it
     except ModuleNotFoundError:
-        fail("experiments need joblib: python -m pip install 'teamslam[studies]'", WRONG_USE)
+        fail(f"experiments need joblib: {install_command('studies')}", WRONG_USE)
 
     from sim.studies.experiments.cases import SchedulerError
     from sim.studies.experiments.experiment import Options, without_datasets

@@ -1,6 +1,7 @@
 """The contents of the team's map: submaps with their place in the set, and initial poses."""
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
@@ -14,11 +15,21 @@ Stream: TypeAlias = tuple[str, int]
 """(robot, incarnation): one unbroken life of a robot's sensor stream."""
 Key: TypeAlias = tuple[int, str, int, int]
 """(end stamp, robot, incarnation, sequence): a submap's place in the canonical order."""
+UNIX_S = 1e9
+"""Team times from here on [s] are Unix times: 1e9 s is in 2001."""
 
 
 def named(stream: Stream) -> str:
     """`r3 (incarnation 2)`."""
     return f"{stream[0]} (incarnation {stream[1]})"
+
+
+def moment(stamp_ns: int) -> str:
+    """Team time in words: seconds, or the time of day (UTC) where it is Unix time."""
+    seconds = 1e-9 * stamp_ns
+    if seconds < UNIX_S:
+        return f"{seconds:,.1f} s"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 class Observation(NamedTuple):

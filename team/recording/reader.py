@@ -2,7 +2,7 @@
 
 import os
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -34,8 +34,10 @@ from team.recording.records import (
 from team.wire.bus import Sample
 from team.wire.channels import VIEW, Channel, channel_of
 
-__all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "open_log"]
+__all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "log_file", "open_log"]
 
+IN_FOLDER = "log.mcap"
+"""The log in the folder of a run."""
 _MESSAGE = struct.Struct("<HIQQ")
 _OF_MESSAGE = int(Opcode.MESSAGE)
 """As a plain number: to compare with an enum's member takes a tenth of the time of reading."""
@@ -46,13 +48,14 @@ class Log:
     """A log on disk. `complete` is False when its recorder did not finish it.
 
     `metadata` is its provenance, `team` the team's name. An incomplete log is read up to its last
-    whole chunk.
+    whole chunk. `reading` is told by every pass over the log which share of it is read.
     """
 
     path: Path
     team: str
     complete: bool
     metadata: dict[str, str] = field(repr=False)
+    reading: Callable[[float], None] = field(default=lambda _: None, repr=False, compare=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
         """The samples of the given channels (None: all) in the order of the file; raises
@@ -84,11 +87,13 @@ class Log:
     ) -> Iterator[list[Sample] | DamagedChunkError]:
         """The samples chunk by chunk; in the place of a damaged chunk, its error."""
         names = None if channels is None else {channel.name for channel in channels}
+        size = max(self.path.stat().st_size, 1)
         with self.path.open("rb") as file:
             # The index repeats the channels: a chunk that introduced one may be damaged.
             keys = self._indexed(file, names) if self.complete else {}
             for frame in frames(file, self.path):
                 if frame.opcode == Opcode.CHUNK:
+                    self.reading(frame.offset / size)
                     try:
                         yield self.samples_in(frame, keys, names)
                     except (*MALFORMED, ValueError, zstandard.ZstdError) as error:
@@ -143,14 +148,20 @@ class Log:
         return key if row is not None and row.name in names else None
 
 
+def log_file(path: Path) -> Path:
+    """The path of a log; of a run's folder, that of the log in it."""
+    return path / IN_FOLDER if path.is_dir() else path
+
+
 def open_log(path: str | Path) -> Log:
-    """The log at `path`; raises `LogError` when it is not one."""
-    path = Path(path)
+    """The log at `path`, or in the run's folder there; raises `LogError` when there is none."""
+    path = log_file(Path(path))
     try:
         with path.open("rb") as file:
             return _opened(file, path)
     except FileNotFoundError:
-        raise LogError(path, "not found", "give the path of a log that was recorded") from None
+        what = "give the path of a log that was recorded, or of the folder of its run"
+        raise LogError(path, "not found", what) from None
     except OSError as error:
         raise LogError(path, str(error.strerror), "give the path of a readable file") from error
 

@@ -179,6 +179,13 @@ def test_a_recorder_never_overwrites(path: Path) -> None:
         Recorder(path, "t", {})
 
 
+def test_a_log_is_found_by_the_folder_of_its_run(tmp_path: Path) -> None:
+    recorded(tmp_path / "log.mcap", stream(10))
+    assert open_log(tmp_path).path == tmp_path / "log.mcap"
+    with pytest.raises(LogError, match=r"log\.mcap: not found; give the path .* folder of its run"):
+        open_log(tmp_path.parent)
+
+
 def test_a_recorder_names_a_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(RecorderError, match="No such file or directory; choose another place"):
         Recorder(tmp_path / "nowhere" / "log.mcap", "t", {})

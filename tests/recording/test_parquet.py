@@ -1,6 +1,7 @@
 """A log as Parquet: every field reads back, typed, in row groups that bound the memory."""
 
 import json
+import sys
 from pathlib import Path
 
 import msgspec
@@ -91,7 +92,7 @@ def test_without_pyarrow_the_command_says_what_to_install(
     monkeypatch.setattr(cli_log, "find_spec", lambda name: None)
     refused = CliRunner().invoke(app, command)
     assert refused.exit_code == 2
-    assert "pip install 'teamslam[parquet]'" in refused.output
+    assert f"{sys.executable} -m pip install 'pyarrow>=18'" in refused.output
     monkeypatch.undo()
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output

@@ -36,6 +36,7 @@ from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.desk.evaluation.verdicts import verdicts_given
+from central.desk.names import in_order
 from central.team_config import TeamConfig, team_config
 from team import translate
 from team.estimation.gaussian import Matrix
@@ -184,7 +185,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         map=fused,
         robots=robots,
         true_landmarks=positions,
-        channels={key: log.traffic[key] for key in sorted(log.traffic)},
+        channels={key: log.traffic[key] for key in in_order(log.traffic)},
         notes=(
             *(end.notes if isinstance(end, m.End) else ()),
             *_lost(fused),
@@ -245,7 +246,7 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
     return [
         f"{node} set {len(found)} messages aside; the first, {found[0].origin}, raised "
         f"{found[0].error} at {found[0].place}: {found[0].text}"
-        for node, found in sorted(by_node.items())
+        for node, found in ((node, by_node[node]) for node in in_order(by_node))
     ]
 
 

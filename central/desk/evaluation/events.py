@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Literal
 
+from central.desk.names import in_order, not_joined, short
 from team.wire import messages as m
 from team.wire.channels import robot_node
 
@@ -61,6 +62,8 @@ class EventDetector:
     _members: set[str] = field(default_factory=set)
     _withdrawn: set[str] = field(default_factory=set)
     _reasons: dict[str, str] = field(default_factory=dict)
+    _joined: set[str] = field(default_factory=set)
+    _apart: set[str] = field(default_factory=set)
     _decided: set[tuple[int, str, str]] = field(default_factory=set)
     _warned: set[tuple[str, str]] = field(default_factory=set)
     _refused: int = 0
@@ -130,20 +133,32 @@ class EventDetector:
 
     def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
         """Changes in the robots that a map contains."""
-        parts = (reason.partition(" not joined: ") for reason in fused.reasons)
-        apart = {name for name, waits, _ in parts if waits}
-        members = {member.robot for member in fused.members} - apart
+        apart = {
+            name: f"{who} not joined: {why}"
+            for who, why in not_joined(fused.reasons)
+            for name in who.split(", ")
+        }
+        members = {member.robot for member in fused.members} - apart.keys()
         events = [
             Event(now_ns, "map", robot_node(robot), f"{robot} is in the team's map")
-            for robot in sorted(members - self._members)
+            for robot in in_order(members - self._members)
         ]
         events += [
             Event(now_ns, "withdrawn", robot_node(robot), f"{robot} was withdrawn from the map")
-            for robot in sorted((self._members & {*fused.withdrawn}) - self._withdrawn)
+            for robot in in_order((self._members & {*fused.withdrawn}) - self._withdrawn)
         ]
         self._members = members
         events += self._decisions(fused, now_ns)
-        reasons = {without_decimals(reason): reason for reason in fused.reasons}
+        events += [
+            Event(now_ns, "map", "central", short(words))
+            for words in fused.joined
+            if words not in self._joined
+        ]
+        self._joined |= {*fused.joined}
+        new = dict.fromkeys(apart[name] for name in in_order(apart.keys() - self._apart))
+        events += [Event(now_ns, "warning", "central", words) for words in new]
+        self._apart = {*apart}
+        reasons = {without_decimals(each): each for each in fused.reasons if not _is_apart(each)}
         events += [
             Event(now_ns, "warning", "central", reasons[shape])
             for shape in sorted(reasons.keys() - self._reasons.keys())
@@ -181,7 +196,8 @@ class EventDetector:
             self._refused = refused
         for warning in status.warnings:
             gist = (status.node, without_decimals(warning))
-            if gist in self._warned or any(text in warning for text in _AWAITED):
+            awaited = any(text in warning for text in _AWAITED)
+            if gist in self._warned or awaited or _is_apart(warning):
                 continue
             self._warned.add(gist)
             kind: Kind = "refused" if "refused" in warning else "warning"
@@ -201,6 +217,11 @@ def decision_words(decision: m.AssociationDecision) -> str:
         return f"{decision.about} wait: {decision.why} ({figures})"
     what = "merged by their maps" if decision.kind == "merge" else "closed a loop"
     return f"{decision.about} {what}: {figures}"
+
+
+def _is_apart(reason: str) -> bool:
+    """Whether it says why a robot is not joined: the map's change says so once."""
+    return any(not_joined([reason]))
 
 
 def without_decimals(text: str) -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int64
 from central.desk.evaluation.events import MOST, Event, EventDetector
 from central.desk.evaluation.log import head_of
 from central.desk.evaluation.running import TrueLandmarks
+from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -258,14 +259,18 @@ def history(samples: Iterable[Sample]) -> History:
     return History(
         start_ns=span[0],
         end_ns=span[1],
-        innovations={robot: _innovations(of) for robot, of in sorted(found.innovations.items())},
+        innovations={
+            robot: _innovations(found.innovations[robot]) for robot in in_order(found.innovations)
+        },
         map_nees=found.map_nees.series,
         map_cost=found.map_cost.series,
-        robot_cost={robot: column.series for robot, column in sorted(found.robot_cost.items())},
-        latencies={robot: _latencies(of) for robot, of in sorted(found.latencies.items())},
+        robot_cost={robot: found.robot_cost[robot].series for robot in in_order(found.robot_cost)},
+        latencies={
+            robot: _latencies(found.latencies[robot]) for robot in in_order(found.latencies)
+        },
         traffic={
             key: Traffic(series.stamps_ns, series.values.astype(np.int64))
-            for key, series in ((k, found.traffic[k].series) for k in sorted(found.traffic))
+            for key, series in ((k, found.traffic[k].series) for k in in_order(found.traffic))
         },
         events=tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
     )

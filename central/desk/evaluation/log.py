@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -105,7 +106,7 @@ class Collected:
             found = channel_of(key)
             if found is not None and found[0].name in _OF_A_ROBOT:
                 names.add(found[1])
-        return sorted(names)
+        return in_order(names)
 
     def last(self, channel: Channel) -> Sample | None:
         """The newest sample of a channel with one key."""

@@ -19,10 +19,50 @@ def name_of(landmark: m.LocalLandmark) -> str:
     return f"{landmark.robot}/{landmark.incarnation}/{landmark.sequence}/{landmark.local}"
 
 
-def contradicted(judgement: m.Judgement, others: Collection[m.Judgement]) -> bool:
-    """Whether one of the others says the opposite of the same pair."""
+def said(judgement: m.Judgement) -> str:
+    """A verdict in words."""
+    first, second = name_of(judgement.first), name_of(judgement.second)
+    return f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
+
+
+def contradicting(
+    judgement: m.Judgement, others: Collection[m.Judgement]
+) -> tuple[m.Judgement, ...]:
+    """The fewest of the others that can not hold together with a verdict; empty where all can.
+
+    They are a chain of landmarks that are one, this verdict perhaps among them, and, last, that its
+    two ends are two.
+    """
     pair = pair_of(judgement)
-    return any(pair_of(each) == pair and each.same != judgement.same for each in others)
+    same = [each for each in others if each.same and pair_of(each) != pair]
+    different = [each for each in others if not each.same]
+    if not judgement.same:
+        same += [each for each in others if each.same and pair_of(each) == pair]
+        return tuple(_chain(judgement.first, judgement.second, same) or ())
+    found = [
+        (*before, *after, each)
+        for each in different
+        for one, two in ((judgement.first, judgement.second), (judgement.second, judgement.first))
+        if (before := _chain(each.first, one, same)) is not None
+        and (after := _chain(two, each.second, same)) is not None
+    ]
+    return min(found, key=len, default=())
+
+
+def _chain(
+    first: m.LocalLandmark, last: m.LocalLandmark, same: Collection[m.Judgement]
+) -> list[m.Judgement] | None:
+    """The shortest chain of verdicts by which two landmarks are one; None where there is none."""
+    chains: dict[m.LocalLandmark, list[m.Judgement]] = {first: []}
+    reached = [first]
+    for at in reached:  # it grows
+        for each in same:
+            pair = pair_of(each)
+            for other in pair - {at} if at in pair else ():
+                if other not in chains:
+                    chains[other] = [*chains[at], each]
+                    reached.append(other)
+    return chains.get(last)
 
 
 def verdicts_given(log: Collected) -> tuple[str, ...]:
@@ -37,9 +77,7 @@ def verdicts_given(log: Collected) -> tuple[str, ...]:
 
 def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     judgement = verdict.judgement
-    first, second = name_of(judgement.first), name_of(judgement.second)
-    text = f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
-    text += f": {verdict.reason}" if verdict.reason else ""
+    text = said(judgement) + (f": {verdict.reason}" if verdict.reason else "")
     if verdict.withdrawn:
         return f"{text} (withdrawn)"
     holds = any(
@@ -47,6 +85,9 @@ def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     )
     if not holds:
         return f"{text} (not in the map: withdrawn, or it does not have both)"
-    if judgement.same and contradicted(judgement, rests_on):
+    chain = contradicting(judgement, rests_on)
+    if judgement.same and len(chain) == 1:
         return f"{text} (without effect: they were said to be two, too)"
+    if len(chain) > 1:
+        return f"{text} (contradicted: {', '.join(map(said, chain))}; two they stay)"
     return text

@@ -8,7 +8,7 @@ read back to the last bit.
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path as FilePath
@@ -44,9 +44,11 @@ class TakenHome:
     measurements: Mapping[int, int]
 
 
-def taken_home(found: Recorded) -> TakenHome:
-    """The paths at keyframe rate and the counts of a log."""
-    return TakenHome(smoothed_paths(found), measurement_counts(found))
+def taken_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
+    """The paths at keyframe rate and the counts of a log; `progress` is called with each robot's
+    name.
+    """
+    return TakenHome(smoothed_paths(found, progress), measurement_counts(found))
 
 
 def measurement_counts(found: Recorded) -> Mapping[int, int]:

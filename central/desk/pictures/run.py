@@ -133,15 +133,18 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
 
 
 def new_figure(
-    width: float, height: float, rows: int, columns: int
+    width: float, height: float, rows: int, columns: int, heights: Sequence[float] | None = None
 ) -> "tuple[Figure, list[list[Axes]]]":
-    """A figure on Agg without pyplot's global state, with its axes by row and column."""
+    """A figure on Agg without pyplot's global state, with its axes by row and column.
+
+    heights: those of the rows in relation to each other; None: all the same.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1, height_ratios=heights)
     return figure, [list(row) for row in grid]
 
 

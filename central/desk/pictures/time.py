@@ -22,6 +22,7 @@ from central.desk.drawing import (
 )
 from central.desk.evaluation.evaluation import Evaluation
 from central.desk.evaluation.history import History, Traffic
+from central.desk.names import in_order
 from central.desk.pictures.run import new_figure, thinning
 from central.desk.pictures.style import save
 from team.estimation.consistency import chi2_interval
@@ -30,6 +31,7 @@ from team.wire.channels import channel_of
 
 if TYPE_CHECKING:  # as in central.desk.pictures.run: Matplotlib is slow to import
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 BINS = 40
 """Number of intervals of team time over which values are summed."""
@@ -42,6 +44,8 @@ WARN, FAIL = 1.1, 1.3
 LOGARITHMIC_FROM = 12.0
 """A NEES beyond this is drawn on a logarithmic axis."""
 SHOWN_KEYS = 8
+_OTHERS = ("central", "recorder", "world")
+"""Nodes that are no robots: below these in the timeline."""
 EVENT_STYLES = {
     "joined": ("o", GREEN), "lost": ("X", RED), "restarted": ("^", ORANGE), "left": ("<", GREY),
     "map": ("D", BLUE), "closure": ("d", BLUE), "undone": ("d", RED), "withdrawn": ("P", PURPLE),
@@ -57,11 +61,31 @@ def binned(
 
     Returns the intervals' middles [s] and the sums; values outside the run count to its ends.
     """
-    edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
-    where = np.clip(np.searchsorted(edges, history.seconds(stamps_ns), "right") - 1, 0, BINS - 1)
+    where = _bins(history, stamps_ns)
     filled = np.bincount(where, minlength=BINS) > 0
     sums = [np.bincount(where, weights=v, minlength=BINS)[filled] for v in values]
-    return (0.5 * (edges[1:] + edges[:-1]))[filled], sums
+    return _middles(history)[filled], sums
+
+
+def _edges(history: History) -> Float[np.ndarray, " e"]:
+    """The ends of the run's BINS intervals [s]."""
+    return np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
+
+
+def _middles(history: History) -> Float[np.ndarray, " b"]:
+    """The middles of the run's BINS intervals [s]."""
+    edges = _edges(history)
+    middles: Float[np.ndarray, " b"] = 0.5 * (edges[1:] + edges[:-1])
+    return middles
+
+
+def _bins(history: History, stamps_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """The interval of each stamp; stamps outside the run count to its ends."""
+    at: Int64[np.ndarray, " n"] = np.searchsorted(
+        _edges(history), history.seconds(stamps_ns), "right"
+    )
+    clipped: Int64[np.ndarray, " n"] = np.clip(at - 1, 0, BINS - 1)
+    return clipped
 
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
@@ -157,9 +181,12 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
 
 def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhline(1.0, color="#888888", linewidth=0.8)
-    for level, colour, name in ((WARN, ORANGE, "warns"), (FAIL, RED, "fails")):
+    for level, colour, name in (
+        (WARN, ORANGE, "covariances too small"),
+        (FAIL, RED, "covariances not to be trusted"),
+    ):
         axis.axhline(
-            level, color=colour, linewidth=0.9, linestyle="--", label=f"{name} above {level}"
+            level, color=colour, linewidth=0.9, linestyle="--", label=f"above {level}: {name}"
         )
     largest = FAIL
     colours = robot_colours(evaluation.robots)
@@ -254,69 +281,101 @@ def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Tr
             at_s[rate > 0.0], rate[rate > 0.0], color=colour_of(k), linestyle=style, linewidth=1.2,
             label=name,
         )  # fmt: skip
-    _log_scale(axis)
+    _log_scale(axis, axis.yaxis)
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     if groups:
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
-def _log_scale(axis: "Axes") -> None:
+def _log_scale(axes: "Axes", axis: "Axis") -> None:
     """A logarithmic scale with plain numbers: 1, 2, 5, 10 where it spans few powers of ten, and
     more where it spans less than one.
     """
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    axis.set_yscale("log")
-    low, high = axis.get_ylim()
+    upright = axis is axes.yaxis
+    (axes.set_yscale if upright else axes.set_xscale)("log")
+    low, high = axes.get_ylim() if upright else axes.get_xlim()
     few = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < 8.0 * low else (1.0, 2.0, 5.0)
-    axis.yaxis.set_major_locator(LogLocator(subs=few if high < 200.0 * low else (1.0,)))
-    axis.yaxis.set_major_formatter("{x:,g}")
-    axis.yaxis.set_minor_formatter(NullFormatter())
-
-
-THICKEST = 4
-"""Number of line widths: robots beyond it have the thickest curve."""
+    axis.set_major_locator(LogLocator(subs=few if high < 200.0 * low else (1.0,)))
+    axis.set_major_formatter("{x:,g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def latency_picture(history: History, path: FilePath) -> bool:
     """Wall time from a submap's first and last measurement to the first map that used it.
 
-    Robots whose submaps came into one map have equal curves: the first is drawn the thickest.
+    Above every submap over team time, with the median of all robots; below a row for each robot,
+    with its median and the range of 95 % of its submaps.
     """
     if not history.latencies:
         return False
-    figure, axes = new_figure(9.0, 3.6, 1, 1)
-    axis = axes[0][0]
+    names = in_order(history.latencies)
+    low_height = 0.5 + 0.26 * len(names)
+    figure, axes = new_figure(9.0, 4.2 + low_height, 2, 1, (3.2, low_height))
+    over, rows = axes[0][0], axes[1][0]
     colours = robot_colours({*history.innovations, *history.latencies})
-    for behind, (name, of) in enumerate(reversed(list(history.latencies.items()))):
+    for name in names:
+        of = history.latencies[name]
         drawn = thinning(len(of.stamps_ns))
-        seconds = history.seconds(of.stamps_ns[drawn])
-        wider = 1.3 * min(behind, THICKEST)
-        axis.plot(
-            seconds, of.last_s[drawn], color=colours[name], linewidth=0.8 + wider, marker="o",
-            markersize=3 + 1.5 * wider, label=name, zorder=2.9 - 0.01 * behind,
+        over.plot(
+            history.seconds(of.stamps_ns[drawn]), of.last_s[drawn], color=colours[name],
+            marker="o", markersize=2.5, linestyle="", alpha=0.5,
         )  # fmt: skip
-        axis.plot(
-            seconds, of.first_s[drawn], color=colours[name], linewidth=0.8 + wider, linestyle=":",
-            zorder=2.9 - 0.01 * behind,
+    every = list(history.latencies.values())
+    stamps = np.concatenate([of.stamps_ns for of in every])
+    for words, style, values in (
+        ("from its last measurement", "-", np.concatenate([of.last_s for of in every])),
+        ("from its first measurement", ":", np.concatenate([of.first_s for of in every])),
+    ):
+        over.plot(
+            *_medians(history, stamps, values), color=MAP_COLOUR, linestyle=style, linewidth=1.2,
+            label=f"{words}, median of all",
         )  # fmt: skip
-    axis.plot([], [], color="#555555", marker="o", markersize=3, label="from its last measurement")
-    axis.plot([], [], color="#555555", linestyle=":", label="from its first measurement")
-    if all((of.last_s > 0.0).all() for of in history.latencies.values()):
-        _log_scale(axis)  # clocks of two machines may disagree
-    axis.set_xlabel("end of the submap, team time [s]")
-    axis.set_ylabel("wall time to the map [s]")
-    axis.grid(color="#eeeeee", linewidth=0.6)
-    axis.set_axisbelow(True)
-    handles, names = axis.get_legend_handles_labels()
-    order = sorted(range(len(names)), key=lambda k: (names[k] not in colours, names[k]))
-    axis.legend(
-        [handles[k] for k in order], [names[k] for k in order],
-        loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False,
-    )  # fmt: skip
+    for row, name in enumerate(names):
+        of = history.latencies[name]
+        for values, marker, face, at in (
+            (of.last_s, "o", colours[name], row - 0.17),
+            (of.first_s, "s", "white", row + 0.17),
+        ):
+            low, middle, high = np.quantile(values, (0.025, 0.5, 0.975)).tolist()
+            rows.plot([low, high], [at, at], color=colours[name], linewidth=1.2)
+            rows.plot(
+                [middle], [at], color=colours[name], marker=marker, markersize=5,
+                markerfacecolor=face,
+            )  # fmt: skip
+    for marker, face, words in (("o", "#555555", "last"), ("s", "white", "first")):
+        rows.plot(
+            [], [], color="#555555", marker=marker, markersize=5, markerfacecolor=face,
+            label=f"from its {words} measurement: median, range of 95 %",
+        )  # fmt: skip
+    rows.set_yticks(range(len(names)), names)
+    rows.set_ylim(len(names) - 0.5, -0.5)
+    if all((of.last_s > 0.0).all() for of in every):  # clocks of two machines may disagree
+        _log_scale(over, over.yaxis)
+        _log_scale(rows, rows.xaxis)
+    over.set_xlabel("end of the submap, team time [s]")
+    over.set_ylabel("wall time to the map [s]")
+    rows.set_xlabel("wall time from a measurement to the map [s]")
+    for axis in (over, rows):
+        axis.grid(color="#eeeeee", linewidth=0.6)
+        axis.set_axisbelow(True)
+        axis.legend(
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=8, frameon=False
+        )
     save(figure, path)
     return True
+
+
+def _medians(
+    history: History, stamps_ns: Int64[np.ndarray, " n"], values: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
+    """The median of the values in each of the run's BINS intervals that has any."""
+    where = _bins(history, stamps_ns)
+    filled = np.unique(where)
+    middles = np.array([np.median(values[where == each]) for each in filled])
+    return _middles(history)[filled], middles
 
 
 def timeline_picture(history: History, path: FilePath) -> bool:
@@ -324,7 +383,7 @@ def timeline_picture(history: History, path: FilePath) -> bool:
     nodes = list(dict.fromkeys(event.of for event in history.events))
     if not nodes:
         return False
-    nodes = sorted(nodes, key=lambda node: (node in ("world", "central", "recorder"), node))
+    nodes = [n for n in in_order(nodes) if n not in _OTHERS] + [n for n in _OTHERS if n in nodes]
     figure, axes = new_figure(9.0, 1.3 + 0.34 * len(nodes), 1, 1)
     axis = axes[0][0]
     for row in range(len(nodes)):

@@ -38,7 +38,9 @@ def _row(name: str, pairs: Pairs) -> tuple[str, ...]:
 def score_note(found: AssociationResult) -> str:
     """The other results of the labels, in words."""
     return (
-        f"{found.landmarks} landmarks without names, {found.duplicates} of them duplicates, "
+        f"{found.landmarks} landmarks without names in all submaps, with those that the final map "
+        "leaves out, that were given up, and that are of robots that are not joined; "
+        f"{found.duplicates} of them are duplicates, "
         f"{found.duplicates_confirmed} among those of two submaps or more; pairs of robots that "
         f"share landmarks: {found.merges_right} rightly, {found.merges_wrong} wrongly; "
         f"{found.merges_refused} attempts wait. Scored by labels that no node receives."

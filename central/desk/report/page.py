@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from central.desk.export.take_home import write_map, write_paths
 from central.desk.export.tum import write_trajectories
+from central.desk.names import in_order
 from central.desk.pictures.run import error_picture, map_picture
 from central.desk.pictures.style import SCREEN, Picture, Style, drawn_in
 from central.desk.pictures.time import (
@@ -234,7 +235,7 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     innovations, cost = run.history.innovations, run.evaluation.cost_by_robot
     scale = run.evaluation.scale_by_robot
     rows = []
-    for name in sorted(run.evaluation.robots.keys() | innovations.keys() | cost.keys()):
+    for name in in_order(run.evaluation.robots.keys() | innovations.keys() | cost.keys()):
         robot, of = run.evaluation.robots.get(name), innovations.get(name)
         online = None if robot is None else robot.online
         rows.append(
@@ -298,7 +299,7 @@ def _measurements(run: Run) -> list[str]:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
         tables = [_dispositions(ledgers)] if any(ledgers.values()) else []
         return [*tables, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
-    robots = sorted({robot for robot, _ in ledger.entries})
+    robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
     if ledger.offenders:

@@ -6,7 +6,9 @@ from math import degrees
 from rich.table import Table
 from rich.text import Text
 
+from central.desk.evaluation.errors import MapErrors
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
+from central.desk.names import not_joined, short
 
 ABSURD_NEES = 1000
 """Beyond this a NEES per dof is shown in words."""
@@ -112,21 +114,17 @@ def team_rows(evaluation: Evaluation) -> Rows:
     errors, arbitrary = fused.errors, evaluation.arbitrary_frame
     if not len(fused.ids) and fused.reasons:
         return [("final map", f"empty: {'; '.join(fused.reasons)}")]
-    rows = [("landmarks", str(len(fused.ids)))]
+    rows = [("landmarks", f"{len(fused.ids)} in the final map")]
     if errors is None:
         rows.append(("landmark errors", "can not be computed: no true landmarks"))
     else:
-        low, high = errors.band
-        kind = "joint" if fused.joint else "blocks only"
-        verdict = "in" if errors.in_band else "outside"
         rows += [
             ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m"),
             ("after rigid alignment", shown(errors.aligned_rmse_m, ".3f", " m")),
         ]
         if not arbitrary:
-            band = f"{verdict} 95 % of {low:.2f}…{high:.2f} ({kind})"
             absurd = errors.nees_per_dof > ABSURD_NEES
-            nees = _absurd(evaluation) if absurd else f"{errors.nees_per_dof:.4g}, {band}"
+            nees = _absurd(evaluation) if absurd else in_words(errors, joint=fused.joint)
             rows.append(("map NEES per dof", nees))
         shape = errors.shape
         if shape is not None:
@@ -136,8 +134,10 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
     rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
     rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
-    rows += [("joined", words) for words in fused.joined]
-    rows += [("note", words) for words in fused.reasons]
+    rows += _association_rows(evaluation)
+    rows += [("joined", short(words)) for words in fused.joined]
+    rows += [("not joined", f"{who}: {why}") for who, why in not_joined(fused.reasons)]
+    rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
     rows += [("verdict", words) for words in evaluation.verdicts]
     meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
     if meetings:
@@ -146,6 +146,51 @@ def team_rows(evaluation: Evaluation) -> Rows:
     if evaluation.unsound:
         rows.append(("unsound messages", str(evaluation.unsound)))
     return rows
+
+
+def in_words(errors: MapErrors, *, joint: bool) -> str:
+    """The map's NEES and whether chance explains it; `joint`: of the joint covariance."""
+    low, high = errors.band
+    kind = "joint" if joint else "blocks only"
+    band = f"95 % of {low:.2f}…{high:.2f} ({kind})"
+    if errors.in_band:
+        return f"{errors.nees_per_dof:.4g}, in {band}"
+    if errors.nees_per_dof < low:
+        return f"{errors.nees_per_dof:.4g}, below {band}: the covariance is too large"
+    return (
+        f"{errors.nees_per_dof:.4g}, above {band}. WARNING: the errors are larger than the "
+        "covariance says; by chance that happens in one run of 40"
+    )
+
+
+def _association_rows(evaluation: Evaluation) -> Rows:
+    """The scores of a run whose landmarks have no names, where there are labels or a GPS."""
+    found, gps_m = evaluation.association, evaluation.gps_median_m
+    rows = [] if gps_m is None else [("distance from GPS", f"{gps_m:.2f} m, median of the paths")]
+    if found is None:
+        return rows
+    pairs = found.pairs
+    scores = (
+        f"precision {shown(pairs.precision, '.4f', '')}, recall {shown(pairs.recall, '.3f', '')}, "
+        f"F1 {shown(pairs.f1, '.3f', '')}; {shown(pairs.wrong_percent, '.3f', ' %')} of the "
+        "detections are in a wrong landmark"
+    )
+    many = found.merges_right + found.merges_wrong + found.merges_refused > 0
+    merges = (
+        f"{found.merges_right} right, {found.merges_wrong} wrong; {found.merges_refused} attempts "
+        "wait"
+    )
+    return [
+        *rows,
+        ("association", scores),
+        (
+            "duplicates",
+            f"{found.duplicates} of the {found.landmarks} landmarks that all submaps have, with "
+            f"those left out of the map; {found.duplicates_confirmed} are of two submaps or more, "
+            f"and the map shows {found.duplicates_shown}",
+        ),
+        *([("pairs of robots merged", merges)] if many else []),
+    ]
 
 
 def _absurd(evaluation: Evaluation) -> str:
@@ -165,7 +210,7 @@ def robot_note(evaluation: Evaluation) -> str:
 
 
 ROBOT_HEADINGS = (
-    "robot", "steps", "measurements\naccounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
+    "robot", "steps", "measure-\nments ac-\ncounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
 )  # fmt: skip
 

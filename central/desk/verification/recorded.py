@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from central.config import CentralConfig
+from central.desk.names import in_order
 from central.desk.verification.measurements import RecordedMeasurements
 from team.config import RobotConfig
 from team.former_names import with_current_names
@@ -151,7 +152,7 @@ class Recorded:
         """Every robot with measurements or messages in the log, by name."""
         names = {robot for robot, _ in self.measurements}
         names |= {s.message.robot for s in self.outputs if isinstance(s.message, m.Submap | m.Done)}
-        return sorted(names)
+        return in_order(names)
 
     def incarnations(self, robot: str) -> list[int]:
         """The incarnations of a robot with measurements, in order."""

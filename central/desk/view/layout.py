@@ -3,7 +3,8 @@
 import json
 from collections.abc import Sequence
 
-from central.desk.drawing import colour_of, in_order
+from central.desk.drawing import colour_of
+from central.desk.names import in_order
 from team.wire import views
 from team.wire.views import MAP_FRAME
 

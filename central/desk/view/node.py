@@ -13,10 +13,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import colour_of, in_order
+from central.desk.drawing import colour_of
 from central.desk.evaluation.errors import PoseErrors
 from central.desk.evaluation.events import Event, EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from central.desk.names import in_order
 from central.desk.view import foxglove_scene as fox
 from central.desk.view.drawn import Landmarks, Track, around, landmarks_of, placed
 from team.wire import channels as ch

@@ -36,6 +36,7 @@ from sim.studies.batch_reference.measurements import BatchReferenceError, Chain,
 from team.estimation.gaussian import Matrix, PoseGaussian
 from team.estimation.geometry import inverse, tangent
 from team.estimation.mount import moved_by
+from team.extras import install_command
 from team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
@@ -208,7 +209,7 @@ def _gtsam() -> Any:
         import gtsam
     except ImportError:
         raise BatchReferenceError(
-            "the batch reference needs GTSAM: python -m pip install 'teamslam[batch-reference]'"
+            f"the batch reference needs GTSAM: {install_command('batch-reference')}"
         ) from None
     return gtsam
 

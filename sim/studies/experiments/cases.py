@@ -17,6 +17,7 @@ from joblib import Memory, Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from sim.studies.experiments.task import Task
+from team.extras import install_command
 
 FOLDER = "cases"
 """Folder of the stored results, in the folder of an experiment."""
@@ -110,9 +111,7 @@ def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
     try:
         from distributed import Client
     except ImportError:
-        raise SchedulerError(
-            "--scheduler needs Dask: python -m pip install 'teamslam[cluster]'"
-        ) from None
+        raise SchedulerError(f"--scheduler needs Dask: {install_command('cluster')}") from None
     try:
         client = Client(scheduler, timeout="10s")
     except (OSError, ValueError) as error:

@@ -36,6 +36,7 @@ from team.estimation.map_joining.association.growing import (
 from team.estimation.map_joining.association.hypotheses import jointly
 from team.estimation.map_joining.association.landmarks import (
     Landmarks,
+    LocalLandmark,
     MergeRecord,
     united,
 )
@@ -167,15 +168,27 @@ class IslandView:
             self._grow("sweep", one[close], two[close], self.profile.tight)
 
     def agreed(self, landmarks: Landmarks) -> None:
-        """Merges the landmarks that an operator has declared to be one."""
-        for first, second, same in landmarks.verdicts:
-            one, two = (
-                self.place_of.get(landmarks.identity(each) or -1) for each in (first, second)
-            )
-            if not same or one is None or two is None or one == two or self.gone[[one, two]].any():
+        """Merges the landmarks that an operator has declared to be one, verdict by verdict in their
+        order; one that would unite two landmarks that were declared to be two has no effect.
+        """
+        declared = [
+            (here, there, each.same)
+            for each in landmarks.verdicts
+            if (here := self._place(landmarks, each.first)) is not None
+            and (there := self._place(landmarks, each.second)) is not None
+        ]
+        for first, second, same in declared:
+            one, two = (int(self._now[each]) for each in (first, second))
+            apart = ({int(self._now[a]), int(self._now[b])} for a, b, one_ in declared if not one_)
+            if not same or one == two or {one, two} in apart:
                 continue
             joint = conditioned(self.joint, one, two, self.profile)
             self.take([Pair(one, two, np.inf, 0.0, -np.inf)], joint, "verdict")
+
+    def _place(self, landmarks: Landmarks, member: LocalLandmark) -> int | None:
+        """The index in `ids` of a member's landmark; None where the island does not have it."""
+        identity = landmarks.identity(member)
+        return None if identity is None else self.place_of.get(identity)
 
 
 def _apart_in_window(

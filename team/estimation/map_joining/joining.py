@@ -15,7 +15,14 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
+from team.estimation.contribution import (
+    Contribution,
+    InitialPoseFactor,
+    Key,
+    Stream,
+    moment,
+    named,
+)
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.association.landmarks import (
     NO_LANDMARKS,
@@ -64,6 +71,8 @@ __all__ = [
     "started",
 ]
 
+NAMED = 10
+"""Most robots of an island that are named when it is merged."""
 PATIENCE = 1.1
 """A failed search is repeated once the number of submaps has grown by this factor."""
 
@@ -386,19 +395,22 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
 
 
 def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
-    """The fold with two islands merged; the record of the merge is filed under the frame that is
-    gone.
+    """The fold with two islands merged; the record of the merge, who joined whom and when, is
+    filed under the frame that is gone.
     """
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
     islands[key] = found.best.island
-    gone = min(fold.islands[other_key].graph.streams)
+    streams = sorted(fold.islands[other_key].graph.streams)
+    gone, into = streams[0], min(fold.islands[key].graph.streams)
+    who = ", ".join(map(named, streams[:NAMED])) + ", …" * (len(streams) > NAMED)
+    at = moment(max((each.end_ns for each in fold.contributions[-1:]), default=0))
     gone_keys = {key, other_key}
     return replace(
         fold,
         islands=islands,
         home={stream: key if at == other_key else at for stream, at in fold.home.items()},
         waiting=found.waiting,
-        joined={**fold.joined, gone: found.words},
+        joined={**fold.joined, gone: f"{who} joined {named(into)} at {at}: {found.words}"},
         judged={pair: record for pair, record in fold.judged.items() if not gone_keys & {*pair}},
         iterations=found.best.iterations,
         change=found.best.change,

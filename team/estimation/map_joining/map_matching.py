@@ -351,10 +351,9 @@ def _merged(
         return fold
     if not is_solvable(best.island):
         return fold
-    gone = min(renamed[goes].graph.streams)
     words = (
-        f"{gone[0]} (incarnation {gone[1]}) joined by its map: {decision.pairs} landmarks, "
-        f"log-likelihood ratio {decision.llr:.0f} against {decision.rival_llr:.0f}, share "
+        f"{decision.pairs} landmarks that both show, log-likelihood ratio "
+        f"{decision.llr:.0f} against {decision.rival_llr:.0f}, share "
         f"{decision.share:.2f}, {decision.absent} absent"
     )
     fold = replace(fold, landmarks=landmarks.decided(decision))

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.estimation import elementwise
-from team.estimation.contribution import named
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
 from team.estimation.map_joining.alignment import Alignment, SharedPoints
@@ -145,15 +144,14 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
 
 
 def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
-    """Describes how an island was merged and how certain its place is."""
-    stream = min(other.graph.streams)
-    node = search.best.island.graph.streams[stream][0]
+    """By what an island was merged, and how certain its place is."""
+    node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
     sigma_m = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
     sigma_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
     dof = 2 * sum(shared) - 3
     text = (
-        f"{named(stream)} joined: {shared}, chi² {max(rise, 0.0) / dof:.1f} per degree of freedom, "
+        f"{shared}, chi² {max(rise, 0.0) / dof:.1f} per degree of freedom, "
         f"transform sigma {sigma_m:.2g} m / {sigma_deg:.2g}°"
     )
     if search.gained > WORTH_TELLING:

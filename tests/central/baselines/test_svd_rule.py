@@ -122,7 +122,7 @@ def test_a_robot_that_shares_too_little_stays_out_with_the_reason(rule):
     short = {"r1": SUBMAPS["r1"], "r2": submaps_of(stream("r2", 3, y=-40.0))}
     starts = STARTS | {"r2": published(stream("r2", 3, y=-40.0))[0]}
     found, _ = final(messages(short, starts), rule)
-    assert found.reasons == ("r2, incarnation 1, not joined: 0 shared landmarks, 2 needed",)
+    assert found.reasons == ("r2 (incarnation 1) not joined: 0 shared landmarks, 2 needed",)
     alone, _ = final(messages({"r1": SUBMAPS["r1"], "r2": []}), rule)
     assert found.means == alone.means
     assert alone.reasons == ()

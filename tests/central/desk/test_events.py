@@ -1,5 +1,7 @@
 """The events of a run in words: each is told once, when it happens, to the report and the page."""
 
+import msgspec
+
 from central.desk.evaluation.events import MOST, EventDetector, without_decimals
 from central.desk.evaluation.history import history
 from team.wire import channels as ch
@@ -69,7 +71,35 @@ def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map() -> None
         ("map", "r1 is in the team's map"),
         ("warning", why),
         ("map", "r2 is in the team's map"),
-        ("map", f"no longer: {why}"),
+    ]
+
+
+def test_robots_that_wait_for_a_place_are_told_once_whatever_test_fails_and_who_joined_whom() -> (
+    None
+):
+    def waiting(who: str, why: str, joined: tuple[str, ...] = ()) -> m.FusedMap:
+        reasons = (f"{who} not joined: with r1 (incarnation 1) {why}",) if who else ()
+        said = msgspec.structs.replace(fused(["r1", "r2", "r3"], reasons), joined=joined)
+        assert isinstance(said, m.FusedMap)
+        return said
+
+    both, one = "r2 (incarnation 1), r3 (incarnation 1)", "r2 (incarnation 1)"
+    words = "r3 (incarnation 1) joined r1 (incarnation 1) at 9.0 s: 12 landmarks"
+    left = "r2 (incarnation 1) joined r1 (incarnation 1) at 12.0 s: 9 landmarks"
+    said = (
+        waiting(both, "pairs 7 < 8"),
+        status(0, f"{both} not joined: with r1 (incarnation 1) pairs 6 < 8"),
+        waiting(both, "pairs 5 < 8"),
+        waiting(one, "share .4 < .5", (words,)),
+        waiting("", "", (words, left)),
+    )
+    assert told(*said) == [
+        ("map", "r1 is in the team's map"),
+        ("warning", "r2, r3 not joined: with r1 pairs 7 < 8"),
+        ("map", "r3 is in the team's map"),
+        ("map", words.replace(" (incarnation 1)", "")),
+        ("map", "r2 is in the team's map"),
+        ("map", left.replace(" (incarnation 1)", "")),
     ]
 
 

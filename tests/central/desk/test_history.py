@@ -1,10 +1,14 @@
 """How a run went over its time: figures against what was put into the log, events in words."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.history import History, history
+from central.desk.evaluation.history import History, Latencies, history
+from central.desk.pictures import time
 from central.desk.pictures.time import BINS, binned, publisher
 from sim.in_memory.team import run_team
 from team import translate
@@ -114,6 +118,19 @@ def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used
     found = history(log).latencies["r1"]
     np.testing.assert_allclose(found.last_s, [0.450 - 0.190, 0.900 - 0.290])
     np.testing.assert_allclose(found.first_s, [0.350, 0.700])
+
+
+def test_latencies_have_a_row_for_each_robot_in_the_order_in_which_people_count(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    found = history([])
+    of = Latencies(np.arange(3), np.full(3, 0.5), np.full(3, 0.4))
+    names = [f"r{k}" for k in range(12, 0, -1)]
+    figures = []
+    monkeypatch.setattr(time, "save", lambda figure, path: figures.append(figure))
+    assert time.latency_picture(replace(found, latencies=dict.fromkeys(names, of)), tmp_path)
+    _, rows = figures[0].axes
+    assert [label.get_text() for label in rows.get_yticklabels()] == names[::-1]
 
 
 def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:

@@ -1,10 +1,19 @@
+from dataclasses import replace
+
 import msgspec
+import numpy as np
 
 from central.desk.evaluation.association import AssociationResult, Pairs
+from central.desk.evaluation.errors import map_errors
+from central.desk.evaluation.evaluation import evaluate
 from central.desk.evaluation.events import EventDetector
 from central.desk.report.identities import decision_rows, score_note, score_rows
+from central.desk.report.tables import in_words, team_rows
 from central.desk.view.landmark_sets import sets_of
+from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import encoded
 from tests.support import examples
 
 FUSED = next(each for each in examples() if isinstance(each, m.FusedMap))
@@ -77,3 +86,23 @@ def test_the_report_has_the_scores_inside_windows_and_over_all() -> None:
         ("over all", "0.75000", "0.5000", "0.6000", "2.000 %"),
     ]
     assert "4 rightly, 0 wrongly; 3 attempts wait" in score_note(found)
+    final = Sample(ch.FINAL_MAP.key(), encoded(msgspec.structs.replace(FUSED, final=True)), 0, 0, 0)
+    run = evaluate([final])
+    rows = dict(team_rows(replace(run, association=found, gps_median_m=0.817)))
+    assert rows["landmarks"].endswith(" in the final map")
+    assert rows["association"] == (
+        "precision 0.7500, recall 0.500, F1 0.600; 2.000 % of the detections are in a wrong "
+        "landmark"
+    )
+    assert rows["duplicates"].startswith("2 of the 9 landmarks that all submaps have")
+    assert rows["distance from GPS"].startswith("0.82 m")
+    assert rows["pairs of robots merged"] == "4 right, 0 wrong; 3 attempts wait"
+
+
+def test_a_nees_outside_of_its_band_says_what_that_means() -> None:
+    errors = map_errors(np.full((18, 2), 1.26), np.eye(36), np.zeros((18, 2)))
+    assert 1.5 < errors.nees_per_dof < 1.6
+    words = in_words(errors, joint=True)
+    assert words.startswith("1.588, above 95 % of 0.59…1.51 (joint). WARNING: the errors are")
+    small = map_errors(np.full((18, 2), 0.1), np.eye(36), np.zeros((18, 2)))
+    assert "below" in in_words(small, joint=True)

@@ -17,11 +17,11 @@ from central.desk.drawing import (
     colour_of,
     curve_through,
     ellipses,
-    in_order,
     robot_colours,
 )
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.evaluation.history import history
+from central.desk.names import in_order
 from central.desk.pictures.run import (
     error_picture,
     label_offsets,

@@ -11,8 +11,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from central.desk.drawing import ellipses, in_order
+from central.desk.drawing import ellipses
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from central.desk.names import in_order
 from central.desk.view.drawn import PATH_POINTS, Track, around, landmarks_of, placed
 from central.desk.view.export import export_views, with_views
 from central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode

@@ -211,7 +211,7 @@ def test_two_free_islands_join_each_other_while_the_main_one_knows_neither():
     assert set(fold.reasons) == {("r1", 0)}
     assert "0 shared landmarks, 2 needed" in fold.reasons[("r1", 0)]
     (words,) = fold.joined.values()
-    assert words.startswith("r2 (incarnation 0) joined: ")
+    assert words.startswith("r2 (incarnation 0) joined r1 (incarnation 0) at ")
     assert "per degree of freedom, transform sigma" in words
     other = fold.island("r2", 0)
     start = other.graph.streams[("r1", 0)][0]

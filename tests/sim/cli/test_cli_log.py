@@ -179,7 +179,7 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
     ("arguments", "told"),
     [
         (["info", "nowhere.mcap"], "nowhere.mcap: not found; give the path of a log"),
-        (["check", "LOG/.."], "Is a directory; give the path of a readable file"),
+        (["check", "."], "log.mcap: not found; give the path of a log that was recorded, or of"),
         (["cut", "LOG", "-o", "LOG"], "exists: choose another name or remove it"),
         (["cut", "LOG", "-o", "new", "--from", "5", "--to", "5"], "the first before the second"),
         (["cut", "LOG", "-o", "new", "--from", "nan"], "give seconds"),

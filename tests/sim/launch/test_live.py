@@ -1,12 +1,14 @@
 """The plain lines of a run."""
 
+import time
 from io import StringIO
 
+import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
 
-from sim.launch import live
+from sim.launch import live, said
 from sim.launch.watch import Watch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -130,7 +132,7 @@ def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
 
 
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
     watch = Watch(robots=2)
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
     watch.statuses["recorder"] = m.Status(
@@ -144,21 +146,21 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.Mo
         warnings=("no measurements of this team yet",),
     )
     watch.statuses["robot/r1"] = late
-    assert live._warnings(watch) == [f"recorder: {'; '.join(missing)}"]
+    assert said.warnings(watch) == [f"recorder: {'; '.join(missing)}"]
     watch.statuses["world"] = m.Status(
         stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
     )
-    assert live._warnings(watch) == ["world: waiting for robot/r2"]
+    assert said.warnings(watch) == ["world: waiting for robot/r2"]
     watch.statuses["world"] = m.Status(
         stamp_ns=0, node="world", state="publishing", figures={}, warnings=()
     )
-    assert "robot/r1: no measurements of this team yet" in live._warnings(watch)
+    assert "robot/r1: no measurements of this team yet" in said.warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
-    assert live._warnings(watch)[0] == "robot-r2 (pid 7) was killed"
+    assert said.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
 
 
 def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=1)
@@ -197,3 +199,76 @@ def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one()
     lines.end()
     said = [line for line in out.getvalue().splitlines() if "warning" in line]
     assert [line.partition("warning: ")[2] for line in said] == ["central: two maps disagree"]
+
+
+def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("LINE_S", "SETTLED_S"):
+        monkeypatch.setattr(live, name, 0.0)
+    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=200))
+    watch = told(3, truth=False)
+    joined = "r3 (incarnation 1) joined r1 (incarnation 1) at 9.0 s: {} landmarks that both show"
+
+    def shown(waits: str, why: str, *words: str, final: bool = False) -> list[str]:
+        begin = len(out.getvalue())
+        reasons = (f"{waits} (incarnation 1) not joined: with r1 (incarnation 1) {why}",)
+        assert watch.fused is not None
+        watch.fused = msgspec.structs.replace(
+            watch.fused, reasons=reasons, joined=words, final=final
+        )
+        watch.statuses["central"] = m.Status(
+            stamp_ns=0, node="central", state="joining", figures={}, warnings=reasons
+        )
+        lines.show(watch)
+        return [line[11:] for line in out.getvalue()[begin:].splitlines()]
+
+    (before,) = shown("r2", "pairs 7 < 8")
+    assert "landmarks in the team's map; not joined yet: r2" in before
+    assert shown("r2", "pairs 6 < 8") == []
+    assert shown("r2", "share .4 < .5", joined.format(9))[0] == (
+        "r3 joined r1 at 9.0 s: 9 landmarks that both show"
+    )
+    assert shown("r2", "evidence 9 < 15", joined.format(10)) == []
+    assert shown("r2", "evidence 9 < 15", joined.format(11), final=True) == []
+    lines.end()
+    assert "warning" not in out.getvalue()
+    assert any("not joined yet: r2: with r1 evidence 9" in line for line in printed(watch, 100))
+
+
+def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("LINE_S", "SETTLED_S"):
+        monkeypatch.setattr(live, name, 0.0)
+    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=200))
+    watch = told(2, truth=False)
+    for k in range(6):
+        slip = f"the odometry slipped by 0.1{k} m, -{k}° before {k}.00 s"
+        watch.statuses["robot/r1"] = m.Status(
+            stamp_ns=0, node="robot/r1", state="mapping", figures={}, warnings=(slip,)
+        )
+        lines.show(watch)
+    warnings = [line for line in out.getvalue().splitlines() if "slipped" in line]
+    assert len(warnings) == 3
+    assert warnings[-1].endswith("; more like this: in the report")
+    watch.last_message["robot/r1"] = time.monotonic() - 8.0
+    assert said.warnings(watch) == [f"robot/r1: {slip}"]
+    assert said.warnings(watch, silent_s=5.0) == []
+
+
+def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
+    watch = Watch()
+    watch.statuses["world"] = world = m.Status(
+        stamp_ns=310 * 10**9, node="world", state="ended", figures={"team_time_s": 300.0},
+        warnings=(),
+    )  # fmt: skip
+    assert said.times(watch, world) == "team time 0 s (the world is 300 s ahead of the map)"
+    watch.fused = fused_map(stamp_ns=130 * 10**9)
+    assert said.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"
+    watch.fused = fused_map(stamp_ns=305 * 10**9)
+    assert said.times(watch, world) == "team time 300 s"

@@ -2,7 +2,7 @@
 
 import { LAYERS, MapView, gridStep } from './mapview.js';
 import { Plot, colour } from './plots.js';
-import { Store, upTo } from './store.js';
+import { Store, inOrder, upTo } from './store.js';
 
 const WARN = 1.1, FAIL = 1.3;  // of the joint cost per degree of freedom, as the centre's monitor
 const SCALE_WARN = Math.SQRT2; // of the covariance scale, and its inverse
@@ -274,7 +274,7 @@ function lookAtPeers() {
   }
   $('peers-card').hidden = !now.size;
   if (!now.size) return;
-  const names = [...now.keys()].sort();
+  const names = [...now.keys()].sort(inOrder.compare);
   const whole = Math.max(...names.map((node) => now.get(node).set_submaps));
   const newest = new Map();
   for (const figures of now.values()) {
@@ -295,7 +295,7 @@ function lookAtPeers() {
     cells[0].textContent = own;
     cells[1].textContent = `${figures.set_submaps} / ${whole}`;
     cells[1].className = figures.set_submaps < whole ? 'warn' : '';
-    cells[2].firstChild.textContent = [...newest].filter(([name]) => name !== own).sort().map(([name, at]) => {
+    cells[2].firstChild.textContent = [...newest].filter(([name]) => name !== own).sort((a, b) => inOrder.compare(a[0], b[0])).map(([name, at]) => {
       const have = figures[`set_newest_s.${name}`];
       return figures[`set_submaps.${name}`] ? `${name} ${Math.max(0, at - have).toFixed(0)} s` : `${name} –`;
     }).join(', ');

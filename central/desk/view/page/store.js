@@ -25,7 +25,7 @@ export class Series {
   get(i, k) { return this.rows[i * this.width + k]; }
 }
 
-const inOrder = new Intl.Collator('en', { numeric: true });  // r2 before r10
+export const inOrder = new Intl.Collator('en', { numeric: true });  // r2 before r10
 const POSE = 7;   // x, y, heading, xx, xy, yy, heading's variance
 const ERROR = 7;  // x, y, heading, their 3σ, NEES per degree of freedom
 const TRUTH = 3;

@@ -1,8 +1,11 @@
 """The fold of submaps whose landmarks have no names."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from central.join_messages import Shown, reasons
 from team.association import AssociationProfile
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
@@ -42,6 +45,11 @@ def _folded(
     for submap in sorted(submaps, key=lambda each: each.key):
         fold = taken(fold, Tick([submap]), settings)
     return fold
+
+
+def _not_joined(fold: Fold) -> list[str]:
+    """What a map says of the robots that are not in it."""
+    return [text for text in reasons(fold, Shown(), (), 1) if "not joined" in text]
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +113,13 @@ def test_robots_with_unknown_initial_poses_become_one_map_by_what_they_see() -> 
     assert [each.kind for each in fold.landmarks.decisions][:1] == ["merge"]
     assert wrong(fold.landmarks, truth) == 0
     assert duplicates(fold.landmarks, truth) <= 1
-    assert "joined by its map" in fold.joined["r2", 1]
+    at = fold.landmarks.decisions[0].stamp_ns * 1e-9
+    assert fold.joined["r2", 1].startswith(
+        f"r2 (incarnation 1) joined r1 (incarnation 1) at {at:.1f} s: "
+    )
+    waited = fold.landmarks.decisions[0]._replace(kind="waits", why="pairs 7 < 8")
+    stale = replace(fold.landmarks, waits={(("r2", 1), ("r1", 1)): waited})
+    assert not _not_joined(replace(fold, landmarks=stale))
 
 
 def test_in_a_grid_of_equal_rooms_robots_with_unknown_initial_poses_wait() -> None:
@@ -122,6 +136,9 @@ def test_in_a_grid_of_equal_rooms_robots_with_unknown_initial_poses_wait() -> No
         fold = _folded(submaps)
         assert len(fold.islands) == 2
         assert all(each.why for each in fold.landmarks.waits.values())
+        (why,) = _not_joined(fold)
+        assert why.startswith("r2 (incarnation 1) not joined: with r1 (incarnation 1) ")
+        assert any(why.endswith(each.why) for each in fold.landmarks.waits.values())
 
 
 def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it() -> None:
@@ -157,3 +174,19 @@ def test_an_operator_says_that_two_are_one_or_two(
     same = Verdict(single[0], other, same=True)
     joined = taken(before, Tick([submaps[until]], verdicts=(same,)), SETTINGS)
     assert joined.landmarks.identity(single[0]) == joined.landmarks.identity(other)
+
+
+def test_of_verdicts_that_contradict_each_other_over_a_third_landmark_the_two_stay_two(
+    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
+) -> None:
+    submaps, _, _ = loop
+    before = _folded(submaps[:3])
+    a, b, c = sorted(
+        members[0] for members in before.landmarks.sets.values() if members[0].sequence == 0
+    )[:3]
+    chain = (Verdict(a, b, same=True), Verdict(b, c, same=True))
+    for verdicts, one in ((chain, True), ((Verdict(a, c, same=False), *chain), False)):
+        told = taken(before, Tick([submaps[3]], verdicts=tuple(sorted(verdicts))), SETTINGS)
+        identity = told.landmarks.identity
+        assert (identity(a) == identity(c)) == one
+        assert identity(a) == identity(b)  # the first of those that say "one" in their order

@@ -1,0 +1,109 @@
+"""What a running team's state says in words: its progress, its warnings, who is not joined yet."""
+
+import math
+import time
+
+from central.desk.names import in_order, not_joined
+from sim.launch.watch import DRIVERS, Watch, team_time
+from team.wire import messages as m
+
+AHEAD_S = 10.0
+"""A world that is ahead of the map by less [s] is not worth a word."""
+PATIENCE_S = 8.0
+"""Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
+
+
+def _taken(watch: Watch) -> tuple[float, float]:
+    """How many of the world's measurements the robots have consumed, and their number; the world
+    may be far ahead of them.
+    """
+    total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
+    robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
+    taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
+    return min(taken, total), total
+
+
+def done(watch: Watch) -> float:
+    """The share of the world's measurements that the robots have consumed."""
+    taken, total = _taken(watch)
+    return taken / total if total else 0.0
+
+
+def is_live(watch: Watch) -> bool:
+    """Whether drivers measure, and no world."""
+    return watch.world is not None and watch.world.node == DRIVERS
+
+
+def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
+    """The failures, and the nodes' warnings; absent nodes are warned of after PATIENCE_S only.
+
+    While the team starts every node lacks every other: the world's warning stands for all. That a
+    robot is not joined yet is no warning: the lines on the map name it. silent_s: what a node
+    has said longer ago than this [s] is left out, since it may hold no more; 0: nothing is.
+    """
+    if time.monotonic() - watch.began <= PATIENCE_S:
+        return list(watch.failures)
+    world = watch.world
+    statuses = [(node, watch.statuses[node]) for node in in_order(watch.statuses)]
+    if world is None:
+        statuses = (
+            [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
+        )
+        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in statuses if s.warnings]
+    elif world.state == "waiting":
+        texts = [f"{world.node}: {w}" for w in world.warnings]
+    else:
+        statuses += [(world.node, world)] if watch.drivers else []
+        oldest = time.monotonic() - silent_s if silent_s else -math.inf
+        fresh = [s for s in statuses if watch.last_message.get(s[0], math.inf) >= oldest]
+        texts = [f"{node}: {w}" for node, status in fresh for w in status.warnings]
+    return [*watch.failures, *(each for each in texts if not any(not_joined([each])))]
+
+
+def share(watch: Watch) -> str:
+    """The progress in words: it is not known how much drivers will measure yet."""
+    if not is_live(watch):
+        return f"{done(watch):.0%}"
+    taken, total = _taken(watch)
+    return f"{taken:,.0f} of {total:,.0f} measurements mapped"
+
+
+def times(watch: Watch, world: m.Status) -> str:
+    """The team time of the map; that of the world, too, which may be far ahead of it."""
+    ahead_s = _behind_s(watch, world)
+    if is_live(watch) or ahead_s < AHEAD_S:
+        return team_time(world)
+    at_s = max(0.0, world.figures.get("team_time_s", 0.0) - ahead_s)
+    return f"team time {at_s:,.0f} s (the world is {ahead_s:,.0f} s ahead of the map)"
+
+
+def _behind_s(watch: Watch, world: m.Status) -> float:
+    """How far the map is behind the world [s]; all of the run where there is none yet."""
+    if watch.fused is None or not watch.fused.stamp_ns:
+        return world.figures.get("team_time_s", 0.0)
+    return max(0.0, 1e-9 * (world.stamp_ns - watch.fused.stamp_ns))
+
+
+def apart(watch: Watch) -> list[tuple[str, str]]:
+    """The robots that are not in the team's map yet, each with the test that failed."""
+    return [] if watch.fused is None else list(not_joined(watch.fused.reasons))
+
+
+def consistency(watch: Watch) -> str:
+    """The consistency monitor's figures; against the truth NEES and coverage of the map's
+    landmarks.
+    """
+    central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
+    figures = {} if central is None else central.figures
+    parts = [
+        f"{words} {figures[name]:.2f}"
+        for name, words in (
+            ("joint_cost_per_dof", "joint cost per dof"),
+            ("covariance_scale", "covariance scale"),
+        )
+        if name in figures
+    ]
+    if landmarks.count:
+        parts.append(f"landmark NEES per dof {landmarks.mean:.2f}")
+        parts.append(f"{landmarks.coverage:.0%} within 95 %")
+    return ", ".join(parts)
