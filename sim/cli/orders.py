@@ -103,7 +103,7 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
     until it is withdrawn.
     """
-    from central.desk.evaluation.verdicts import contradicting, said
+    from central.desk.evaluation.verdicts import contradicting, in_words
     from central.desk.orders import NoRobotError, WithdrawError
     from central.desk.verdicts import judge, local_landmark
     from team.wire.messages import Judgement
@@ -127,10 +127,10 @@ def verdict(
     opposite = "different" if word == "same" else "same"
     chain = () if withdraw else contradicting(judgement, fused.verdicts)
     if len(chain) > 1:
-        every = "; ".join(map(said, (*chain[:-1], judgement) if word == "same" else chain))
+        every = "; ".join(map(in_words, (*chain[:-1], judgement) if word == "same" else chain))
         apart = chain[-1] if word == "same" else judgement
         fail(
-            f"these verdicts contradict each other: {every}; yet {said(apart)}, which is what "
+            f"these verdicts contradict each other: {every}; yet {in_words(apart)}, which is what "
             "holds, so that one of the others has no effect: withdraw what is wrong by "
             "`teamslam verdict … --withdraw`",
             FAILED,

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from central.desk.evaluation.events import without_decimals
 from central.desk.names import in_order, short
-from sim.launch import said
+from sim.launch import progress
 from sim.launch.watch import DRIVERS, Watch
 from team.wire import messages as m
 
@@ -91,17 +91,19 @@ class _Lines:
         """The line on how far the team is; of what a live team waits for it says who and what."""
         robots = [s for n, s in watch.statuses.items() if n.startswith("robot/")]
         if world.state == "waiting":
-            lacking = world.warnings if said.is_live(watch) and len(robots) >= watch.robots else ()
+            lacking = (
+                world.warnings if progress.is_live(watch) and len(robots) >= watch.robots else ()
+            )
             self._shown |= {without_decimals(f"{DRIVERS}: {text}") for text in lacking}
             return "; ".join(lacking) or f"waiting: {len(robots)} of {watch.robots} robots"
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
-        waiting = ", ".join(who for who, _ in said.apart(watch))
+        waiting = ", ".join(who for who, _ in progress.apart(watch))
         apart = f"; not joined yet: {waiting}" if waiting else ""
-        consistency = said.consistency(watch)
+        consistency = progress.consistency(watch)
         return (
-            f"{said.share(watch):>4}  {said.times(watch, world)}, "
+            f"{progress.share(watch):>4}  {progress.times(watch, world)}, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
             f"{apart}{'; ' if consistency else ''}{consistency}"
         )
@@ -118,7 +120,7 @@ class _Lines:
 
     def _warn(self, watch: Watch, settled_s: float) -> None:
         """Print new warnings that have lasted; of many that differ in their numbers the first."""
-        now, warnings = time.monotonic(), said.warnings(watch, silent_s=settled_s)
+        now, warnings = time.monotonic(), progress.warnings(watch, silent_s=settled_s)
         self._since = {w: self._since.get(w, now) for w in map(without_decimals, warnings)}
         for warning in warnings:
             key = without_decimals(warning)
@@ -151,9 +153,9 @@ def _view(title: str, watch: Watch) -> Group:
     else:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(
-            ProgressBar(total=1.0, completed=said.done(watch), width=36),
-            said.share(watch),
-            f"{said.times(watch, world)}, {world.node} {world.state}",
+            ProgressBar(total=1.0, completed=progress.done(watch), width=36),
+            progress.share(watch),
+            f"{progress.times(watch, world)}, {world.node} {world.state}",
         )
         parts.append(bar)
     if robots:
@@ -161,7 +163,7 @@ def _view(title: str, watch: Watch) -> Group:
     parts += [Text(line) for line in _map_lines(watch)]
     parts += [Text(short(words)) for words in (() if watch.fused is None else watch.fused.joined)]
     parts += [Text(note) for note in watch.notes[-4:]]
-    parts += [Text(w, style="yellow") for w in said.warnings(watch)[-4:]]
+    parts += [Text(w, style="yellow") for w in progress.warnings(watch)[-4:]]
     return Group(*parts)
 
 
@@ -235,9 +237,9 @@ def _map_lines(watch: Watch) -> list[str]:
         f"team map by {fused.rule}: {len(fused.ids) // 4} landmarks from "
         f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
     ]
-    consistency = said.consistency(watch)
+    consistency = progress.consistency(watch)
     lines += [consistency] if consistency else []
-    return lines + [f"not joined yet: {who}: {why}" for who, why in said.apart(watch)]
+    return lines + [f"not joined yet: {who}: {why}" for who, why in progress.apart(watch)]
 
 
 def _number(value: float | None, form: str) -> str:

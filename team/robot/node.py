@@ -266,7 +266,11 @@ class RobotNode:
             node=ch.robot_node(self.robot),
             state=state,
             figures={name: value for name, value in figures.items() if abs(value) <= 1e300},
-            warnings=(*warnings, *unexpected(nis, outliers), *self.warnings[-3:]),
+            warnings=(
+                *warnings,
+                *unexpected(nis, outliers, self.config.estimator),
+                *self.warnings[-3:],
+            ),
         )
 
     # What comes in.

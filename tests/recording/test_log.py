@@ -361,7 +361,6 @@ def bomb(path: Path, size: int, claimed: int) -> None:
     ("make", "told"),
     [
         (lambda path: None, "not found; give the path of a log"),
-        (lambda path: path.mkdir(), "Is a directory; give the path"),
         (lambda path: path.write_bytes(b""), "empty file; its recorder was stopped"),
         (lambda path: path.write_bytes(b"hello, world"), "not an MCAP file; give a log"),
         (foreign, "an MCAP file of another program"),

@@ -19,7 +19,7 @@ def name_of(landmark: m.LocalLandmark) -> str:
     return f"{landmark.robot}/{landmark.incarnation}/{landmark.sequence}/{landmark.local}"
 
 
-def said(judgement: m.Judgement) -> str:
+def in_words(judgement: m.Judgement) -> str:
     """A verdict in words."""
     first, second = name_of(judgement.first), name_of(judgement.second)
     return f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
@@ -77,7 +77,7 @@ def verdicts_given(log: Collected) -> tuple[str, ...]:
 
 def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     judgement = verdict.judgement
-    text = said(judgement) + (f": {verdict.reason}" if verdict.reason else "")
+    text = in_words(judgement) + (f": {verdict.reason}" if verdict.reason else "")
     if verdict.withdrawn:
         return f"{text} (withdrawn)"
     holds = any(
@@ -89,5 +89,5 @@ def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     if judgement.same and len(chain) == 1:
         return f"{text} (without effect: they were said to be two, too)"
     if len(chain) > 1:
-        return f"{text} (contradicted: {', '.join(map(said, chain))}; two they stay)"
+        return f"{text} (contradicted: {', '.join(map(in_words, chain))}; two they stay)"
     return text

@@ -1,6 +1,6 @@
 """The tables of a report, for a terminal and for the page."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import degrees
 
 from rich.table import Table
@@ -22,43 +22,26 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     team = Table(title=Text(title_of(evaluation)), show_header=False)
     for name, value in team_rows(evaluation):
         team.add_row(Text(name), Text(value))
-    robots = Table(caption=robot_note(evaluation))
-    for heading in ROBOT_HEADINGS:
-        robots.add_column(Text(heading), justify="left" if heading == "robot" else "right")
-    for name, robot in evaluation.robots.items():
-        cells = robot_row(name, robot, arbitrary=evaluation.arbitrary_frame)
-        robots.add_row(*(Text(cell) for cell in cells))
+    arbitrary = evaluation.arbitrary_frame
+    each = evaluation.robots.items()
+    rows = [robot_row(name, robot, arbitrary=arbitrary) for name, robot in each]
+    robots = _table(ROBOT_HEADINGS, rows, robot_note(evaluation))
+    if not evaluation.peers and unfused(evaluation):
+        return [team, robots, _table(OWN_HEADINGS, own_rows(evaluation), OWN_NOTE)]
+    tables = [team, robots]
+    if any(robot.smoothed is not None for _, robot in each):
+        paths = [path_row(name, robot, arbitrary=arbitrary) for name, robot in each]
+        tables.append(_table(PATH_HEADINGS, paths, PATH_NOTE))
     if evaluation.peers:
-        return [team, robots, *_paths(evaluation), _peers(evaluation)]
-    if unfused(evaluation):
-        own = Table(caption=OWN_NOTE)
-        for heading in OWN_HEADINGS:
-            own.add_column(Text(heading), justify="left" if heading == "robot" else "right")
-        for row in own_rows(evaluation):
-            own.add_row(*(Text(cell) for cell in row))
-        return [team, robots, own]
-    return [team, robots, *_paths(evaluation)]
+        tables.append(_table(PEER_HEADINGS, peer_rows(evaluation), PEER_NOTE))
+    return tables
 
 
-def _paths(evaluation: Evaluation) -> list[Table]:
-    """A row for the path of each robot; no table where no path was smoothed."""
-    if all(robot.smoothed is None for robot in evaluation.robots.values()):
-        return []
-    paths = Table(caption=PATH_NOTE)
-    for heading in PATH_HEADINGS:
-        paths.add_column(Text(heading), justify="left" if heading == "robot" else "right")
-    for name, robot in evaluation.robots.items():
-        cells = path_row(name, robot, arbitrary=evaluation.arbitrary_frame)
-        paths.add_row(*(Text(cell) for cell in cells))
-    return [paths]
-
-
-def _peers(evaluation: Evaluation) -> Table:
-    """A row for each robot's copy of the set."""
-    table = Table(caption=PEER_NOTE)
-    for heading in PEER_HEADINGS:
+def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> Table:
+    table = Table(caption=caption)
+    for heading in headings:
         table.add_column(Text(heading), justify="left" if heading == "robot" else "right")
-    for row in peer_rows(evaluation):
+    for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     return table
 

@@ -17,6 +17,7 @@ from team.estimation.association.scans import NOBODY
 from team.estimation.baselines import ekf_slam
 from team.estimation.baselines.ekf_slam import EkfSlam
 from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.models import Increment
 
 GATE = 13.8
@@ -50,11 +51,42 @@ def filter_step(
     if not len(unnamed):
         slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)
         return replace(state, slam=slam)
-    slam = ekf_slam.filter_step(state.slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
-    given = ids.copy()
-    given[unnamed] = _associated(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
+    slam, given = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, gate)
     slam = ekf_slam.filter_step(slam, Increment.identity(), sensor, given, ranges, bearings)
     return NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
+
+
+def innovation(
+    state: NearestNeighbour,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """Of the measurements that `filter_step` would take, of the landmarks that it would take them
+    for: ids from UNNAMED on name the rows of a scan, not landmarks.
+    """
+    if (ids >= UNNAMED).any():
+        _, ids = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, GATE)
+    return ekf_slam.innovation(state.slam, increment, sensor, ids, ranges, bearings)
+
+
+def _moved_and_named(
+    slam: EkfSlam,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    gate: float,
+) -> tuple[EkfSlam, UInt32[np.ndarray, " n"]]:
+    """The filter after the motion, and the measurements' landmarks."""
+    slam = ekf_slam.filter_step(slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
+    unnamed = np.flatnonzero(ids >= UNNAMED)
+    given = ids.copy()
+    given[unnamed] = _associated(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
+    return slam, given
 
 
 def _associated(

@@ -236,7 +236,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(nearest_neighbour.initial_state, nearest_neighbour.filter_step),
         lambda state: ekf_slam.pose_gaussian(state.slam),
         lambda state: ekf_slam.landmark_gaussian(state.slam),
-        lambda state, *step: ekf_slam.innovation(state.slam, *step[:-1]),
+        _without_claims(nearest_neighbour.innovation),
         took=lambda state: np.concatenate((np.empty(0, np.int64), *state.took)),
     ),
     "fastslam1": with_association(_plain("fastslam1")),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sim.launch import live, said
+from sim.launch import live, progress
 from sim.launch.watch import Watch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -132,7 +132,7 @@ def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
 
 
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     watch = Watch(robots=2)
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
     watch.statuses["recorder"] = m.Status(
@@ -146,21 +146,21 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.Mo
         warnings=("no measurements of this team yet",),
     )
     watch.statuses["robot/r1"] = late
-    assert said.warnings(watch) == [f"recorder: {'; '.join(missing)}"]
+    assert progress.warnings(watch) == [f"recorder: {'; '.join(missing)}"]
     watch.statuses["world"] = m.Status(
         stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
     )
-    assert said.warnings(watch) == ["world: waiting for robot/r2"]
+    assert progress.warnings(watch) == ["world: waiting for robot/r2"]
     watch.statuses["world"] = m.Status(
         stamp_ns=0, node="world", state="publishing", figures={}, warnings=()
     )
-    assert "robot/r1: no measurements of this team yet" in said.warnings(watch)
+    assert "robot/r1: no measurements of this team yet" in progress.warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
-    assert said.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
+    assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
 
 
 def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=1)
@@ -206,7 +206,7 @@ def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
 ) -> None:
     for name in ("LINE_S", "SETTLED_S"):
         monkeypatch.setattr(live, name, 0.0)
-    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=200))
     watch = told(3, truth=False)
@@ -243,7 +243,7 @@ def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_n
 ) -> None:
     for name in ("LINE_S", "SETTLED_S"):
         monkeypatch.setattr(live, name, 0.0)
-    monkeypatch.setattr(said, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=200))
     watch = told(2, truth=False)
@@ -257,8 +257,8 @@ def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_n
     assert len(warnings) == 3
     assert warnings[-1].endswith("; more like this: in the report")
     watch.last_message["robot/r1"] = time.monotonic() - 8.0
-    assert said.warnings(watch) == [f"robot/r1: {slip}"]
-    assert said.warnings(watch, silent_s=5.0) == []
+    assert progress.warnings(watch) == [f"robot/r1: {slip}"]
+    assert progress.warnings(watch, silent_s=5.0) == []
 
 
 def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
@@ -267,8 +267,8 @@ def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
         stamp_ns=310 * 10**9, node="world", state="ended", figures={"team_time_s": 300.0},
         warnings=(),
     )  # fmt: skip
-    assert said.times(watch, world) == "team time 0 s (the world is 300 s ahead of the map)"
+    assert progress.times(watch, world) == "team time 0 s (the world is 300 s ahead of the map)"
     watch.fused = fused_map(stamp_ns=130 * 10**9)
-    assert said.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"
+    assert progress.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"
     watch.fused = fused_map(stamp_ns=305 * 10**9)
-    assert said.times(watch, world) == "team time 300 s"
+    assert progress.times(watch, world) == "team time 300 s"
