@@ -3,6 +3,7 @@
 import difflib
 import math
 from collections.abc import Iterable
+from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
@@ -40,12 +41,18 @@ def check_fields(value: object, declared: Any, at: str) -> None:
         for i, part in enumerate(value):
             check_fields(part, part_type, f"{at}[{i}]")
     elif isinstance(value, dict) and _is_struct(declared):
-        types = {field.name: field.type for field in msgspec.structs.fields(declared)}
+        types = types_of(declared)
         tag = declared.__struct_config__.tag_field
         for name, part in value.items():
             if name != tag:
                 check_known(name, [known for known in types if _here(known, at)], at)
                 check_fields(part, types[name], f"{at}.{name}" if at else name)
+
+
+@cache
+def types_of(declared: type) -> dict[str, Any]:
+    """The fields of a struct with their types, evaluated once: this takes longer than a check."""
+    return {field.name: field.type for field in msgspec.structs.fields(declared)}
 
 
 def check_known(name: str, known: list[str], at: str) -> None:

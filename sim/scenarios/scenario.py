@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from central.team_config import TeamConfig
-from sim.scenarios.checks import ScenarioError, check_fields, plain
+from sim.scenarios.checks import ScenarioError, check_fields, plain, types_of
 from sim.scenarios.document import (
     MAX_ROBOTS,
     Fields,
@@ -76,7 +76,7 @@ def load(name_or_path: str | Path) -> Scenario:
     A data set's path in a file is relative to that file.
     """
     name = str(name_or_path)
-    known = [field.name for field in msgspec.structs.fields(Scenario)]
+    known = list(types_of(Scenario))
     try:
         return _converted(resolved(*named_document(name), known))
     except ScenarioError as error:
@@ -147,7 +147,7 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
     fields: Fields = msgspec.to_builtins(world)
     kind = _kind_of(path, "utias" if isinstance(world, UtiasWorld) else "folder")
     if kind != fields["kind"]:
-        common = {field.name for field in msgspec.structs.fields(WORLDS[kind])}
+        common = set(types_of(WORLDS[kind]))
         common -= {"identities"}  # what a kind of set tells is its own
         fields = {name: value for name, value in fields.items() if name in common}
     return fields | {"kind": kind, "path": path}

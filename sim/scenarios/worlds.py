@@ -1,8 +1,6 @@
 """The kinds of world that a scenario may have, and what is wrong with one of none of them."""
 
-import msgspec
-
-from sim.scenarios.checks import ScenarioError, check_fields, close
+from sim.scenarios.checks import ScenarioError, check_fields, close, types_of
 from sim.scenarios.document import Fields, builtin_names
 from sim.world.config import (
     FolderWorld,
@@ -28,18 +26,14 @@ def check_world(world: Fields) -> None:
     if not isinstance(kind, str) or kind not in WORLDS:
         raise ScenarioError(_which(kind))
     for name in world:
-        kinds = [each for each in WORLDS if name in _fields(each)]
+        kinds = [each for each, declared in WORLDS.items() if name in types_of(declared)]
         if kinds and kind not in kinds:
             belongs = " or ".join(f'"{each}"' for each in kinds)
             raise ScenarioError(
                 f'`{name}` is no field of a world of kind "{kind}", which this file or its base '
-                f"has, but of kind = {belongs} at world; known: {', '.join(_fields(kind))}"
+                f"has, but of kind = {belongs} at world; known: {', '.join(types_of(WORLDS[kind]))}"
             )
     check_fields(world, WORLDS[kind], "world")
-
-
-def _fields(kind: str) -> list[str]:
-    return [field.name for field in msgspec.structs.fields(WORLDS[kind])]
 
 
 def _which(kind: object) -> str:
