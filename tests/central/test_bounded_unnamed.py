@@ -76,6 +76,20 @@ def _small():
         yield
 
 
+@pytest.fixture(scope="module")
+def ticks(world, _small):
+    """The running fold of the whole world, and the full one."""
+    messages, _ = world
+    return folded(messages), folded(messages, bounded=False)
+
+
+@pytest.fixture(scope="module")
+def all_said(cluttered, _small):
+    """The running fold of all that the other robot said."""
+    messages, _ = cluttered
+    return folded(messages)
+
+
 def folded(messages, bounded=True, watermarks=()):
     ticks = TickFold(CONFIG, bounded)
     for k, each in enumerate(messages):
@@ -94,9 +108,9 @@ def bits(fold):
     return b"".join(parts if old is None else [*parts, old.information.tobytes()])
 
 
-def test_the_running_fold_is_bounded_and_the_full_solution_is_that_of_the_raw_set(world):
+def test_the_running_fold_is_bounded_and_the_full_solution_is_that_of_the_raw_set(world, ticks):
     messages, truth = world
-    bounded, full = folded(messages), folded(messages, bounded=False)
+    bounded, full = ticks
     assert bounded.fold.departed > 0.5 * len(messages)
     assert wrong(bounded.fold.landmarks, truth) == 0
     assert [each.kind for each in bounded.fold.landmarks.decisions] == ["closure"]
@@ -106,13 +120,15 @@ def test_the_running_fold_is_bounded_and_the_full_solution_is_that_of_the_raw_se
     assert one.departed == other.departed == 0
 
 
-def test_the_full_solution_of_a_large_set_has_the_running_folds_identities(world, monkeypatch):
+def test_the_full_solution_of_a_large_set_has_the_running_folds_identities(
+    world, ticks, monkeypatch
+):
     messages, _ = world
-    ticks, raw = folded(messages), folded(messages, bounded=False).solved()
+    bounded, raw = ticks[0], ticks[1].solved()
     taken = []
     monkeypatch.setattr(tick_fold, "taken", lambda *_: taken.append(_))
     monkeypatch.setattr(tick_fold, "FULL_UNNAMED", len(messages) - 1)
-    solved = ticks.solved()
+    solved = bounded.solved()
     assert not taken, "no tick is taken again"
     assert solved.departed == 0
     assert solved.landmarks.sets == raw.landmarks.sets
@@ -139,9 +155,9 @@ def test_a_closure_of_what_is_condensed_is_solved_with_all_of_it_linearised_agai
     assert first > again == after == 0
 
 
-def test_late_submaps_give_the_same_bytes(world):
+def test_late_submaps_give_the_same_bytes(world, ticks):
     messages, _ = world
-    wanted = bits(folded(messages).fold)
+    wanted = bits(ticks[0].fold)
     assert bits(folded(messages, watermarks=range(0, 72, 9)).fold) == wanted
     ticks = TickFold(CONFIG)
     held = messages[30]
@@ -154,10 +170,10 @@ def test_late_submaps_give_the_same_bytes(world):
 
 
 def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_same_bytes(
-    cluttered,
-):
+    cluttered, all_said,
+):  # fmt: skip
     messages, truth = cluttered
-    halves = [folded(messages[:count]).fold for count in (40, 80)]
+    halves = [folded(messages[:40]).fold, all_said.fold]
     nodes = [len(each.main.graph.landmarks) for each in halves]
     false = [40 // 2, 80 // 2]
     assert nodes[1] - nodes[0] < 0.3 * (false[1] - false[0])
@@ -175,12 +191,10 @@ def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_
     assert bits(late.fold) == bits(fold)
 
 
-def test_what_was_given_up_is_there_when_all_is_linearised_again(cluttered):
-    messages, _ = cluttered
-    ticks = folded(messages)
-    again = ticks._inputs.relinearised(ticks.fold, float("inf"), ())
+def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
+    again = all_said._inputs.relinearised(all_said.fold, float("inf"), ())
     assert again.departed == 0
     assert again.landmarks.present.keys() == again.main.graph.landmarks.keys()
-    assert again.main.graph.landmarks.keys() == ticks.fold.landmarks.sets.keys()
+    assert again.main.graph.landmarks.keys() == all_said.fold.landmarks.sets.keys()
     cost = again.main.cost / sum(again.main.graph.dimensions)
     assert cost < 1.1, "each lies where its only submap has it"

@@ -13,6 +13,7 @@ from central.desk.evaluation.evaluation import evaluate, to_json
 from central.desk.evaluation.history import history
 from central.desk.ledger import Entry, Ledger
 from central.desk.pictures.time import latency_picture
+from central.desk.report import page as report_page
 from central.desk.report.page import write_report
 from central.desk.report.run import Run, run_figures
 from sim.cli.main import app
@@ -42,6 +43,12 @@ def log() -> list[Sample]:
         msgspec.structs.replace(sample, wall_ns=(k + 1) * 1_000_000)
         for k, sample in enumerate(run_team(of, streams(of)))
     ]
+
+
+@pytest.fixture
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To draw them takes longer than all else, and the test is about the page's words."""
+    monkeypatch.setattr(report_page, "write_pictures", lambda *_: {})
 
 
 def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Path) -> None:
@@ -117,6 +124,7 @@ def written(log: list[Sample], path: Path) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: Path) -> None:
     file = written(log, tmp_path / "log.mcap")
     done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
@@ -130,6 +138,7 @@ def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: 
     assert figures["provenance"] == {"seed": "1"}
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_a_measurement_used_twice_is_named_on_the_page(log: list[Sample], tmp_path: Path) -> None:
     run = run_of(log)
     name = "measurement 7 of r1, incarnation 1 is in two submaps: 0 and 1"
@@ -138,6 +147,7 @@ def test_a_measurement_used_twice_is_named_on_the_page(log: list[Sample], tmp_pa
     assert 'class="bad">Ledger: 1 offenders: measurement 7 of r1' in page
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_a_log_that_lacks_what_the_ledger_needs_says_what(tmp_path: Path) -> None:
     file = written(joined_log(scenario(), 0.1), tmp_path / "log.mcap")
     done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])

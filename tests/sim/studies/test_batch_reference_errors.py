@@ -173,9 +173,10 @@ def lasting_scenario(seed: int) -> Scenario:
 def test_the_map_is_consistent_where_errors_last_and_not_if_they_are_taken_as_white(
     kind: str,
 ) -> None:
+    """The mutant is found among a quarter of the runs."""
     runs = [
         batch_map(joined_log(lasting_scenario(seed), 0.02), kind)  # type: ignore[arg-type]
-        for seed in range(100, 300)
+        for seed in range(100, 150 if kind == "white" else 300)
     ]
     errors = [run.errors for run in runs if run.errors is not None]
     dof = sum(2 * e.count for e in errors)
