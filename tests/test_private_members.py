@@ -13,9 +13,12 @@ NUMBAS = {
     *("_cache", "_cache_file", "_cache_path", "_impl", "_data_path", "_load_overload", "_memo"),
     *("_guard_against_spurious_io_errors", "_data_name", "_save_data", "_save_index"),
     *("_codegen", "_engine", "_set_compiled_object", "_finalize_final_module"),
+    *("_object_caching_enabled", "_raise_if_finalized", "_ensure_finalized", "_final_module"),
+    *("_linking_libraries", "_reload_init", "_get_module_for_linking", "_library_class"),
+    *("_finalize_dynamic_globals", "_optimize_final_module"),
 }
 """What these modules of team/estimation have to ask numba for: it has no public way."""
-ASKING = ("compiled.py", "cached_code.py")
+ASKING = ("compiled.py", "cached_code.py", "parts.py")
 
 
 def reached(source: str) -> Iterator[tuple[int, str]]:

@@ -46,24 +46,28 @@ def unpickled(file: IO[bytes]) -> Any:
 
 
 class _Loaded(codegen.JITCodeLibrary):
-    """The machine code of a form of a kernel; its bit code is parsed when a caller is compiled."""
+    """A form of a kernel; its bit code is parsed when a caller is compiled."""
 
     _bit_code: bytes | None = None
 
     @classmethod
     def read(cls, generator: Any, cached: tuple[str, str, tuple[bytes, bytes]]) -> Any:
-        """Hands the machine code to the linker, as Numba does."""
+        """Hands machine code to the linker, as Numba does."""
         name, kind, (code, bit_code) = cached
         assert kind == "object"
         library: Any = cls(generator, name)
         library._bit_code = bit_code
-        library.enable_object_caching()
-        library._set_compiled_object(code)
-        library._finalize_final_module()
+        if code:
+            library.enable_object_caching()
+            library._set_compiled_object(code)
+            library._finalize_final_module()
+        library._finalized = True
         return library
 
     def get_pointer_to_function(self, name: str) -> Any:
-        """The address of a function, which the linker knows though its bit code is not parsed."""
+        """The address of a function in machine code, which the linker knows; 0 in bit code."""
+        if not self._object_caching_enabled:
+            return 0
         return self._codegen._engine.get_function_address(name)
 
     def _get_module_for_linking(self) -> Any:

@@ -27,6 +27,7 @@ from numba.core.caching import IndexDataCacheFile
 
 from team.estimation.cached_code import load_alone, loads_alone, unpickled
 from team.estimation.compiled_once import compile_once
+from team.estimation.parts import keep_parts_as_bit_code
 from team.sources import sources_of
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -39,12 +40,32 @@ def compiled(function: F) -> F:
     wrapped function is compiled.
     """
     kernel = inspect.unwrap(function)
-    dispatcher: Any = numba.njit(
-        cache=True, fastmath=False, error_model="numpy", forceinline=kernel in _INLINED
-    )(kernel)
-    if dispatcher is not kernel:  # with NUMBA_DISABLE_JIT it is the function itself
-        compile_once(dispatcher, lambda: _cache_of_its_own(dispatcher))
+    dispatcher = _compiler_of(kernel)
+    if dispatcher is not kernel and loads_alone():
+        part = cache(partial(_compiler_of, kernel, no_cpython_wrapper=True))
+        dispatcher.get_call_template = lambda *types: part().get_call_template(*types)
+        dispatcher.get_overload = lambda form: part().get_overload(form)
     return cast(F, dispatcher)
+
+
+def _compiler_of(kernel: Callable[..., object], **options: bool) -> Any:
+    """Compiles a kernel at its first call: for Python, or as a part of others, which has no entry
+    from Python (`team.estimation.parts`).
+    """
+    compile_: Any = numba.njit
+    dispatcher = compile_(
+        kernel,
+        cache=True,
+        fastmath=False,
+        error_model="numpy",
+        forceinline=kernel in _INLINED,
+        no_cfunc_wrapper=True,  # no C program calls it
+        **options,
+    )
+    if dispatcher is not kernel:  # with NUMBA_DISABLE_JIT it is the function itself
+        kind = "-part" if options else ""
+        compile_once(dispatcher, lambda: _cache_of_its_own(dispatcher, kind))
+    return dispatcher
 
 
 def inlined(function: F) -> F:
@@ -56,7 +77,7 @@ def inlined(function: F) -> F:
 _INLINED: set[Callable[..., object]] = set()
 
 
-def _cache_of_its_own(dispatcher: Any) -> Path:
+def _cache_of_its_own(dispatcher: Any, kind: str) -> Path:
     """Names the files of a kernel's cache by its program; returns the file that locks them.
 
     To be called at the kernel's first call, when all names that it uses are defined. The kernel's
@@ -64,10 +85,11 @@ def _cache_of_its_own(dispatcher: Any) -> Path:
     """
     cached, program = dispatcher._cache, program_of(dispatcher.py_func)
     line = f"-{dispatcher.py_func.__code__.co_firstlineno}."
-    name = f"{cached._impl.filename_base.replace(line, '.', 1)}-{program}"
+    name = f"{cached._impl.filename_base.replace(line, '.', 1)}-{program}{kind}"
     files: Any = _CacheFile
     cached._cache_file = files(cached._cache_path, name, program)
     if loads_alone():
+        keep_parts_as_bit_code(dispatcher.targetctx.codegen())
         cached.load_overload = partial(load_alone, cached)
     return Path(cached._cache_path) / f"{name}.lock"
 
@@ -108,7 +130,7 @@ class _CacheFile(IndexDataCacheFile):
             raise OSError(f"{name} is damaged, or names what has another name now") from error
 
 
-_NAMES = b"parts numbered at random"
+_NAMES = b"parts numbered at random, without machine code"
 """How the parts of a kernel are named: code whose parts have other names is not linked with it."""
 _CALLERS: ContextVar[tuple[Callable[..., object], ...]] = ContextVar("callers", default=())
 """The kernels whose digests are being computed, each one called by the one before it."""

@@ -10,6 +10,7 @@ from types import ModuleType
 import pytest
 
 from team.estimation import geometry
+from team.estimation.cached_code import unpickled
 from team.estimation.compiled import (
     CircularKernelsError,
     _CacheFile,
@@ -176,6 +177,14 @@ def test_kernels_that_two_processes_compiled_do_not_share_parts_that_are_called_
     assert said == [["5679"], ["1302"], ["5679", "1302"]]
 
 
+def machine_code(file: Path) -> bool:
+    """Whether a file of the cache holds machine code, and not bit code alone."""
+    with file.open("rb") as opened:
+        (_, _, (code, bit_code)), *_ = unpickled(opened)
+    assert bit_code
+    return bool(code)
+
+
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     folder = tmp_path / "kernels"
@@ -189,6 +198,8 @@ def package(tmp_path: Path) -> Path:
 def test_a_kernel_is_compiled_once_and_anew_when_what_it_calls_has_changed(package: Path) -> None:
     both = computed(package.parent, processes=2)
     assert both == [(21.0, 0), (21.0, 1)], "who comes second waits for the first and takes its code"
+    kinds = {each.name.split(".")[1]: machine_code(each) for each in package.rglob("*.nbc")}
+    assert sorted(kinds.items()) == [("inner", False), ("outer", True)]
     (package / "inner.py").write_text(INNER.format("3.0"))
     assert computed(package.parent) == [(31.0, 0)]
     (package / "inner.py").write_text(INNER.format("2.0"))

@@ -366,7 +366,7 @@ def test_the_scenario_of_a_team_of_a_hundred_robots_is_understood_on_the_wire() 
 
 
 def test_the_fields_of_a_scenario_are_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their types were evaluated anew for every field of every world: most of the time of a load."""
+    """Their types were evaluated for every field of a world: two thirds of the time of a load."""
     load("thesis")
     monkeypatch.setattr(msgspec.structs, "fields", lambda each: pytest.fail(f"again: {each}"))
     load("thesis")
