@@ -121,7 +121,11 @@ class JoinRule(FusionRule[SubmapInputs]):
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None
         biases = marginals.bias_estimates(fold)
-        found = NOTHING if agreement is None else finding(agreement, self.config.normal_scale)
+        found = (
+            NOTHING
+            if agreement is None
+            else finding(agreement, self.config.normal_scale, final=final)
+        )
         self.finding = found.with_biases(biases)
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps)

@@ -93,10 +93,13 @@ def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
     return mean if abs(mean) > max(MISCALIBRATED, SIGMAS * sigma) else None
 
 
-def finding(agreement: Agreement, normal: float = 1.0) -> Finding:
+def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) -> Finding:
     """The team's and every robot's figures, and who is out of bounds.
 
     normal: the covariance scale where the covariances are right; the scale is given relative to it.
+    final: of the final map. Before it nobody is warned that a map claims too little: it is cautious
+    meanwhile, and of a robot that has not come back anywhere yet the submaps hardly contradict each
+    other.
     """
     figures = {}
     warnings = []
@@ -112,7 +115,8 @@ def finding(agreement: Agreement, normal: float = 1.0) -> Finding:
     scales = _scales(agreement.submaps, normal)
     for who, scale in scales.items():
         figures[f"covariance_scale.{who}" if who else "covariance_scale"] = scale.value
-    return Finding(figures, (*warnings, *_misscaled(scales), *_worst(agreement)))
+    misscaled = _misscaled(scales, small=final)
+    return Finding(figures, (*warnings, *misscaled, *_worst(agreement)))
 
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
@@ -131,13 +135,16 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
     }
 
 
-def _misscaled(scales: Mapping[str, Scale]) -> list[str]:
-    """The team, or single robots, whose covariances are far too small or too large, in words."""
-    robots = {who: each for who, each in scales.items() if who}
+def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
+    """The team, or single robots, whose covariances are far too small or, if `small` scales are to
+    be told, too large, in words.
+    """
+    told = {who: each for who, each in scales.items() if small or each.value > 1.0}
     words_of = {
-        who: words for who, each in robots.items() if (words := _misscale(each, ROBOT_WARN))
+        who: words for who, each in told.items() if who and (words := _misscale(each, ROBOT_WARN))
     }
-    team = _misscale(scales[""], SCALE_WARN) if "" in scales else ""
+    team = _misscale(told[""], SCALE_WARN) if "" in told else ""
+    robots = scales.keys() - {""}
     if team and (not words_of or 2 * len(words_of) > len(robots)):
         return [f"the team's {team}"]
     return [f"{robot}: {words}" for robot, words in words_of.items()]

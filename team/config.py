@@ -5,6 +5,7 @@ it does not depend on the rate of the odometry: a standard deviation per square 
 a metre driven and of a radian turned; the three add in variance.
 """
 
+import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
@@ -16,6 +17,8 @@ Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
+Angle = Annotated[float, Meta(gt=0.0, le=math.pi)]
+"""[rad]; more than half a turn is a number of degrees."""
 
 UNNAMED = 2**31
 """Landmark numbers below this are identities, as of a barcode. From here on they are assigned by
@@ -167,7 +170,7 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     range_sigma: Positive = 0.1
     range_sigma_per_m: NonNegative = 0.0
-    bearing_sigma: Positive = 0.02
+    bearing_sigma: Angle = 0.02
     min_range: NonNegative = 0.0
     max_range: Positive = 1e6
     field_of_view: Positive = 6.283185307179586

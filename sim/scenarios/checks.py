@@ -78,6 +78,7 @@ def plain(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
     field = path.rstrip("`").removeprefix("$").lstrip(".")
     where = ".".join(part for part in (at, field) if part)
     problem = problem[:1].lower() + problem[1:].replace("`", "")
+    problem = problem.replace(f"float <= {math.pi}", "radians, half a turn at most,")
     for pattern, words in _IN_WORDS.items():
         problem = problem.replace(f"str matching regex '{pattern}'", words)
     return ScenarioError(f"{problem} at {where}" if where else problem)

@@ -22,7 +22,7 @@ SETTINGS = JoinSettings()
 ROBUST = JoinSettings(robust_c=1.0)
 
 
-def watched(seed, claim=None, settings=SETTINGS, normal=1.0):
+def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
     """The finding of a joined team; `claim` changes a contribution before it is joined."""
     world = team(seed, robots=3, submaps=30, landmarks=8)
     fold = EMPTY_FOLD
@@ -30,7 +30,7 @@ def watched(seed, claim=None, settings=SETTINGS, normal=1.0):
         fold = started(fold, start)
     submaps = [claim(s) if claim else s for s in world.submaps]
     solved = converged(folded(fold, submaps, settings), settings)
-    return finding(marginals.joint_cost(solved), normal)
+    return finding(marginals.joint_cost(solved), normal, final=final)
 
 
 def with_covariance_times(factor, of):
@@ -85,6 +85,13 @@ def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
             said = [w for w in found.warnings if "ought to be" in w]
             assert bool(said) == (words is not None), (seed, factor, found)
             assert all(words in w and w.startswith("the team's") for w in said)
+
+
+def test_that_a_map_claims_too_little_is_told_of_the_final_one_only():
+    for factor, told in ((0.5, 1), (2.0, 0)):
+        found = watched(0, with_covariance_times(factor, lambda _: True), final=False)
+        assert len([w for w in found.warnings if "ought to be" in w]) == told
+        assert "covariance_scale" in found.figures
 
 
 @pytest.mark.parametrize("factor", [1.0 / 25.0, 25.0])

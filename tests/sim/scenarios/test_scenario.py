@@ -180,6 +180,10 @@ UTIAS = 'world = { kind = "utias" }\n'
         (SMALL + "[defaults.front_end]\npartcles = 5", "did you mean `particles`?"),
         (SMALL + "wold = 3", "unknown field `wold` at world; known: steps, size_m"),
         (
+            'base = "thesis"\n[defaults.sensor]\nbearing_sigma = 20.0',
+            "expected radians, half a turn at most, at defaults.sensor.bearing_sigma",
+        ),
+        (
             "sead = 3\n" + SMALL,
             "unknown field `sead` at the top; known: name, team, robots, central",
         ),
