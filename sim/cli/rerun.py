@@ -242,6 +242,8 @@ def _verify(path: Path, json_file: Path | None) -> None:
         json_file.write_text(json.dumps(figures, indent=2) + "\n")
     if not log.complete:
         typer.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
+    if not result.messages:
+        fail(f"{path} has no message that can be computed again: nothing is verified", FAILED)
     if result.first is not None:
         what = "the log lacks what is needed" if result.first.lacks else "the first difference"
         fail(f"{what}: {result.first}", FAILED)

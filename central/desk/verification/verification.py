@@ -229,9 +229,11 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
             return lost or _gap(log, message)
         case m.Prior() | m.Trajectory():
             maps = [each for channel in MAPS for each in log.of(channel)]
-            digests = {each.digest for each in maps if isinstance(each, m.FusedMap)}
-            digest = message.digest
-            return None if digest in digests else f"no map {digest.hex()} in the log"
+            by_digest = {each.digest: each for each in maps if isinstance(each, m.FusedMap)}
+            fused = by_digest.get(message.digest)
+            if fused is None:
+                return f"no map {message.digest.hex()} in the log"
+            return _lacking(fused, log)  # it came with that map, which lacks what it was made of
         case m.FusedMap():
             found = log.submaps()
             for each in message.members:

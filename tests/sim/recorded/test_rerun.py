@@ -180,6 +180,19 @@ def test_what_was_made_of_a_map_that_is_lost_can_not_be_judged_and_all_else_is_e
     assert f"no prior {lost.digest.hex()} in the log" in str(result.first)
 
 
+def test_what_came_with_a_map_whose_submap_is_lost_can_not_be_judged_either(
+    samples: list[Sample], tmp_path: Path
+) -> None:
+    lost = messages(samples, ch.SUBMAP, "r2")[0]
+    cut = changed(samples, ch.SUBMAP, lambda x: None if x == lost else x)
+    result = verify(written(tmp_path / "log.mcap", cut))
+    assert [c.channel for c in result.channels if c.different] == []
+    lacking = {c.channel: c.lacking for c in result.channels if c.lacking}
+    assert {"fused_map", "prior", "trajectory", "final_map"} <= lacking.keys()
+    assert result.first is not None
+    assert "submap 0 of r2, incarnation 1, is not in the log" in str(result.first)
+
+
 def test_on_another_platform_numbers_are_compared_within_a_tolerance(
     samples: list[Sample], tmp_path: Path
 ) -> None:
@@ -271,6 +284,13 @@ def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(
     result = runner.invoke(app, ["rerun", str(bad.path), "--verify"])
     assert result.exit_code == 1
     assert "robot/r2/submap" in result.output
+    channels = ((sample, ch.channel_of(sample.key)) for sample in samples)
+    sensors = [sample for sample, of in channels if of is not None and not of[0].recomputable]
+    empty = runner.invoke(
+        app, ["rerun", str(written(tmp_path / "e.mcap", sensors).path), "--verify"]
+    )
+    assert empty.exit_code == 1
+    assert "nothing is verified" in empty.output
     for wrong in (
         ["--verify", "--delay", "3"],
         ["--loss", "1"],
