@@ -40,6 +40,9 @@ from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
 from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from central.desk.report.run import Run
     from sim.launch.launch import Outcome
     from sim.launch.plan import Plan
     from sim.world.streams import WorldStreams
@@ -347,6 +350,22 @@ def _compile(scenario: Scenario) -> None:
         warm_up(scenario.estimator, scenario.fusion)
 
 
+def _write_report(
+    run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
+) -> None:
+    """Write the report and say what was written; where that fails, as on a full disk, note it."""
+    from central.desk.report.page import write_report
+
+    try:
+        for path in write_report(run, outcome.folder, figures):
+            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    except OSError as error:
+        outcome.failures.append(
+            f"{outcome.folder}: can not write the report: {error.strerror}; "
+            f"`teamslam report {outcome.log} -o FOLDER` makes it elsewhere"
+        )
+
+
 def _conclude(
     scenario: Scenario, outcome: "Outcome", json_file: Path | None, *, report: bool
 ) -> None:
@@ -357,7 +376,6 @@ def _conclude(
     from central.desk.evaluation.history import history
     from central.desk.export.take_home import taken_home
     from central.desk.names import in_order
-    from central.desk.report.page import write_report
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
     from central.desk.verification.recorded import recorded
@@ -401,8 +419,7 @@ def _conclude(
             typer.echo("drawing the pictures and writing the report", err=True)
             if (line := nis_line(run)) is not None:
                 console.print(line, highlight=False, soft_wrap=True)
-            for path in write_report(run, outcome.folder, {**figures, **run_figures(run)}):
-                console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+            _write_report(run, outcome, {**figures, **run_figures(run)}, console)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
     for name in in_order(outcome.restarts):

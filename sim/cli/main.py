@@ -131,6 +131,8 @@ def _advice(error: Exception) -> tuple[int, str] | None:
         return WRONG_USE, str(error)
     if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
         return WRONG_USE, f"{error.filename}: {error.strerror}; give another path"
-    if isinstance(error, RecorderError | FaultyRunError | OSError):
+    if isinstance(error, RecorderError | FaultyRunError):
         return FAILED, str(error)
+    if isinstance(error, OSError):
+        return FAILED, f"{error.filename}: {error.strerror}" if error.filename else str(error)
     return None

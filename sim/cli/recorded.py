@@ -147,8 +147,11 @@ def report(
     if found is not None:
         verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()
         console.print(f"ledger: {verdict}", highlight=False, soft_wrap=True)
-    for path in write_report(run, output, figures):
-        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    try:
+        for path in write_report(run, output, figures):
+            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    except OSError as error:
+        fail(f"-o {output}: can not write: {error.strerror}; give another folder", FAILED)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=2) + "\n")
     _hint_if_cut(opened)

@@ -1,10 +1,18 @@
 """What is left of a launch whose run is over, and which is interrupted as it is scored."""
 
+import errno
+import os
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
+from central.desk.evaluation.evaluation import evaluate
+from central.desk.evaluation.history import history
+from central.desk.report import page
+from central.desk.report.run import Run
 from sim.cli import launch
 from sim.cli.main import app
 from sim.launch.launch import Outcome
@@ -36,3 +44,21 @@ def test_figures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     launch._write_whole(file, "new")
     assert [each.name for each in tmp_path.iterdir()] == ["figures.json"]
     assert file.read_text() == "new"
+
+
+def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcome = Outcome(log=tmp_path / "log.mcap", folder=tmp_path, wall_s=1.0, processes=[])
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(page, "write_report", full)
+    run = Run(evaluate([]), history([]), {})
+    launch._write_report(run, outcome, {}, Console(file=StringIO()))
+    (failure,) = outcome.failures
+    assert failure == (
+        f"{tmp_path}: can not write the report: No space left on device; "
+        f"`teamslam report {outcome.log} -o FOLDER` makes it elsewhere"
+    )
