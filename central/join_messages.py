@@ -38,6 +38,8 @@ detections in a row look like a landmark in a single window. Running maps show t
 too."""
 NAMED = 10
 """Most landmarks left out of the map, refusals, and robots of an island that are named."""
+FEW = 3
+"""Most pairs of landmarks without names that are named."""
 NONE_SHARED = "not joined: 0 shared landmarks, "
 
 
@@ -173,8 +175,11 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
 
 
 def _listed(names: Sequence[str]) -> str:
-    """The first names in brackets; a landmark without a name has none."""
-    return f" ({', '.join(names[:NAMED])}{', …' * (len(names) > NAMED)})" if names else ""
+    """The first names in brackets; landmarks without a name have none, or are pairs, of which a few
+    will do.
+    """
+    most = FEW if names and " with " in names[0] else NAMED
+    return f" ({', '.join(names[:most])}{', …' * (len(names) > most)})" if names else ""
 
 
 def priors(

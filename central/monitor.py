@@ -139,11 +139,11 @@ def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
     """The team, or single robots, whose covariances are far too small or, if `small` scales are to
     be told, too large, in words.
     """
-    told = {who: each for who, each in scales.items() if small or each.value > 1.0}
+    judged = {who: each for who, each in scales.items() if small or each.value > 1.0}
     words_of = {
-        who: words for who, each in told.items() if who and (words := _misscale(each, ROBOT_WARN))
+        who: words for who, each in judged.items() if who and (words := _misscale(each, ROBOT_WARN))
     }
-    team = _misscale(told[""], SCALE_WARN) if "" in told else ""
+    team = _misscale(judged[""], SCALE_WARN) if "" in judged else ""
     robots = scales.keys() - {""}
     if team and (not words_of or 2 * len(words_of) > len(robots)):
         return [f"the team's {team}"]

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Sequence
 from math import degrees
 
+from rich import box
+from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
@@ -38,9 +40,13 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> Table:
-    table = Table(caption=caption)
+    """A narrow table, whose cells go on in the next line where even that is too wide: a number that
+    is cut is a wrong one.
+    """
+    table = Table(caption=caption, box=box.SIMPLE, padding=(0, 1, 0, 0))
     for heading in headings:
-        table.add_column(Text(heading), justify="left" if heading == "robot" else "right")
+        side: JustifyMethod = "left" if heading == "robot" else "right"
+        table.add_column(Text(heading), justify=side, overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     return table
@@ -193,7 +199,7 @@ def robot_note(evaluation: Evaluation) -> str:
 
 
 ROBOT_HEADINGS = (
-    "robot", "steps", "measure-\nments ac-\ncounted\nfor/sent", "sub-\nmaps", "position\nRMSE [m]",
+    "robot", "steps", "measure-\nments\nused or\nrejected", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
 )  # fmt: skip
 
