@@ -25,8 +25,8 @@ def assigned(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     """The first of these submaps, the newest first, whose landmarks are assigned to those of
     submaps elsewhere.
 
-    A group has SURE_AFTER pairs or more, one of them known to no better than `near`, a
-    log-likelihood ratio of `llr_loose` together, and the share of a closure.
+    A group has SURE_AFTER pairs or more, one of them known to no better than `near`, what `jointly`
+    asks of such a group together, and the share of a closure.
     """
     profile = view.profile
     others = view.sees.copy()
@@ -41,7 +41,7 @@ def assigned(view: IslandView, submaps: Sequence[int]) -> Closure | None:
             found = jointly(
                 view.joint, one[different], two[different], profile, NEARLY * profile.same
             )
-            if not _is_group(found, profile.near, profile.llr_loose):
+            if not _is_group(found, profile.near):
                 continue
             mean = found.joint.mean
             places = mean[[pair.second for pair in found.pairs]]
@@ -62,10 +62,6 @@ def assigned(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     return None
 
 
-def _is_group(found: Grown, near: float, llr: float) -> bool:
+def _is_group(found: Grown, near: float) -> bool:
     """Whether enough pairs agree, of which one was farther off than what is compared anyway."""
-    return (
-        len(found.pairs) >= SURE_AFTER
-        and max(pair.sd for pair in found.pairs) > near
-        and found.llr >= llr
-    )
+    return len(found.pairs) >= SURE_AFTER and max(pair.sd for pair in found.pairs) > near

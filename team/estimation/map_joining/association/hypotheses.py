@@ -46,8 +46,10 @@ def jointly(
 ) -> Grown:
     """The pairs of candidates on which nearly all of the weight of joint assignments agrees.
 
-    A pair needs log odds of `odds` against all assignments without it, and a single pair a standard
-    deviation below `tight`.
+    A pair needs log odds of `odds` against all assignments without it. Where the standard deviation
+    of one of the pairs exceeds `tight`, all of them together need a log-likelihood ratio of
+    `llr_loose`, as a single such pair does (`growing.needed`): where little is known, a few
+    landmarks fit others by chance.
     most_sd: candidates with a larger standard deviation are left out.
     """
     at = likelihoods(joint, first, second, profile)
@@ -155,7 +157,9 @@ def _agreed(
         )
         if odds >= profile.odds:
             sure.append(pair._replace(rival=pair.llr - odds))
-    if len(sure) == 1 and sure[0].sd > profile.tight:
+    if any(pair.sd > profile.tight for pair in sure) and (
+        sum(pair.llr for pair in sure) < profile.llr_loose
+    ):
         sure = []
     pairs = []
     for pair in sure:

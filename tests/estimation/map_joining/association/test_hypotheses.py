@@ -42,6 +42,22 @@ def test_one_of_two_neighbours_alone_waits():
     assert not jointly(joint, one, two, PROFILE, 0.5).pairs
 
 
+def test_a_few_loosely_known_landmarks_that_fit_others_by_chance_wait() -> None:
+    known = np.array([(0.0, 0.0), (4.0, 1.0), (1.0, 5.0)])
+    profile = AssociationProfile(slack=0.0, density=0.006, same=1.0)
+    for count, sd, pairs in ((2, 0.3, 0), (2, 0.05, 2), (3, 0.3, 3)):
+        points = np.concatenate([known, known[:count] + np.array([1.0, -0.5])])
+        n = len(points)
+        shift = np.zeros((2 * n, 2))  # an error of 1 m that all that is seen again has in common
+        shift[6::2, 0] = shift[7::2, 1] = 1.0
+        seen = np.arange(n) >= len(known)
+        apart = (seen[:, None] == seen) & ~np.eye(n, dtype=np.bool_)
+        joint = Joint(points, sd**2 * np.eye(2 * n) + shift @ shift.T, apart)
+        one, two = (each.ravel() for each in np.meshgrid(np.arange(3, n), np.arange(3)))
+        found = jointly(joint, one, two, profile, 2.0)
+        assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(pairs)]
+
+
 def _submap(points: np.ndarray, together: bool) -> LocalMap:
     n = len(points)
     seen = np.ones((n, 1), np.bool_) if together else np.eye(n, dtype=np.bool_)
