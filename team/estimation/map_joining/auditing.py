@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from team.estimation.map_joining import refusal
+from team.estimation.map_joining.association.crowding import Crowd
 from team.estimation.map_joining.association.landmarks import OPEN, Opened
 from team.estimation.map_joining.association.shares import overlap_share
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings
@@ -82,7 +83,8 @@ def share_now(fold: Fold, opened: Opened) -> float | None:
     if not len(at):
         return None
     one, two = (_points(island, [node for node in known if side[node]]) for side in sides)
-    return overlap_share(one, two, at, island.settings.association)
+    around = Crowd(each.observation.spacings for each in graph.observed)
+    return overlap_share(one, two, at, around.bounded(island.settings.association))
 
 
 def _points(island: Island, nodes: list[int]) -> np.ndarray:

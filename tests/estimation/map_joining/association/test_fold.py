@@ -8,8 +8,14 @@ import pytest
 from central.join_messages import Shown, reasons
 from team.association import AssociationProfile
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
-from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.association.landmarks import (
+    OPEN,
+    Landmarks,
+    LocalLandmark,
+    Opened,
+    Verdict,
+)
+from team.estimation.map_joining.auditing import share_now, taken
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -157,6 +163,28 @@ def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it(
     assert len(careful.islands) == len(fold.islands) == 2
     assert fold.main.state.tobytes() == careful.main.state.tobytes()
     assert fold.landmarks.sets == careful.landmarks.sets
+
+
+def test_an_audit_looks_around_a_closure_as_far_as_landmarks_stand_apart(
+    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
+) -> None:
+    _, _, fold = loop
+    stream = fold.main_key
+    assert stream is not None
+    newer = ((stream, 12, OPEN),)
+    both = [
+        members
+        for members in fold.landmarks.sets.values()
+        if members[0].sequence < 8 and members[-1].sequence >= 12
+    ]
+    pairs = tuple((members[0], members[-1]) for members in both)
+    opened = Opened(fold.landmarks.decisions[0], pairs, newer)
+    shares = []
+    for profile in (SETTINGS.association, AssociationProfile(recent=4, same=15.0)):
+        settings = JoinSettings(association=profile)
+        island = replace(fold.main, settings=settings)
+        shares.append(share_now(replace(fold, islands={stream: island}), opened))
+    assert shares == [1.0, 1.0]
 
 
 def test_an_operator_says_that_two_are_one_or_two(
