@@ -114,9 +114,12 @@ def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
         gc.enable()  # compiling makes much that does not stay
     with compilations(lambda done, of: asked.sendall(f"compiled {of}".encode())):
         if (estimator, rule) == ("hybrid", "join") and not is_warm:
+            template = os.getpid()
             if (centre := os.fork()) == 0:
+                end_with_parent(signal.SIGKILL)  # as an interrupted launch ends the template
                 with suppress(Exception):  # then this process compiles what is lacking
-                    warm_up.fold_made_up_submaps()
+                    if os.getppid() == template:
+                        warm_up.fold_made_up_submaps()
                 os._exit(0)
             warm_up.run_to_the_first_submap(estimator, rule)
             os.waitpid(centre, 0)

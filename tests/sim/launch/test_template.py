@@ -1,7 +1,9 @@
 """The template: when it is started and ended, and when a process is forked from it."""
 
 import os
+import signal
 import socket
+import subprocess
 import sys
 import threading
 from types import SimpleNamespace
@@ -88,3 +90,21 @@ def test_a_launch_that_can_not_begin_leaves_no_template(
     assert one.process.returncode is not None  # killed, or it saw first that nobody asks any more
     assert ahead.taken() is None
     assert words[0] in capfd.readouterr().err
+
+
+COMPILES = """
+import os, signal, socket
+from sim.launch import template, warm_up
+warm_up.is_warm = lambda *_: False
+warm_up.fold_made_up_submaps = signal.pause
+warm_up.run_to_the_first_submap = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+template._load_kernels("hybrid", "join", socket.socket())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is no template")
+def test_a_template_that_is_ended_while_it_compiles_leaves_nobody_who_goes_on() -> None:
+    """A launch was interrupted: the process that compiles the centre's kernels went on alone."""
+    with subprocess.Popen([sys.executable, "-c", COMPILES], stdout=subprocess.PIPE) as process:
+        process.communicate(timeout=100)  # both hold the pipe open until they end
+        assert process.returncode == -signal.SIGKILL
