@@ -22,6 +22,7 @@ from central.desk.evaluation.errors import Path, moved
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.paths import SmoothedPath
 from central.desk.pictures.style import save
+from team.config import UNNAMED
 from team.estimation.geometry import inverse
 
 # Matplotlib takes half a second to import: a run that draws nothing has no use for it
@@ -202,9 +203,11 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     )  # fmt: skip
     blocks = landmark_blocks(fused.covariance)
     draw_ellipses(axis, fused.means, blocks, MAP_COLOUR, width=1.1, zorder=7)
-    if len(fused.ids) <= LABELLED_LANDMARKS:
+    named = fused.ids < UNNAMED  # the others' numbers tell nobody anything
+    if 0 < np.count_nonzero(named) <= LABELLED_LANDMARKS:
+        means = fused.means[named]
         for landmark, mean, offset in zip(
-            fused.ids, fused.means, label_offsets(fused.means), strict=True
+            fused.ids[named], means, label_offsets(means), strict=True
         ):
             axis.annotate(
                 str(landmark),

@@ -4,6 +4,7 @@
 import { upTo } from './store.js';
 
 const ELLIPSE = Math.sqrt(5.991);  // 95 % of a Gaussian in the plane
+const UNNAMED = 2 ** 31;           // from here on the map has numbered landmarks itself: a click says who they are
 const LABELS = 400;                // more landmarks than these have no numbers until they are near
 
 export const LAYERS = [
@@ -260,7 +261,7 @@ export class MapView {
     if (this.on.labels && seen.length <= LABELS) {
       g.font = `${11 * r}px system-ui, "DejaVu Sans", sans-serif`;
       g.fillStyle = this.colours.soft;
-      for (const [x, y, i] of seen) g.fillText(map.ids[i], x + 6 * r, y - 5 * r);
+      for (const [x, y, i] of seen) if (map.ids[i] < UNNAMED) g.fillText(map.ids[i], x + 6 * r, y - 5 * r);
     }
   }
 
