@@ -29,6 +29,8 @@ REPEAT_S = 60.0
 """Wall time after which a line is repeated that says nothing new."""
 SETTLED_S = 5.0
 """A warning that a node withdraws sooner [s], as while a team starts, is not printed as a line."""
+WIDE = 80
+"""Columns of a terminal that has room for the whole table."""
 MOST_ALIKE = 3
 """Most lines of warnings that differ in their numbers only."""
 _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
@@ -42,7 +44,7 @@ def shown(title: str) -> Iterator[Callable[[Watch], None]]:
     console = Console(stderr=True)
     if console.is_terminal and sys.stderr.isatty():
         with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda watch: live.update(_view(title, watch))
+            yield lambda watch: live.update(_view(title, watch, console.width))
     else:
         lines = _Lines(console)
         try:
@@ -141,7 +143,7 @@ class _Lines:
         )
 
 
-def _view(title: str, watch: Watch) -> Group:
+def _view(title: str, watch: Watch, width: int = WIDE) -> Group:
     elapsed = time.monotonic() - watch.began
     world = watch.world
     parts: list[Text | Table] = [Text(f"{title}   {elapsed:.1f} s", style="bold")]
@@ -159,7 +161,7 @@ def _view(title: str, watch: Watch) -> Group:
         )
         parts.append(bar)
     if robots:
-        parts.append(_robots(robots, watch.errors))
+        parts.append(_robots(robots, watch.errors, width))
     parts += [Text(line) for line in _map_lines(watch)]
     parts += [Text(short(words)) for words in (() if watch.fused is None else watch.fused.joined)]
     parts += [Text(note) for note in watch.notes[-4:]]
@@ -176,18 +178,22 @@ _COLUMNS = (
     ("messages_per_s", "\nmsg/s", "{:,.0f}"),
     ("bytes_per_s", "\nB/s", "{:,.0f}"),
 )
+_NARROW = ("steps", "submaps", "pose_sigma_m", "nis_per_dof")
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
 """Most robots with a row of their own: a table that is higher than the terminal would be cut."""
 
 
-def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
-    """A row for each robot; NEES and coverage of its poses where there is a truth."""
+def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:
+    """A row for each robot; NEES and coverage of its poses where there is a truth. A terminal that
+    is not WIDE has room for some figures only.
+    """
+    columns = [each for each in _COLUMNS if width >= WIDE or each[0] in _NARROW]
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)
     table.add_column(Text("\nrobot"), no_wrap=True)
-    headings = [heading for _, heading, _ in _COLUMNS] + ["NEES\n/dof", "in\n95 %"] * judged
+    headings = [heading for _, heading, _ in columns] + ["NEES\n/dof", "in\n95 %"] * judged
     for heading in headings:
         table.add_column(Text(heading), justify="right", no_wrap=True)
     peers = any("set_submaps" in status.figures for status in statuses.values())
@@ -198,7 +204,7 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors") -> Table:
         robot = node.removeprefix("robot/")
         cells = [
             form.format(status.figures[key]) if key in status.figures else "–"
-            for key, _, form in _COLUMNS
+            for key, _, form in columns
         ]
         if judged:
             tally = errors.of(robot)

@@ -101,7 +101,7 @@ def told(robots: int, *, truth: bool) -> Watch:
 
 def printed(watch: Watch, width: int) -> list[str]:
     out = StringIO()
-    Console(file=out, width=width).print(live._view("thesis, seed 1", watch))
+    Console(file=out, width=width).print(live._view("thesis, seed 1", watch, width))
     return out.getvalue().splitlines()
 
 
@@ -116,6 +116,13 @@ def test_the_table_fits_eighty_columns_with_the_largest_figures() -> None:
     ]  # fmt: skip
     expected = "joint cost per dof 1.07, landmark NEES per dof 0.75, 100% within 95 %"
     assert expected in lines
+
+
+def test_a_narrow_terminal_has_fewer_columns_and_cuts_no_number() -> None:
+    lines = printed(told(2, truth=True), 60)
+    assert not any("…" in line for line in lines)
+    row = next(line for line in lines if line.strip().startswith("r2")).split()
+    assert row == ["r2", "12,345", "1,234", "12.34", "1.05", "2.00", "50%", "mapping"]
 
 
 def test_without_truth_there_are_the_monitor_and_nis_alone() -> None:
