@@ -21,7 +21,7 @@ def driven(
         count, answer = node.drive_on(block.part(at, block.size))
         out += answer
         at += count
-        if not answer and at < block.size:  # it did not stop to report: the next one leads to more
+        if at < block.size:  # the next one leads to more
             out += give(block.message(at))
             at += 1
     return out

@@ -246,12 +246,15 @@ class BoundedEstimator:
         if isinstance(measurement, m.Detections) and not self._associates:
             return Rejection.NO_ASSOCIATION
         scan = translate.scan_of(measurement)
-        near = self._judge.near(scan.ranges) & sensible(scan.own, scan.ranges, self._config.bounds)
-        rejected = self._time(measurement)
-        if rejected is None and len(near) and not near.any():
+        near = self._judge.near(scan.ranges)
+        if scan.own.size:
+            near &= sensible(scan.own, scan.ranges, self._config.bounds)
+        accepted, rejected = np.count_nonzero(near), self._time(measurement)
+        if rejected is None and len(near) and not accepted:
             rejected = Rejection.RANGE
         if rejected is None:
-            rejected = self.estimator.observe(measurement.stamp_ns, scan.only(near))
+            scan = scan if accepted == len(near) else scan.only(near)
+            rejected = self.estimator.observe(measurement.stamp_ns, scan)
         return rejected
 
     def sight(self, measurement: m.Sightings) -> Rejection | None:

@@ -231,3 +231,16 @@ def test_a_block_of_another_turn_is_left_to_the_messages():
     assert node.drive_on(following.part(0, 1))[0] == 1
     node.handle(DENSE[40], 0)  # one waits for its turn
     assert node.drive_on(following.part(1, 5)) == (0, [])
+
+
+def test_a_block_of_which_nothing_follows_is_taken_whole_and_reported_at_each_place():
+    still = [msgspec.structs.replace(DENSE[1], stamp_ns=20_000_000 * k, number=k, forward=0.0)
+             for k in range(1, 141)]  # fmt: skip
+    (block,) = in_blocks(still[1:], 10**9)
+    singly, at_once = RobotNode(config()), RobotNode(config())
+    for node in (singly, at_once):
+        for message in (DENSE[0], still[0]):
+            assert node.handle(message, 0) == []
+    expected = [each for message in still[1:] for each in singly.handle(message, 0)]
+    assert [each.message.measurements for each in expected] == [64, 128]
+    assert at_once.drive_on(block) == (139, expected)

@@ -2,7 +2,8 @@
 takes.
 """
 
-from bisect import insort
+from bisect import bisect_right, insort
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,10 +11,10 @@ from jaxtyping import Bool, Float, UInt32
 
 from team.config import MotionModel, Sensor
 from team.estimation import dense, geometry
-from team.estimation.geometry import adjoint, inverse
+from team.estimation.geometry import Pose, adjoint, inverse
 from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
-from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
+from team.estimation.hybrid_slam.reduction import KeyframeScan, all_between, reduced
 from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, scanned
 from team.estimation.mount import of_sensor
@@ -93,6 +94,7 @@ class Segmenter:
         self._forward = np.zeros(3)
         self._waiting: list[KeyframeScan] = []
         self._keyframe: list[KeyframeScan] = []
+        self._scan_poses: list[Pose] = []
         self._keyframe_start_ns = 0
         self._scan_motion = np.zeros(3)
         self._since_look: Increment | None = None
@@ -126,12 +128,14 @@ class Segmenter:
         if self.now_ns is not None and stamp_ns < self.now_ns:
             return Rejection.OLDER
         mask, r, b = scanned(self._sensor, ranges, bearings)
-        if len(ids) and not mask.any():
+        accepted = np.count_nonzero(mask)
+        if len(ids) and not accepted:
             return Rejection.SENSOR_LIMITS
-        if not mask.all():
-            ids, r, b = ids[mask], r[mask], b[mask]
-        noises = unclaimed(len(r)) if own is None else calibrated(own[mask], self._sensor)
-        scan = KeyframeScan(stamp_ns, ids, r, b, noises, np.zeros(3))
+        noises = unclaimed(len(r)) if own is None else own
+        if accepted < len(mask):
+            ids, r, b, noises = ids[mask], r[mask], b[mask], noises[mask]
+        noises = calibrated(noises, self._sensor)
+        scan = KeyframeScan(stamp_ns, ids, r, b, noises)
         insort(self._waiting, scan, key=lambda each: each.stamp_ns)
         return None
 
@@ -154,13 +158,17 @@ class Segmenter:
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             scan = self._waiting.pop(0)
             keyframes += self._nodes(scan.stamp_ns - 1, over)
-            at_ns = self._go_to(scan.stamp_ns, over)
+            at_ns = self._go_on_to(scan.stamp_ns, over)
+            if self._keyframe_ns and not scan.is_unnamed:
+                self._keep(scan)
+                continue
+            self._settle()
             motion = self._increment if self._since_look is None else self._since_look
-            scan = replace(scan, at_ns=at_ns, pose=self._scan_motion, motion=motion)
+            scan = replace(scan, at_ns=at_ns, motion=motion)
             if scan.is_unnamed:
                 self._since_look = Increment.identity()
             if self._keyframe_ns:
-                self._keyframe.append(scan)
+                self._keep(scan)
             elif scan.is_unnamed:
                 keyframes.append(replace(self._keyframe_at(at_ns, *NOTHING), looks=(scan,)))
             else:
@@ -193,21 +201,35 @@ class Segmenter:
 
     def drive_on(self, intervals: Intervals) -> None:
         """Take some of the `quiet` intervals, as `drive` takes each of them."""
-        while self._waiting and self._waiting[0].stamp_ns <= intervals.ends_ns[-1]:
-            covers = int(intervals.ends_ns.searchsorted(self._waiting[0].stamp_ns))
+        last_ns, covered = intervals.ends_ns[-1], 0
+        if self._waiting:
+            covered = bisect_right(self._waiting, last_ns, key=lambda scan: scan.stamp_ns)
+        scans = self._waiting[:covered]
+        if not any(scan.is_unnamed for scan in scans):
+            self._waiting = self._waiting[covered:]
+            self._go_over(intervals, scans)
+            return
+        covers = int(intervals.ends_ns.searchsorted(scans[0].stamp_ns))
+        if covers:
             self._go_over(intervals.part(0, covers))
-            self.drive(intervals.part(covers, covers + 1).last)
-            intervals = intervals.part(covers + 1, len(intervals.ends_ns))
-            if not len(intervals.ends_ns):
-                return
-        self._go_over(intervals)
+        self.drive(intervals.part(covers, covers + 1).last)
+        if covers + 1 < len(intervals.ends_ns):
+            self.drive_on(intervals.part(covers + 1, len(intervals.ends_ns)))
 
-    def _go_over(self, intervals: Intervals) -> None:
-        """Take intervals without a scan in them."""
-        if len(intervals.ends_ns):
-            self._last, self._unmeasured = intervals.last, None
-            self._run.add_all(intervals)
-            self.now_ns = self._last.end_ns
+    def _go_over(self, intervals: Intervals, scans: Sequence[KeyframeScan] = ()) -> None:
+        """Take intervals, and the scans in them."""
+        self._last, self._unmeasured = intervals.last, None
+        self._run.add_all(intervals, [scan.stamp_ns for scan in scans])
+        self._keyframe += scans
+        self.now_ns = self._last.end_ns
+
+    def _keep(self, scan: KeyframeScan) -> None:
+        """Keep a scan of the keyframe, here; its pose is known once the motion up to it is."""
+        self._keyframe.append(scan)
+        if self._run:
+            self._run.mark()
+        else:
+            self._scan_poses.append(self._scan_motion)
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
         """Close the window here: returns its last keyframe, if one is open, and the motion after
@@ -244,16 +266,16 @@ class Segmenter:
         keyframes = []
         grid = self._grid
         while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
-            self._go_to(next_ns, over)
+            self._go_on_to(next_ns, over)
+            self._settle()
             if grid.reach():
                 keyframes.append(replace(self._keyframe_at(next_ns, *NOTHING), is_node=True))
         return keyframes
 
-    def _go_to(self, stamp_ns: int, over: OdometryInterval) -> int:
+    def _go_on_to(self, stamp_ns: int, over: OdometryInterval) -> int:
         """Integrate up to a stamp; a stamp before the interval's start is taken as its start."""
         at_ns = max(stamp_ns, self._here_ns)
         self._integrate(at_ns - self._here_ns, over.end_ns - at_ns, over)
-        self._settle()
         self._here_ns = at_ns
         return at_ns
 
@@ -301,7 +323,8 @@ class Segmenter:
         if self._since_look is not None:
             self._since_look = self._run.behind(self._since_look)
         node = Increment.identity() if self._grid is None else self._grid.since_node
-        after = self._run.driven(self._increment, node, self._forward, self._scan_motion)
+        after, poses = self._run.driven(self._increment, node, self._forward, self._scan_motion)
+        self._scan_poses += list(poses)
         self._increment = Increment(after.motion, after.covariance)
         if self._motion.calibrated_speed is not None:
             self._forward = after.shift
@@ -334,14 +357,11 @@ class Segmenter:
         return keyframe
 
     def _close_keyframe(self, stamp_ns: int) -> Keyframe:
-        end = self._scan_motion
-        seen = reduced([scan for scan in self._keyframe if not scan.is_unnamed], end)
-        looks = tuple(
-            replace(scan, back=geometry.between(end, scan.pose))
-            for scan in self._keyframe
-            if scan.is_unnamed
-        )
-        self._keyframe = []
+        backs = all_between(self._scan_motion, np.array(self._scan_poses))
+        placed = list(zip(self._keyframe, backs, strict=True))
+        seen = reduced([each for each in placed if not each[0].is_unnamed])
+        looks = tuple(replace(scan, back=back) for scan, back in placed if scan.is_unnamed)
+        self._keyframe, self._scan_poses = [], []
         self._keyframe_start_ns = stamp_ns
         self._scan_motion = np.zeros(3)
         return replace(self._keyframe_at(stamp_ns, *seen), looks=looks)

@@ -2,9 +2,11 @@
 
 Odometry arrives tens of times between two uses of the resulting motion. Each interval is kept as it
 came; the motions since the last keyframe, since the last pose node and since the first scan of a
-keyframe are updated when they are needed.
+keyframe are updated when they are needed. Where a scan lies, an interval is split, and the place is
+marked: the same call returns the pose at each mark.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +32,9 @@ from team.estimation.odometry import Intervals, OdometryInterval
 Spread = Float[np.ndarray, "3 3"]
 Driven = tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Durations [ns], forward speeds [m/s] and yaw rates [rad/s] of consecutive intervals."""
+Marks = Int64[np.ndarray, " m"]
+"""Numbers of intervals before each of some places, ascending."""
+NO_MARKS = np.empty(0, np.int64)
 
 
 class Since(NamedTuple):
@@ -55,13 +60,20 @@ def gone_on(
     durations_ns: Int64[np.ndarray, " n"],
     forward: Float[np.ndarray, " n"],
     yaw_rates: Float[np.ndarray, " n"],
-) -> Since:
-    """All motions after further intervals, in order: equal to `Increment.then` and `compose`."""
+    marks: Marks,
+) -> tuple[Since, Float[np.ndarray, "m 3"]]:
+    """All motions after further intervals, in order: equal to `Increment.then` and `compose`; and
+    `of_scan` at each of the marks.
+    """
     motion, covariance, shift = since.motion.copy(), since.covariance.copy(), since.shift.copy()
     node_motion, node_covariance = since.node_motion.copy(), since.node_covariance.copy()
     of_scan = since.of_scan.copy()
     step, spread, half, Ad = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    at_marks, marked = np.empty((len(marks), 3)), 0
     for k in range(len(forward)):
+        while marked < len(marks) and marks[marked] == k:
+            at_marks[marked] = of_scan
+            marked += 1
         duration_s = durations_ns[k] * 1e-9
         course = course_of(model, duration_s, forward[k], yaw_rates[k])
         if model.turns_first:
@@ -76,7 +88,41 @@ def gone_on(
         ahead, left = scale_column(model, duration_s, forward[k], yaw_rates[k])
         shift[0], shift[1] = c * x + s * y + ahead, -s * x + c * y + left
         go(of_scan, step)
-    return Since(motion, covariance, shift, node_motion, node_covariance, of_scan)
+    at_marks[marked:] = of_scan
+    return Since(motion, covariance, shift, node_motion, node_covariance, of_scan), at_marks
+
+
+@compiled
+def split(
+    ends_ns: Int64[np.ndarray, " n"],
+    durations_ns: Int64[np.ndarray, " n"],
+    forward: Float[np.ndarray, " n"],
+    yaw_rates: Float[np.ndarray, " n"],
+    stamps_ns: Int64[np.ndarray, " m"],
+) -> tuple[Driven, Marks]:
+    """The intervals, each split where one of the ascending stamps lies in it, and their marks.
+
+    A stamp before its interval is taken as the interval's start, as one between two intervals is.
+    """
+    most = len(ends_ns) + len(stamps_ns)
+    durations, speeds, marks = (
+        np.empty(most, np.int64),
+        np.empty((2, most)),
+        np.empty_like(stamps_ns),
+    )
+    count, place = 0, 0
+    for k in range(len(ends_ns)):
+        here_ns = ends_ns[k] - durations_ns[k]
+        while here_ns < ends_ns[k] or (place < len(marks) and stamps_ns[place] <= ends_ns[k]):
+            is_marked = place < len(marks) and stamps_ns[place] <= ends_ns[k]
+            until_ns = max(stamps_ns[place], here_ns) if is_marked else ends_ns[k]
+            if until_ns > here_ns:
+                durations[count] = until_ns - here_ns
+                speeds[0, count], speeds[1, count] = forward[k], yaw_rates[k]
+                count, here_ns = count + 1, until_ns
+            if is_marked:
+                marks[place], place = count, place + 1
+    return (durations[:count], speeds[0, :count], speeds[1, :count]), marks
 
 
 @compiled
@@ -97,19 +143,31 @@ class OdometryRun:
         self._model = model_of(motion)
         self._stretches: list[Driven] = []
         self._parts: list[tuple[int, float, float]] = []
+        self._marks: list[int] = []
+        self._count = 0
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
-        return bool(self._stretches or self._parts)
+        """Whether there are any, or marks."""
+        return bool(self._count or self._marks)
 
     def add(self, over: OdometryInterval, duration_ns: int) -> None:
         """Adds the next part of an interval."""
         self._parts.append((duration_ns, over.forward, over.yaw_rate))
+        self._count += 1
 
-    def add_all(self, intervals: Intervals) -> None:
-        """Adds whole intervals."""
+    def add_all(self, intervals: Intervals, stamps_ns: Sequence[int] = ()) -> None:
+        """Adds whole intervals, with a mark at each of the ascending stamps in them."""
         self._note_parts()
-        self._stretches.append(intervals[1:])
+        stretch: Driven = intervals[1:]
+        if stamps_ns:
+            stretch, marks = split(*intervals, np.array(stamps_ns, np.int64))
+            self._marks += (self._count + marks).tolist()
+        self._stretches.append(stretch)
+        self._count += len(stretch[0])
+
+    def mark(self) -> None:
+        """Marks this place: `driven` returns the pose here."""
+        self._marks.append(self._count)
 
     def _note_parts(self) -> None:
         if self._parts:
@@ -123,7 +181,7 @@ class OdometryRun:
         none = np.zeros(3)
         still = none, np.zeros((3, 3))
         since = Since(motion.mean, motion.covariance, none, *still, none)
-        after = gone_on(since, self._model, *self._whole())
+        after, _ = gone_on(since, self._model, *self._whole(), NO_MARKS)
         return Increment(after.motion, after.covariance)
 
     def driven(
@@ -132,18 +190,24 @@ class OdometryRun:
         since_node: Increment,
         shift: Float[np.ndarray, "3"],
         of_scan: Pose,
-    ) -> Since:
-        """The motions up to now with all stored parts, which are removed."""
+    ) -> tuple[Since, Float[np.ndarray, "m 3"]]:
+        """The motions up to now with all stored parts, which are removed, and the poses since the
+        first scan at the marks.
+        """
         whole, self._stretches = self._whole(), []
+        marks, self._marks, self._count = np.array(self._marks, np.int64), [], 0
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
-        return gone_on(since, self._model, *whole)
+        return gone_on(since, self._model, *whole, marks)
 
     def _whole(self) -> Driven:
         self._note_parts()
-        if len(self._stretches) > 1:
-            durations, forward, yaw_rates = zip(*self._stretches, strict=True)
+        if len(self._stretches) != 1:
+            durations, forward, yaw_rates = zip(NO_STRETCH, *self._stretches, strict=True)
             self._stretches = [
                 (np.concatenate(durations), np.concatenate(forward), np.concatenate(yaw_rates))
             ]
         return self._stretches[0]
+
+
+NO_STRETCH: Driven = (np.empty(0, np.int64), np.empty(0), np.empty(0))

@@ -2,23 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, UInt32
+from jaxtyping import Float, Int64, UInt32
 
 from team.config import UNNAMED, Sensor
 from team.estimation import elementary, geometry
+from team.estimation.compiled import compiled
+from team.estimation.geometry import Pose
 from team.estimation.models import Increment, located
-from team.estimation.scans import SENSOR, Own, carried, mean_claim, together
+from team.estimation.scans import SENSOR, Own, carried, mean_claim, together, unclaimed
 
 
 @dataclass(frozen=True)
 class KeyframeScan:
     """One scan at at_ns (its stamp, or the start of the odometry that covers it).
 
-    pose: the robot's, since the keyframe's start. back: the same pose relative to the keyframe's
-    end; None: it is the keyframe itself. motion: since the scan or keyframe before.
+    back: the robot's pose relative to the keyframe's end; None: it is the keyframe itself, or that
+    end is still to come. motion: since the scan or keyframe before.
     """
 
     stamp_ns: int
@@ -26,12 +28,11 @@ class KeyframeScan:
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
     own: Own
-    pose: Float[np.ndarray, "3"]
     at_ns: int = 0
     motion: Increment | None = None
-    back: Float[np.ndarray, "3"] | None = None
+    back: Pose | None = None
 
-    @property
+    @cached_property
     def is_unnamed(self) -> bool:
         """Whether it has detections without identities; it has no others then."""
         return bool((self.ids >= UNNAMED).any())
@@ -41,30 +42,99 @@ Measured = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.nda
 """Ids, ranges [m], bearings [rad] and the noises that they claim."""
 
 
-def reduced(looks: Sequence[KeyframeScan], end: Float[np.ndarray, "3"]) -> Measured:
-    """Reduce scans to one measurement per landmark, by ascending id.
+def reduced(placed: Sequence[tuple[KeyframeScan, Pose]]) -> Measured:
+    """Reduce scans to one measurement per landmark, by ascending id; each scan with its pose
+    relative to the keyframe's end.
 
     It is the median of range and bearing, moved by the odometry to the keyframe's end; its claimed
     noise is the mean of theirs.
     """
-    points: dict[int, list[tuple[float, float]]] = {}
+    if not placed:
+        return np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
+    looks = [look for look, _ in placed]
+    ids, ranges, bearings = _medians(
+        np.concatenate([look.ids for look in looks]),
+        np.concatenate([look.ranges for look in looks]),
+        np.concatenate([look.bearings for look in looks]),
+        np.repeat(np.arange(len(looks)), [len(look.ids) for look in looks]),
+        np.array([back for _, back in placed]),
+    )
+    if not any(look.own.size for look in looks):
+        return ids, ranges, bearings, unclaimed(len(ids))
     claims: dict[int, list[Own]] = {}
-    for look in looks:
-        back = geometry.between(end, look.pose) if look.back is None else look.back
-        for k, landmark in enumerate(look.ids):
+    for look, back in placed:
+        for k in range(len(look.ids) if look.own.size else 0):
             r, b = float(look.ranges[k]), float(look.bearings[k])
-            x, y = located(back, r, b)
-            points.setdefault(int(landmark), []).append(
-                (elementary.hypot(x, y), elementary.atan2(y, x))
-            )
-            if look.own.size:
-                claim = carried(look.own[k], r, float(back[2]) + b, np.array([x, y]))
-                claims.setdefault(int(landmark), []).append(claim)
-    ids = sorted(points)
-    ranges = [median([r for r, _ in points[i]]) for i in ids]
-    bearings = [_median_direction([b for _, b in points[i]]) for i in ids]
-    own = together([(1, mean_claim(claims.get(i, []))) for i in ids])
-    return np.array(ids, dtype=np.uint32), np.array(ranges), np.array(bearings), own
+            claim = carried(look.own[k], r, float(back[2]) + b, located(back, r, b))
+            claims.setdefault(int(look.ids[k]), []).append(claim)
+    own = together([(1, mean_claim(claims.get(i, []))) for i in ids.tolist()])
+    return ids, ranges, bearings, own
+
+
+@compiled
+def all_between(end: Pose, poses: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Each pose seen from the end: `geometry.between`."""
+    found = np.empty_like(poses)
+    for k in range(len(poses)):
+        found[k] = geometry.between(end, poses[k])
+    return found
+
+
+@compiled
+def _medians(
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    scans: Int64[np.ndarray, " n"],
+    backs: Float[np.ndarray, "m 3"],
+) -> tuple[UInt32[np.ndarray, " u"], Float[np.ndarray, " u"], Float[np.ndarray, " u"]]:
+    """Ascending ids, and the median range and direction of each as seen from the keyframe's end;
+    scans: the row of each measurement's pose in `backs`. The median of directions is relative to
+    the first of them.
+    """
+    n = len(ids)
+    distances, directions = np.empty(n), np.empty(n)
+    for k in range(n):
+        point = located(backs[scans[k]], ranges[k], bearings[k])
+        distances[k] = elementary.hypot(point[0], point[1])
+        directions[k] = elementary.atan2(point[1], point[0])
+    found, medians = np.empty(n, np.uint32), np.empty((2, n))
+    own, offsets = np.empty(n), np.empty(n)
+    count, last = 0, -1
+    while True:
+        following = 1 << 32
+        for k in range(n):
+            if last < ids[k] < following:
+                following = np.int64(ids[k])
+        if following == 1 << 32:
+            return found[:count].copy(), medians[0, :count].copy(), medians[1, :count].copy()
+        size, first = 0, 0.0
+        for k in range(n):
+            if ids[k] == following:
+                first = directions[k] if size == 0 else first
+                _insert(own, size, distances[k])
+                _insert(offsets, size, geometry.wrapped(directions[k] - first))
+                size += 1
+        found[count] = following
+        medians[0, count] = _median(own, size)
+        medians[1, count] = geometry.wrapped(first + _median(offsets, size))
+        count, last = count + 1, following
+
+
+@compiled
+def _insert(row: Float[np.ndarray, " n"], size: int, value: float) -> None:
+    """Puts a number into its place among the first `size`, which ascend."""
+    while size > 0 and row[size - 1] > value:
+        row[size] = row[size - 1]
+        size -= 1
+    row[size] = value
+
+
+@compiled
+def _median(row: Float[np.ndarray, " n"], size: int) -> float:
+    """The median of the first `size` numbers, which ascend."""
+    middle = size // 2
+    return row[middle] if size % 2 else (row[middle - 1] + row[middle]) / 2.0
 
 
 def variances(
@@ -83,9 +153,3 @@ def variances(
         return of_sensor
     claims = own[:, 3] != SENSOR
     return np.where(claims[:, None], own[:, :3], of_sensor)
-
-
-def _median_direction(angles: list[float]) -> float:
-    """The median of directions, relative to the first of them."""
-    offsets = [geometry.wrapped(angle - angles[0]) for angle in angles]
-    return geometry.wrapped(angles[0] + median(offsets))

@@ -189,7 +189,7 @@ def _measured(looks: Sequence[KeyframeScan]) -> Measured:
     if len(looks) == 1 and looks[0].back is None:
         (look,) = looks
         return look.ids, look.ranges, look.bearings, look.own
-    return reduced(looks, np.zeros(3))
+    return reduced([(look, np.zeros(3) if look.back is None else look.back) for look in looks])
 
 
 def _with(keyframe: Keyframe, seen: Measured) -> Keyframe:

@@ -42,9 +42,7 @@ def drive(seed: int) -> tuple[list[Keyframe], np.ndarray]:
         bearings = np.arctan2(seen[:, 1], seen[:, 0])
         bearings += SENSOR.bearing_sigma * random.standard_normal(n)
         ids, at = (UNNAMED + np.arange(n)).astype(np.uint32), k * SECOND
-        look = KeyframeScan(
-            at, ids, ranges, bearings, unclaimed(n), np.zeros(3), at_ns=at, motion=motion
-        )
+        look = KeyframeScan(at, ids, ranges, bearings, unclaimed(n), at_ns=at, motion=motion)
         none = np.empty(0)
         keyframes.append(
             Keyframe(

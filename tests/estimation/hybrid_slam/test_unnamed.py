@@ -18,9 +18,7 @@ def keyframe(k: int, ranges: list[float]) -> Keyframe:
     ids = (UNNAMED + np.arange(len(ranges))).astype(np.uint32)
     own, still = unclaimed(len(ranges)), Increment.identity()
     at = k * SECOND
-    look = KeyframeScan(
-        at, ids, np.array(ranges), bearings, own, np.zeros(3), at_ns=at, motion=FORWARD
-    )
+    look = KeyframeScan(at, ids, np.array(ranges), bearings, own, at_ns=at, motion=FORWARD)
     looks, rest = ((look,), still) if ranges else ((), None)
     none = np.empty(0)
     return Keyframe(
