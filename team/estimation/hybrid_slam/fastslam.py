@@ -226,8 +226,11 @@ def _filter_step(
     poses, weights = np.empty_like(start), log_weights.copy()
     placed = np.empty((len(start), len(after), 2))
     spread = np.empty((len(start), len(after), 3))
-    placed[:, : len(known)] = means
-    spread[:, : len(known)] = covariances
+    for i in range(len(start)):
+        for k in range(len(known)):
+            placed[i, k, 0], placed[i, k, 1] = means[i, k, 0], means[i, k, 1]
+            for j in range(3):
+                spread[i, k, j] = covariances[i, k, j]
     rows = measured(ranges, bearings, sensor, own)
     step(
         start, motion, L, normals, len(known), slots, first, rows, improved, poses, weights,

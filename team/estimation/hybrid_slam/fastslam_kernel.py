@@ -45,6 +45,7 @@ from team.estimation.hybrid_slam.blocks import (
     store_landmark,
 )
 from team.estimation.hybrid_slam.landmark_kernel import Triple
+from team.estimation.placing import put
 
 Ids = UInt32[np.ndarray, " L"]
 Square = tuple[float, float, float, float, float, float, float, float, float]
@@ -66,7 +67,7 @@ def slots_of(
     new.
     """
     ids = np.empty(len(known) + len(observed), np.uint32)
-    ids[: len(known)] = known
+    put(ids, 0, known)
     count = len(known)
     slots = np.empty(len(observed), np.int64)
     first = np.zeros(len(observed), np.bool_)

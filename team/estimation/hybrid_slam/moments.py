@@ -7,6 +7,7 @@ from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import factor_or_fault
 from team.estimation.geometry import wrapped
+from team.estimation.placing import put_block
 
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
@@ -68,9 +69,8 @@ def moments(
     count, p = poses.shape
     n = p + 2 * means.shape[1]
     deviations = np.empty((count, n))
-    deviations[:, :p] = poses
-    deviations[:, p::2] = means[:, :, 0]
-    deviations[:, p + 1 :: 2] = means[:, :, 1]
+    put_block(deviations, 0, 0, poses)
+    put_block(deviations, 0, p, np.ascontiguousarray(means).reshape(count, n - p))
     mean = np.zeros(n)
     for i in range(count):
         for j in range(n):

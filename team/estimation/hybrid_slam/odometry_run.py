@@ -72,7 +72,7 @@ def gone_on(
     at_marks, marked = np.empty((len(marks), 3)), 0
     for k in range(len(forward)):
         while marked < len(marks) and marks[marked] == k:
-            at_marks[marked] = of_scan
+            _put(at_marks, marked, of_scan)
             marked += 1
         duration_s = durations_ns[k] * 1e-9
         course = course_of(model, duration_s, forward[k], yaw_rates[k])
@@ -88,8 +88,16 @@ def gone_on(
         ahead, left = scale_column(model, duration_s, forward[k], yaw_rates[k])
         shift[0], shift[1] = c * x + s * y + ahead, -s * x + c * y + left
         go(of_scan, step)
-    at_marks[marked:] = of_scan
+    for k in range(marked, len(marks)):
+        _put(at_marks, k, of_scan)
     return Since(motion, covariance, shift, node_motion, node_covariance, of_scan), at_marks
+
+
+@compiled
+def _put(poses: Float[np.ndarray, "m 3"], k: int, pose: Pose) -> None:
+    """`poses[k] = pose`, whose check of shapes takes a second to compile."""
+    for i in range(3):
+        poses[k, i] = pose[i]
 
 
 @compiled

@@ -76,7 +76,8 @@ def all_between(end: Pose, poses: Float[np.ndarray, "m 3"]) -> Float[np.ndarray,
     """Each pose seen from the end: `geometry.between`."""
     found = np.empty_like(poses)
     for k in range(len(poses)):
-        found[k] = geometry.between(end, poses[k])
+        pose = geometry.between(end, poses[k])
+        found[k, 0], found[k, 1], found[k, 2] = pose[0], pose[1], pose[2]
     return found
 
 

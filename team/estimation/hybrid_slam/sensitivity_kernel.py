@@ -14,6 +14,7 @@ from team.estimation.geometry import adjoint, between
 from team.estimation.hybrid_slam.arrow_kernel import solve_arrow
 from team.estimation.hybrid_slam.moments import mean_path
 from team.estimation.models import NEAREST_M
+from team.estimation.placing import put_block
 
 BIASES: tuple[Bias, ...] = get_args(Bias)
 """The biases in the order of the columns."""
@@ -140,7 +141,7 @@ def _add_motions(
     for k in range(len(path)):
         before = np.zeros(3) if k == 0 else path[k - 1]
         J = np.zeros((3, 6))
-        J[:, :3] = -adjoint(between(path[k], before))
+        put_block(J, 0, 0, -adjoint(between(path[k], before)))
         for i in range(3):
             J[i, 3 + i] = 1.0
         for i in range(6):

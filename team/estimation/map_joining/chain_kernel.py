@@ -28,6 +28,7 @@ from team.estimation.map_joining.least_squares import (
     SHARES,
 )
 from team.estimation.map_joining.submap_factor import submap_normal, submap_residual
+from team.estimation.placing import put
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -155,7 +156,7 @@ def _factors(chain: Chain, slots: Indices) -> tuple[SubmapFactors, int]:
         if fault and fault_of < 0:
             fault_of = k
         elif fault_of < 0:
-            information[first : first + n * n] = inverse_from_factor(L).ravel()
+            put(information, first, inverse_from_factor(L).ravel())
     member_start[maps] = 2 * maps + len(slots)
     none, no_start = np.zeros(0, np.int64), np.zeros(maps + 1, np.int64)
     factors = SubmapFactors(
@@ -184,13 +185,13 @@ def _guess(chain: Chain, slots: Indices, landmarks: int) -> Values:
     for k in range(maps):
         mean = chain.mean[chain.mean_start[k] : chain.mean_start[k + 1]]
         start = state[3 * k : 3 * k + 3].copy()
-        state[3 * k + 3 : 3 * k + 6] = compose(start, mean[:3])
+        put(state, 3 * k + 3, compose(start, mean[:3]))
         for i in range(chain.id_start[k], chain.id_start[k + 1]):
             if not is_placed[slots[i]]:
                 is_placed[slots[i]] = True
                 row = len(mean) - 2 * (chain.id_start[k + 1] - i)
                 at = 3 * (maps + 1) + 2 * slots[i]
-                state[at : at + 2] = transformed(start, mean[row : row + 2])
+                put(state, at, transformed(start, mean[row : row + 2]))
     return state
 
 

@@ -22,6 +22,7 @@ from jaxtyping import Float, Int64
 from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.geometry import wrapped
+from team.estimation.placing import put, put_block
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -156,8 +157,8 @@ def biased_normal(
     unbiased, slope, chi2 = submap_normal(state, members, shifted, information)
     n = len(mean)
     hessian, gradient = np.zeros((n + 3 + biases, n + 3 + biases)), np.zeros(n + 3 + biases)
-    hessian[: n + 3, : n + 3] = unbiased
-    gradient[: n + 3] = slope
+    put_block(hessian, 0, 0, unbiased)
+    put(gradient, 0, slope)
     s, c = elementary.sin_and_cos(state[at[0] + 2])
     poses = poses_of(len(members) - 1, n)
     turned = np.empty((biases, n))

@@ -12,6 +12,7 @@ from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import solve_stack
 from team.estimation.geometry import wrapped
+from team.estimation.placing import put_block
 
 
 class Constraints(NamedTuple):
@@ -306,7 +307,8 @@ def tied_pose(
     before, state = np.concatenate((mean[:3], end)), np.empty(6)
     _step(before, gain, tie.multiplier, state)
     joint, row = np.zeros((6, 6)), np.empty(len(tie.multiplier))
-    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], end_covariance
+    put_block(joint, 0, 0, covariance[:3, :3])
+    put_block(joint, 3, 3, end_covariance)
     for a in range(6):
         _multiply(tie.inverse, gain[a], row)
         for b in range(6):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Int64, UInt64
 
 from team.estimation.compiled import compiled
+from team.estimation.placing import put
 
 Indices = Int64[np.ndarray, " _"]
 Bits = UInt64[np.ndarray, "_ _"]
@@ -121,7 +122,7 @@ def _eliminated(
         begin = start[step]
         if begin + n > len(structure):
             grown = np.empty(2 * len(structure) + n, dtype=np.int64)
-            grown[:begin] = structure[:begin]
+            put(grown, 0, structure[:begin])
             structure = grown
         end = begin + _neighbours(adjacent, v, structure[begin:])
         start[step + 1] = end
@@ -192,6 +193,6 @@ def _postordered(
         for k in range(start[old], start[old + 1]):
             new_structure[end] = new_of_old[step_of[structure[k]]]
             end += 1
-        new_structure[begin:end] = np.sort(new_structure[begin:end])
+        put(new_structure, begin, np.sort(new_structure[begin:end]))
         new_start[new + 1] = end
     return new_order, new_parent, new_start, new_structure

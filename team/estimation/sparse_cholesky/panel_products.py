@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import matrix_product
+from team.estimation.placing import put_block
 
 Values = Float[np.ndarray, " _"]
 ROWS = 256
@@ -97,11 +98,11 @@ def inverse_by_blocks(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w w
                 for p in range(k, i):
                     total += panel[p, i] * own[k - begin, p - begin]
                 own[k - begin, i - begin] = -total / panel[i, i]
-        inverse[begin:end, begin:end] = own
+        put_block(inverse, begin, begin, own)
         if begin > 0:
             before = np.ascontiguousarray(inverse[:begin, :begin])
             coupled = matrix_product(before, np.ascontiguousarray(panel[:begin, begin:end]))
-            inverse[:begin, begin:end] = -matrix_product(coupled, own)
+            put_block(inverse, 0, begin, -matrix_product(coupled, own))
     return inverse
 
 
@@ -146,4 +147,7 @@ def solve_forward(panel: Float[np.ndarray, "w m"], right: Float[np.ndarray, "w k
                     right[i, c] -= factor * right[k, c]
         if end < width:
             later = np.ascontiguousarray(panel[begin:end, end:width])
-            right[end:] -= matrix_product(np.ascontiguousarray(later.T), right[begin:end])
+            product = matrix_product(np.ascontiguousarray(later.T), right[begin:end])
+            for i in range(end, width):
+                for c in range(many):
+                    right[i, c] -= product[i - end, c]

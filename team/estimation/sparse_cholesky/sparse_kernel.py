@@ -10,6 +10,7 @@ from jaxtyping import Float, Int64
 
 from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import matrix_product
+from team.estimation.placing import put
 from team.estimation.sparse_cholesky import panel_products as products
 from team.estimation.sparse_cholesky.sparse_layout import Structure
 
@@ -182,7 +183,7 @@ def _over_own_triangle(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w 
                 total += panel[p, i] * y[k, p]
             y[k, i] = -total / panel[i, i]
     for k in range(width - 1, -1, -1):
-        y[k, width:] = panel[k, width:]
+        put(y[k], width, panel[k, width:])
         for later in range(k + 1, width):
             factor = panel[k, later]
             for i in range(width, m):
@@ -280,7 +281,10 @@ def inverse_among(
             for i in range(width, m):
                 for c in range(begin, end):
                     solution[rows[i], c] -= reached[i - width, c - begin]
-        result[begin:end, begin:end] += matrix_product(np.ascontiguousarray(own.T), own)
+        product = matrix_product(np.ascontiguousarray(own.T), own)
+        for i in range(begin, end):
+            for c in range(begin, end):
+                result[i, c] += product[i - begin, c - begin]
     return result
 
 

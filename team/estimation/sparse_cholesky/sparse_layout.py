@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from team.estimation.compiled import compiled
+from team.estimation.placing import put
 
 Indices = Int64[np.ndarray, " _"]
 Structure: TypeAlias = tuple[Indices, Indices, Indices, Indices, Indices]
@@ -87,10 +88,10 @@ def supernodes(
     for s in range(count):
         last = begins[s + 1] - 1
         at = row_start[s] + columns_of[s + 1] - columns_of[s]
-        row[row_start[s] : at] = np.arange(columns_of[s], columns_of[s + 1])
+        put(row, row_start[s], np.arange(columns_of[s], columns_of[s + 1]))
         for later in structure[start[last] : start[last + 1]]:
             size = sizes[order[later]]
-            row[at : at + size] = np.arange(first[later], first[later] + size)
+            put(row, at, np.arange(first[later], first[later] + size))
             at += size
     return permutation, (columns_of, row_start, row, panel_start, supernode_of)
 
