@@ -1,9 +1,11 @@
 """A kernel's cached machine code is that of its sources, near and far."""
 
+import ast
 import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -19,6 +21,7 @@ from team.estimation.compiled import (
     program_of,
 )
 from tests import kernels
+from tests.support import ROOT
 
 INNER = """
 from team.estimation.compiled import compiled
@@ -73,6 +76,7 @@ def computed(folder: Path, processes: int = 1) -> list[tuple[float, int]]:
 
 ALLOCATING = """
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 import numpy as np
 from team.estimation.compiled import compiled
@@ -372,3 +376,32 @@ def test_code_that_can_not_be_read_counts_as_not_there(
     code.write_bytes(whole)
     del module.Record
     assert files.load("form") is None
+
+
+def assigned_slices(path: Path) -> Iterator[str]:
+    """Assignments to slices in a module's kernels, other than of one number as it stands."""
+    for kernel in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if not isinstance(kernel, ast.FunctionDef):
+            continue
+        if not {"compiled", "inlined"} & {ast.unparse(each) for each in kernel.decorator_list}:
+            continue
+        for step in ast.walk(kernel):
+            if not isinstance(step, ast.Assign | ast.AugAssign):
+                continue
+            targets = step.targets if isinstance(step, ast.Assign) else [step.target]
+            values = [step.value]
+            if isinstance(targets[0], ast.Tuple) and isinstance(step.value, ast.Tuple):
+                targets, values = targets[0].elts, step.value.elts
+            for target, value in zip(targets, values, strict=False):
+                parts = ast.walk(target.slice) if isinstance(target, ast.Subscript) else ()
+                if any(isinstance(p, ast.Slice) for p in parts) and not isinstance(
+                    value, ast.Constant
+                ):
+                    yield f"{path.relative_to(ROOT)}:{step.lineno}: {ast.unparse(step)}"
+
+
+def test_no_kernel_of_the_product_assigns_arrays_to_slices() -> None:
+    """It took seconds to compile in each process, for the words of an error: `placing`."""
+    modules = (ROOT / "team" / "estimation").rglob("*.py")
+    product = [path for path in modules if "baselines" not in path.parts]
+    assert [each for path in product for each in assigned_slices(path)] == []

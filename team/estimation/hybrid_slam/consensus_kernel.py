@@ -23,6 +23,7 @@ from team.estimation.geometry import (
 )
 from team.estimation.hybrid_slam.landmark_kernel import innovation_of
 from team.estimation.models import NEAREST_M, landmark_jacobian, pose_jacobian, predicted
+from team.estimation.placing import put_block
 
 Sensor3 = tuple[float, float, float]
 """(σ_range² [m²], σ_range_per_m², σ_bearing² [rad²])."""
@@ -184,7 +185,7 @@ def normal_equations(
     H, g = np.zeros((size, size)), np.zeros(size)
     J, at = np.zeros((3, 6)), np.empty(6, np.int64)
     for k in range(1, len(path)):
-        J[:, :3] = -adjoint(between(path[k], path[k - 1]))
+        put_block(J, 0, 0, -adjoint(between(path[k], path[k - 1])))
         for i in range(3):
             J[i, 3 + i] = 1.0
             at[i], at[3 + i] = 3 * (k - 1) + i, 3 * k + i
@@ -240,8 +241,8 @@ def _row(
     """∂h/∂(pose, landmark), its columns' place in the state, z − h and R (rr, rb, bb)."""
     r, b = predicted(path[keyframe], landmarks[slot])
     J, at = np.empty((2, 5)), np.empty(5, np.int64)
-    J[:, :3] = pose_jacobian(r, b)
-    J[:, 3:] = landmark_jacobian(r, path[keyframe, 2] + b)
+    put_block(J, 0, 0, pose_jacobian(r, b))
+    put_block(J, 0, 3, landmark_jacobian(r, path[keyframe, 2] + b))
     for i in range(3):
         at[i] = 3 * keyframe + i
     at[3] = 3 * len(path) + 2 * slot

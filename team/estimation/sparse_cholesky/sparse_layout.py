@@ -83,7 +83,8 @@ def supernodes(
         height = width + below[begins[s + 1] - 1]
         row_start[s + 1] = row_start[s] + height
         panel_start[s + 1] = panel_start[s] + width * height
-        supernode_of[columns_of[s] : columns_of[s + 1]] = s
+        for column in range(columns_of[s], columns_of[s + 1]):
+            supernode_of[column] = s
     row = np.empty(row_start[count], dtype=np.int64)
     for s in range(count):
         last = begins[s + 1] - 1
