@@ -101,13 +101,13 @@ def _medians(
         directions[k] = elementary.atan2(point[1], point[0])
     found, medians = np.empty(n, np.uint32), np.empty((2, n))
     own, offsets = np.empty(n), np.empty(n)
-    count, last = 0, -1
+    count, last, beyond = 0, np.int64(-1), np.int64(1 << 32)
     while True:
-        following = 1 << 32
+        following = beyond
         for k in range(n):
             if last < ids[k] < following:
                 following = np.int64(ids[k])
-        if following == 1 << 32:
+        if following == beyond:
             return found[:count].copy(), medians[0, :count].copy(), medians[1, :count].copy()
         size, first = 0, 0.0
         for k in range(n):
@@ -135,7 +135,8 @@ def _insert(row: Float[np.ndarray, " n"], size: int, value: float) -> None:
 def _median(row: Float[np.ndarray, " n"], size: int) -> float:
     """The median of the first `size` numbers, which ascend."""
     middle = size // 2
-    return row[middle] if size % 2 else (row[middle - 1] + row[middle]) / 2.0
+    found: float = row[middle] if size % 2 else (row[middle - 1] + row[middle]) / 2.0
+    return found
 
 
 def variances(
