@@ -61,7 +61,7 @@ FIGURES = (
     ("duplicates", "duplicates", "{:.1f}"),
     ("merges_wrong", "wrong merges", "{:.2f}"),
     ("rmse", "RMSE [m]", "{:.3f}"),
-    ("ratio", "÷ with names", "{:.2f}"),
+    ("ratio", "RMSE ÷ with names", "{:.2f}"),
     ("nees", "shape NEES / 2", "{:.2f}"),
     ("gospa", "GOSPA [m]", "{:.2f}"),
 )
@@ -155,7 +155,8 @@ def association_run(
         "rmse": found["landmark_rmse_aligned_m"],
         "nees": None if shape is None else 0.5 * shape,
         "gospa": None if found["gospa"] is None else found["gospa"]["distance_m"],
-    } | {name: scores.get(name) for name in ("f1", "wrong_percent", "duplicates", "merges_wrong")}
+        "merges_wrong": None if alone else scores.get("merges_wrong"),
+    } | {name: scores.get(name) for name in ("f1", "wrong_percent", "duplicates")}
 
 
 def outcome(options: Options, results: Results) -> Outcome:
@@ -183,7 +184,8 @@ def outcome(options: Options, results: Results) -> Outcome:
                 (axis, *(heading for _, heading, _ in FIGURES)),
                 tuple(rows),
                 "ours and with names: two robots, one map; the others one robot. Wrong: detections "
-                "in a landmark of another label; duplicates: landmarks beyond the first of a label",
+                "in a landmark of another label; duplicates: landmarks beyond the first of a "
+                "label. Of shape NEES / 2 1 is right",
             )
         )
     return Outcome(
@@ -211,8 +213,7 @@ def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) 
     def draw(path: Path) -> None:
         drawn(axis, of_axis).savefig(path, dpi=120)
 
-    file = "association-" + axis.replace(" / ", "-")
-    return Picture(file, f"Association over {axis}.", draw)
+    return Picture(axis.replace(" / ", "-"), f"Association over {axis}.", draw)
 
 
 def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
@@ -232,11 +233,22 @@ def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> 
         axes.set_xlabel(axis)
         axes.set_title(heading, fontsize=10)
         if axis == "spacing / noise":
-            axes.set_xscale("log")
+            axes.set_xscale("log", base=2)
+            axes.set_xticks(AXES[axis])
+            axes.xaxis.set_major_formatter("{x:g}")
         if name in ("rmse", "nees"):
-            axes.set_yscale("log")
+            axes.set_yscale("log", subs=(2, 5))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:g}")
+        if name in ("duplicates", "merges_wrong"):
+            axes.set_ylim(0.0, max(1.0, axes.get_ylim()[1]))
         ruled(axes)
+    order = [system.name for system in SYSTEMS if system.name in curves]
     made.legend(
-        curves.values(), curves.keys(), fontsize=8, ncols=len(curves), loc="outside lower center"
+        [curves[name] for name in order],
+        order,
+        fontsize=8,
+        ncols=len(order),
+        loc="outside lower center",
     )
     return made

@@ -247,3 +247,16 @@ def test_a_system_has_one_colour_in_every_panel_of_the_pictures_of_association()
         colours = [line.get_color() for line in axes.get_lines() if len(line.get_xdata()) == 1]
         missing = told[association.NAMED.name] if axes.get_title() in ("F1", "duplicates") else None
         assert colours == [told[name] for name in systems if told[name] != missing]
+
+
+def test_the_pictures_of_association_name_the_values_that_were_run_and_count_from_zero() -> None:
+    axis = "spacing / noise"
+    means: dict[str, float | None] = {name: 0.0 for name, *_ in association.FIGURES}
+    means |= {"rmse": 1.0, "nees": 1.0}
+    values = association.AXES[axis]
+    made = association.drawn(axis, {"ours": {f"{value:g}": means for value in values}})
+    made.canvas.draw()
+    for axes in made.axes:
+        assert [each.get_text() for each in axes.get_xticklabels()] == ["4", "6", "10", "20", "40"]
+        if axes.get_title() in ("duplicates", "wrong merges"):
+            assert axes.get_ylim() == (0.0, 1.0)
