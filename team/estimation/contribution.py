@@ -1,7 +1,6 @@
 """The contents of the team's map: submaps with their place in the set, and initial poses."""
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
@@ -29,7 +28,7 @@ def moment(stamp_ns: int) -> str:
     seconds = 1e-9 * stamp_ns
     if seconds < UNIX_S:
         return f"{seconds:,.1f} s"
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return f"{str(np.datetime64(int(seconds), 's')).replace('T', ' ')} UTC"
 
 
 class Observation(NamedTuple):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team.estimation.consistency import chi2_interval, nees
-from team.estimation.contribution import InitialPoseFactor
+from team.estimation.contribution import InitialPoseFactor, moment
 from team.estimation.map_joining.alignment import SharedPoints, aligned, procrustes, refusal
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
@@ -241,3 +241,8 @@ def test_merges_and_their_words_are_the_same_for_every_order_of_arrival(random):
     assert one.main.state.tobytes() == other.main.state.tobytes()
     assert (one.joined, one.reasons) == (other.joined, other.reasons)
     assert one.joined
+
+
+def test_a_moment_is_seconds_or_the_time_of_day_where_team_time_is_unix_time() -> None:
+    assert moment(123_456_789_000) == "123.5 s"
+    assert moment(1_700_000_000 * 10**9) == "2023-11-14 22:13:20 UTC"
