@@ -54,11 +54,14 @@ class Checkpoints:
         """Number of submaps in the fold when suspects were last tested; 0 if they never were."""
         return self.taken[-1].tested if self.taken else 0
 
-    def push(self, tick: int, fold: Fold) -> None:
-        """Add the fold after one more tick; older ones are compacted, and thinned by their age."""
+    def push(self, tick: int, fold: Fold, *, is_raw: bool) -> None:
+        """Add the fold after one more tick; older ones are compacted, and thinned by their age.
+
+        is_raw: nothing was condensed for this tick.
+        """
         *before, last = self.taken or (None,)
         number = 1 if last is None else last.number + 1
-        new = Checkpoint(tick, fold, self.tested, number, self.is_raw and not fold.departed)
+        new = Checkpoint(tick, fold, self.tested, number, self.is_raw and is_raw)
         older = () if last is None else (*before, replace(last, fold=compacted(last.fold)))
         keep = thinned((*older, new))
         self.taken = (*(replace(each, ahead=None) for each in keep[:-NEAR]), *keep[-NEAR:])

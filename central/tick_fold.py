@@ -216,19 +216,20 @@ class TickFold:
         """
         before = self.checkpoints.tick
         try:
-            fold = self._with_tick(self.fold, tick)
+            fold, is_raw = self._with_tick(self.fold, tick)
         except CondensedError:
             self._raw_until = tick
             self.checkpoints = self.checkpoints.raw()
             return False
-        self.checkpoints.push(tick, fold)
+        self.checkpoints.push(tick, fold, is_raw=is_raw)
         is_tested = math.isinf(before) or before // self._period < tick // self._period
         if is_tested and fold.size >= GROWTH * self.checkpoints.tested:
             return not self._convict(fold, tick)
         return True
 
-    def _with_tick(self, fold: Fold, tick: int) -> Fold:
-        """The fold with all of a tick; members beyond the bounds are refused before the others.
+    def _with_tick(self, fold: Fold, tick: int) -> tuple[Fold, bool]:
+        """The fold with all of a tick, and whether nothing was condensed for it; members beyond the
+        bounds are refused before the others.
 
         A closure moves what is condensed too far for its linearisation: then nothing is condensed.
         Raises CondensedError where an island would have to be moved that is condensed, or comes to
@@ -242,11 +243,11 @@ class TickFold:
         is_named = not fold.landmarks.are_there
         if fold.departed and is_named and (stream := next(unnamed, None)) is not None:
             raise CondensedError(stream)
-        after = taken(fold, members, self.settings)
+        after, is_raw = taken(fold, members, self.settings), not fold.departed
         if fold.departed and after.landmarks.opened:
             fold = self._inputs.relinearised(fold, tick - 1, self._gone)
             after = after if fold.departed else taken(fold, members, self.settings)
-        return after
+        return after, is_raw
 
     def _condensed(self, fold: Fold, tick: int) -> Fold:
         """The fold that a tick is added to; relinearised where that is due."""
@@ -304,7 +305,7 @@ class TickFold:
         fold = self.fold
         for tick in self._open_ticks():
             try:
-                fold = self._with_tick(fold, tick)
+                fold, _ = self._with_tick(fold, tick)
             except CondensedError:
                 whole = self.without(())
                 whole.take_until(math.inf)

@@ -59,7 +59,10 @@ def computed(folder: Path, processes: int = 1) -> list[tuple[float, int]]:
         subprocess.Popen(
             [sys.executable, "-m", "kernels.outer"], cwd=folder, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": f"{folder}:{Path.cwd()}"},
+            env={
+                **os.environ, "PYTHONPATH": f"{folder}:{Path.cwd()}",
+                "NUMBA_CACHE_DIR": str(folder / "cached"),
+            },
         )
         for _ in range(processes)
     ]  # fmt: skip
@@ -202,7 +205,7 @@ def package(tmp_path: Path) -> Path:
 def test_a_kernel_is_compiled_once_and_anew_when_what_it_calls_has_changed(package: Path) -> None:
     both = computed(package.parent, processes=2)
     assert both == [(21.0, 0), (21.0, 1)], "who comes second waits for the first and takes its code"
-    kinds = {each.name.split(".")[1]: machine_code(each) for each in package.rglob("*.nbc")}
+    kinds = {each.name.split(".")[1]: machine_code(each) for each in package.parent.rglob("*.nbc")}
     assert sorted(kinds.items()) == [("inner", False), ("outer", True)]
     (package / "inner.py").write_text(INNER.format("3.0"))
     assert computed(package.parent) == [(31.0, 0)]

@@ -166,5 +166,5 @@ def test_a_run_that_did_not_end_has_no_limit() -> None:
 
 def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(BatchReferenceError, match=r"teamslam\[batch-reference\]"):
+    with pytest.raises(BatchReferenceError, match=r"pip install '?gtsam"):
         batch_map([])
