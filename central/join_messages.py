@@ -160,25 +160,19 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
     out = sorted({*known} - {*shown.ids, *shown.undecided})
     needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
     pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
+    named_out = [str(id_) for id_ in out if id_ < UNNAMED]
     return tuple(
-        f"left out, {why}: {count} of {len(known)} landmarks{_listed(names)}"
-        for why, count, names in (
-            (
-                f"{needed} submaps that agree needed",
-                len(out),
-                [str(id_) for id_ in out if id_ < UNNAMED],
-            ),
-            ("may be one with another landmark", len(pairs), pairs),
+        f"left out, {why}: {count} of {len(known)} landmarks{_listed(names, most)}"
+        for why, count, names, most in (
+            (f"{needed} submaps that agree needed", len(out), named_out, NAMED),
+            ("may be one with another landmark", len(pairs), pairs, FEW),
         )
         if count
     )
 
 
-def _listed(names: Sequence[str]) -> str:
-    """The first names in brackets; landmarks without a name have none, or are pairs, of which a few
-    will do.
-    """
-    most = FEW if names and " with " in names[0] else NAMED
+def _listed(names: Sequence[str], most: int) -> str:
+    """The first names in brackets; landmarks without a name have none."""
     return f" ({', '.join(names[:most])}{', …' * (len(names) > most)})" if names else ""
 
 

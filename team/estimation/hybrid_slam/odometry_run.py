@@ -28,6 +28,7 @@ from team.estimation.models import (
     turn_and_drive,
 )
 from team.estimation.odometry import Intervals, OdometryInterval
+from team.estimation.placing import put
 
 Spread = Float[np.ndarray, "3 3"]
 Driven = tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
@@ -72,7 +73,7 @@ def gone_on(
     at_marks, marked = np.empty((len(marks), 3)), 0
     for k in range(len(forward)):
         while marked < len(marks) and marks[marked] == k:
-            _put(at_marks, marked, of_scan)
+            put(at_marks[marked], 0, of_scan)
             marked += 1
         duration_s = durations_ns[k] * 1e-9
         course = course_of(model, duration_s, forward[k], yaw_rates[k])
@@ -89,15 +90,8 @@ def gone_on(
         shift[0], shift[1] = c * x + s * y + ahead, -s * x + c * y + left
         go(of_scan, step)
     for k in range(marked, len(marks)):
-        _put(at_marks, k, of_scan)
+        put(at_marks[k], 0, of_scan)
     return Since(motion, covariance, shift, node_motion, node_covariance, of_scan), at_marks
-
-
-@compiled
-def _put(poses: Float[np.ndarray, "m 3"], k: int, pose: Pose) -> None:
-    """`poses[k] = pose`, whose check of shapes takes a second to compile."""
-    for i in range(3):
-        poses[k, i] = pose[i]
 
 
 @compiled

@@ -99,6 +99,16 @@ def told(robots: int, *, truth: bool) -> Watch:
     return watch
 
 
+def impatient(monkeypatch: pytest.MonkeyPatch) -> tuple[live._Lines, StringIO]:
+    """Lines that come with every look, and where they go."""
+    for name in ("LINE_S", "SETTLED_S"):
+        monkeypatch.setattr(live, name, 0.0)
+    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
+    out = StringIO()
+    lines = live._Lines(Console(file=out, width=200))
+    return lines, out
+
+
 def printed(watch: Watch, width: int) -> list[str]:
     out = StringIO()
     Console(file=out, width=width).print(live._view("thesis, seed 1", watch, width))
@@ -211,11 +221,7 @@ def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one()
 def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ("LINE_S", "SETTLED_S"):
-        monkeypatch.setattr(live, name, 0.0)
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
-    out = StringIO()
-    lines = live._Lines(Console(file=out, width=200))
+    lines, out = impatient(monkeypatch)
     watch = told(3, truth=False)
     joined = "r3 (incarnation 1) joined r1 (incarnation 1) at 9.0 s: {} landmarks that both show"
 
@@ -248,11 +254,7 @@ def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
 def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ("LINE_S", "SETTLED_S"):
-        monkeypatch.setattr(live, name, 0.0)
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
-    out = StringIO()
-    lines = live._Lines(Console(file=out, width=200))
+    lines, out = impatient(monkeypatch)
     watch = told(2, truth=False)
     for k in range(6):
         slip = f"the odometry slipped by 0.1{k} m, -{k}° before {k}.00 s"
