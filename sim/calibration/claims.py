@@ -99,9 +99,11 @@ def _rows(data: Reference, sensor: Sensor) -> _Rows:
     seen = data.seen
     stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
     poses, known = sensor_poses(data, stamps)
+    ranges, bearings = corrected(sensor, seen.ranges, seen.bearings)
     taken = known & np.isin(seen.ids, np.array(sorted(data.landmarks), dtype=np.int64))
+    taken &= np.isfinite(ranges)  # a depth far from the optical axis has no distance
+    ranges, bearings = ranges[taken], bearings[taken]
     places = np.array([data.landmarks[i] for i in seen.ids[taken].tolist()]).reshape(-1, 2)
-    ranges, bearings = corrected(sensor, seen.ranges[taken], seen.bearings[taken])
     c, s = np.cos(poses[taken, 2]), np.sin(poses[taken, 2])
     dx, dy = (places - poses[taken, :2]).T
     true = np.column_stack([c * dx + s * dy, c * dy - s * dx])
@@ -143,7 +145,8 @@ def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
     if 3.0 * float(sigmas.max()) > CERTAIN_M:
         return (
             f"mount: the sensor's place on the base is not learnt (± {sigmas.max():.3f} m): in so "
-            "narrow a view it can not be distinguished from range_offset and bearing_offset",
+            "narrow a view, or with so much noise, it can not be told from range_offset and "
+            "bearing_offset",
         )
     if np.all(np.abs(found[:2]) <= DISTANT * sigmas):
         return ()

@@ -1,8 +1,14 @@
 """A calibration as a scenario in TOML that a user can read, with each figure's uncertainty."""
 
-from collections.abc import Sequence
+import os
+import tomllib
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import msgspec
+import tomli_w
 
 from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration
@@ -10,6 +16,8 @@ from sim.calibration.figures import Figure, nested
 from sim.scenarios.scenario import Scenario, builtin_names
 from sim.world.config import FolderWorld, LiveWorld
 from team.config import AssociationSettings, MotionModel, Sensor
+
+Fields = dict[str, Any]
 
 
 def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
@@ -19,23 +27,11 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
     world = scenario.world
     otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
     base = scenario.name if scenario.name in builtin_names() else otherwise
-    how = "ground truth" if calibration.by_truth else "the team's own joined map"
-    lines = [
-        f"# Learnt from {', '.join(sources)} by `teamslam calibrate`, against {how}.",
-        "# ± is one standard deviation, leaving out one robot (or stretch of time) after another.",
-        *(f"# {note}" for note in calibration.notes),
-        f'base = "{base}"',
-    ]
+    lines = [*_head(calibration, sources), f'base = "{base}"']
     if isinstance(world, LiveWorld):
         lines += [f'name = "{scenario.name}"', f'team = "{scenario.team}"']
         lines += ["", "[world]", 'kind = "live"', *(["admit = true"] if world.admit else [])]
-    parts = (
-        ("defaults.motion", calibration.motion, MotionModel),
-        ("defaults.sensor", calibration.sensor, Sensor),
-        ("defaults.front_end.association", calibration.detections, AssociationSettings),
-        ("central", calibration.central, CentralConfig),
-    )
-    for name, figures, declared in parts:
+    for name, figures, declared in _parts(calibration):
         if figures:
             lines += ["", f"[{name}]", *_table(figures, declared)]
     differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
@@ -45,6 +41,78 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
         own = [f"sensor = {_inline(fields)}"] if fields else []
         lines += ["", "[[robots]]", f'id = "{robot.id}"', *own]
     return "\n".join(lines) + "\n"
+
+
+def within(own: Path, calibration: Calibration, sources: Sequence[str], output: Path) -> str:
+    """The user's scenario `own` with the learnt figures in it, as the text of the file `output`.
+
+    What was learnt is every robot's, so no robot has another value of it except one learnt for that
+    robot. All other fields stay.
+    """
+    document = tomllib.loads(own.read_text("utf-8"))
+    world = document.get("world", {})
+    if world.get("path"):
+        world["path"] = os.path.relpath(own.parent / world["path"], output.parent)
+    robots: list[Fields] = document.get("robots", [])
+    comments = []
+    for name, figures, declared in _parts(calibration):
+        comments += [f"# {name}.{f.name}: {f.value:.5g} {_uncertainty(f)}" for f in figures]
+        first, *inner = name.split(".")
+        learnt = nested({}, [_rounded(figure) for figure in figures], declared)
+        if not learnt:
+            continue
+        below = document.setdefault(first, {})
+        for key in inner:
+            below = below.setdefault(key, {})
+        below |= learnt
+        if inner:
+            robots = [_without(robot, inner, learnt) for robot in robots]
+    for robot_id, figures in calibration.robots.items():
+        new: Fields = {"id": robot_id}
+        robot = next((each for each in robots if each.get("id") == robot_id), new)
+        of_robot = [_rounded(figure) for figure in figures]
+        robot["sensor"] = nested(robot.get("sensor", {}), of_robot, Sensor)
+        if robot is new:
+            robots.append(robot)
+    if robots:
+        document["robots"] = robots
+    return "\n".join([*_head(calibration, sources), *comments, "", tomli_w.dumps(document)])
+
+
+def _rounded(figure: Figure) -> Figure:
+    return replace(figure, value=float(f"{figure.value:.5g}"))
+
+
+def _without(table: Fields, path: Sequence[str], keys: Collection[str]) -> Fields:
+    """The table without these keys in its inner table at a path; that goes where it is empty."""
+    if not path:
+        return {key: value for key, value in table.items() if key not in keys}
+    if path[0] not in table:
+        return table
+    inner = _without(table[path[0]], path[1:], keys)
+    rest = {key: value for key, value in table.items() if key != path[0]}
+    return rest | ({path[0]: inner} if inner else {})
+
+
+def _head(calibration: Calibration, sources: Sequence[str]) -> list[str]:
+    how = "ground truth" if calibration.by_truth else "the team's own joined map"
+    return [
+        f"# Learnt from {', '.join(sources)} by `teamslam calibrate`, against {how}.",
+        "# ± is one standard deviation, leaving out one robot (or stretch of time) after another.",
+        *(f"# {note}" for note in calibration.notes),
+    ]
+
+
+def _parts(
+    calibration: Calibration,
+) -> tuple[tuple[str, Sequence[Figure], type[msgspec.Struct]], ...]:
+    """The figures by their place in a scenario."""
+    return (
+        ("defaults.motion", calibration.motion, MotionModel),
+        ("defaults.sensor", calibration.sensor, Sensor),
+        ("defaults.front_end.association", calibration.detections, AssociationSettings),
+        ("central", calibration.central, CentralConfig),
+    )
 
 
 def _inline(value: object) -> str:

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import msgspec
 
-from sim.datasets.kinds import UTIAS_MARKER, kind_of
+from sim.datasets.kinds import UTIAS_MARKER
 from sim.datasets.tables import opened as opened_set
 from sim.datasets.utias_log import present_robots
 from sim.recorded.streams import measurements_in
 from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import scenario_beside, streams_of
+from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from sim.world.streams import WorldStreams
 
 
@@ -25,10 +25,17 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
     return measurements_in(path)
 
 
+def own_scenario(path: Path) -> Path | None:
+    """The scenario that a data set brings with it as a file of its own; a log has none."""
+    own = Path(scenario_beside(path)) if path.suffix != ".mcap" else None
+    return own if own is not None and own.is_file() else None
+
+
 def _with_its_robots(path: Path) -> Scenario:
     """The data set's own scenario with the robots that have files in it, however many."""
-    if kind_of(path) != "utias":
-        return with_options(load(scenario_beside(path)), dataset=path)
+    own = scenario_beside(path)
+    if own != "utias":
+        return with_present_robots(with_options(load(own), dataset=path))[0]
     with opened_set(str(path), UTIAS_MARKER) as files:
         present = present_robots(files)
     scenario = with_options(load("utias"), robots=max(present, default=None), dataset=path)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.options import FAILED, WRONG_USE, fail
+from sim.cli.options import FAILED, WRONG_USE, fail, set_aside
 
 app = typer.Typer()
 
@@ -38,18 +38,23 @@ def calibrate(
 
     from sim.calibration.calibrate import calibrated
     from sim.calibration.figures import CalibrationError
-    from sim.calibration.scenario import scenario_toml
-    from sim.calibration.source import measurements_of
+    from sim.calibration.scenario import scenario_toml, within
+    from sim.calibration.source import measurements_of, own_scenario
     from sim.cli.importing import readable
     from sim.cli.options import scenario_of, warn_of_holes
+    from sim.scenarios.scenario import Scenario
+    from sim.world.streams import WorldStreams
     from team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
         fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
-    read = []
+    read: list[tuple[str, WorldStreams, Scenario]] = []
+    own = Path(scenario) if scenario is not None and Path(scenario).is_file() else None
     for path in source:
         typer.echo(f"reading {path}", err=True)
         with readable(path) as found_at:
+            if not read and scenario is None:
+                own = own_scenario(found_at)
             if found_at.suffix == ".mcap":
                 warn_of_holes(open_log(found_at))
             read.append((path.name, *measurements_of(found_at)))
@@ -77,5 +82,9 @@ def calibrate(
     if json_file is not None:
         json_file.write_text(json.dumps(asdict(found), indent=2) + "\n")
     if output is not None:
-        output.write_text(scenario_toml(found, start, [name for name, _, _ in read]), "utf-8")
+        names = [name for name, _, _ in read]
+        text = within(own, found, names, output) if own else scenario_toml(found, start, names)
+        if output.exists():
+            set_aside(output)
+        output.write_text(text, "utf-8")
         typer.echo(f"wrote {output}: `teamslam launch {output} --dataset …` uses it")

@@ -34,6 +34,7 @@ from sim.cli.options import (
     refuse_open_door,
     scenario_for,
     scenario_of,
+    set_aside,
 )
 from sim.cli.steps import Steps
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
@@ -172,7 +173,7 @@ def launch(
         insecure=insecure,
     )
     for earlier_set in plan.earlier_sets:
-        _set_aside(earlier_set)
+        set_aside(earlier_set)
     page = (
         shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
         if view
@@ -299,16 +300,7 @@ def _keep_earlier(log: Path) -> None:
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
-        _set_aside(log)
-
-
-def _set_aside(file: Path) -> None:
-    """Rename a file of an earlier run, with the first number that is free."""
-    number = 1
-    while (aside := file.with_name(f"{file.name}.{number}")).exists():
-        number += 1
-    file.rename(aside)
-    typer.echo(f"{file} was there already: it is now {aside}", err=True)
+        set_aside(log)
 
 
 KERNELS_TO_ESTIMATE = 5

@@ -187,6 +187,15 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
         typer.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
 
 
+def set_aside(file: Path) -> None:
+    """Rename a file that is to be written anew, with the first number that is free."""
+    number = 1
+    while (aside := file.with_name(f"{file.name}.{number}")).exists():
+        number += 1
+    file.rename(aside)
+    typer.echo(f"{file} was there already: it is now {aside}", err=True)
+
+
 def one_line(text: str) -> str:
     """A text of an untrusted file as one line without control characters for a terminal."""
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)

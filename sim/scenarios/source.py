@@ -56,12 +56,12 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
 def scenario_beside(path: str | Path) -> str:
     """The scenario that a data set brings with it, or the built-in one for its kind."""
     kind = kind_of(path)
-    if kind == "utias":
-        return "utias"
-    if kind == "unlabelled" and not (Path(path) / SCENARIO).is_file():
-        return "victoria" if is_car(path) else "dlr"
     own = Path(path) / SCENARIO
-    return str(own) if own.is_file() else "recorded"
+    if own.is_file():
+        return str(own)
+    if kind == "unlabelled":
+        return "victoria" if is_car(path) else "dlr"
+    return "utias" if kind == "utias" else "recorded"
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:

@@ -24,14 +24,14 @@ from sim.calibration.figures import (
 from sim.calibration.join import joined_team
 from sim.calibration.motion import UNITS as MOTION_UNITS
 from sim.calibration.motion import creep, fit_motion
-from sim.calibration.scenario import scenario_toml
+from sim.calibration.scenario import scenario_toml, within
 from sim.calibration.sensor import UNITS as SENSOR_UNITS
 from sim.calibration.sensor import fit_sensor
 from sim.cli.main import app
 from sim.datasets.utias_writer import write_utias
 from sim.recorded.streams import recorded_streams
 from sim.scenarios.scenario import Scenario, load, with_options
-from sim.world.config import SimulatedWorld
+from sim.world.config import SimulatedWorld, UtiasWorld
 from sim.world.streams import (
     ODOMETRY,
     Detections,
@@ -420,6 +420,52 @@ def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path:
             assert getattr(mine.sensor, name) == getattr(theirs.sensor, name)
         assert mine.sensor == written.robots[0].sensor, "nothing is known of one robot by itself"
         assert mine.motion.forward_scale == theirs.motion.forward_scale
+
+
+OWN = """
+name = "mine"
+exchange = "continuous"
+[world]
+kind = "utias"
+path = "set"
+[defaults.motion]
+kind = "turn-then-drive"
+[[robots]]
+id = "r1"
+[robots.sensor]
+range_scale = 1.2
+field_of_view = 4.0
+[[robots]]
+id = "r2"
+[robots.motion]
+forward_scale = 2.0
+[robots.front_end]
+window_s = 7.0
+"""
+
+
+def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path: File) -> None:
+    own, elsewhere = tmp_path / "set" / "own.toml", tmp_path / "learnt.toml"
+    own.parent.mkdir()
+    own.write_text(OWN.replace('"set"', '"."'), "utf-8")
+    of_sensor = (Figure("range_scale", 0.98765432, 0.001, ""), Figure("bearing_outliers", 0, 0, ""))
+    of_robots = {"r2": (Figure("range_offset", 0.1, 0.01, "m"),)}
+    found = Calibration(
+        (Figure("forward_scale", 1.1, 0.01, ""),), of_sensor, True, (), (), of_robots
+    )
+    elsewhere.write_text(within(own, found, ["set"], elsewhere), "utf-8")
+    before, learnt = load(own), load(elsewhere)
+    assert isinstance(before.world, UtiasWorld)
+    assert isinstance(learnt.world, UtiasWorld)
+    assert File(learnt.world.path).resolve() == File(before.world.path).resolve()
+    assert learnt.exchange == "continuous"
+    assert [robot.motion.kind for robot in learnt.robots] == ["turn-then-drive"] * 2
+    assert [robot.motion.forward_scale for robot in learnt.robots] == [1.1, 1.1]
+    assert [robot.sensor.range_scale for robot in learnt.robots] == [0.98765, 0.98765]
+    assert [robot.sensor.range_offset for robot in learnt.robots] == [0.0, 0.1]
+    assert learnt.robots[0].sensor.field_of_view == 4.0
+    assert learnt.robots[1].front_end.window_s == 7.0
+    assert "# defaults.sensor.bearing_outliers: 0 ± 0" in elsewhere.read_text("utf-8")
 
 
 @pytest.fixture(scope="module")

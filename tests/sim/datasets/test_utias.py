@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sim.calibration.source import measurements_of, own_scenario
 from sim.cli.main import app
 from sim.datasets import errata
 from sim.datasets.tables import DatasetError
@@ -18,7 +19,7 @@ from sim.datasets.utias_rows import start_pose
 from sim.datasets.utias_writer import landmark_shift, write_utias
 from sim.publisher.node import WorldNode
 from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
+from sim.scenarios.source import scenario_beside, streams_of
 from sim.world.config import UtiasWorld
 from sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
 from team.config import RobotConfig
@@ -95,6 +96,17 @@ def test_a_written_set_has_the_files_of_the_format(folder: Path) -> None:
     kinds = ("Odometry", "Measurement", "Groundtruth")
     robots = {f"Robot{i}_{kind}.dat" for i in (1, 2, 3) for kind in kinds}
     assert names == {"Barcodes.dat", "Landmark_Groundtruth.dat"} | robots
+
+
+def test_a_set_of_another_rig_brings_its_own_models(folder: Path) -> None:
+    assert scenario_beside(folder) == "utias"
+    own = folder / "scenario.toml"
+    own.write_text('base = "utias"\n[defaults.sensor]\nrange_is_depth = false\n', "utf-8")
+    assert scenario_beside(folder) == str(own)
+    assert own_scenario(folder) == own
+    streams, scenario = measurements_of(folder)
+    assert [robot.sensor.range_is_depth for robot in scenario.robots] == [False] * 3
+    assert [stream.robot for stream in streams.streams] == ["r1", "r2", "r3"]
 
 
 def test_more_robots_than_the_rig_had_can_be_written_and_read(tmp_path: Path) -> None:
