@@ -59,7 +59,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     judged = [of_case for of_case in figures.values() if "silent" in of_case]
     runs = sum(of_case["seeds"] for of_case in judged)
     table = Table(
-        f"few landmarks, one start known, {len(options.seeds)} seeds",
+        f"few landmarks, one start known, {options.seed_count}",
         ("world, landmarks", *(heading for _, heading, _ in SHOWN)),
         tuple((name, *cells_of(of_case, SHOWN)) for name, of_case in figures.items()),
         "warned: maps with a warning; wrong: in another minimum than the truth; silent: wrong, and "

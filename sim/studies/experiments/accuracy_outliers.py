@@ -7,7 +7,7 @@ many inliers. An outlier has a uniform range and bearing, or the identity of ano
 import msgspec
 
 from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table, seed_count
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
 from sim.world.config import OutlierKind, SimulatedWorld
@@ -70,7 +70,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         for name, of_kind in of_world.items()
     )
     table = Table(
-        f"30 % outliers, {len(options.seeds[:MOST_SEEDS])} seeds",
+        f"30 % outliers, {seed_count(len(options.seeds[:MOST_SEEDS]))}",
         ("world", *(heading for _, heading, _ in SHOWN)),
         rows,
         "not joined, withdrawn: runs in which a robot, all of them good, is not in the final map",

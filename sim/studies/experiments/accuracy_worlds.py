@@ -14,6 +14,7 @@ from sim.studies.experiments.experiment import (
     Outcome,
     Results,
     Table,
+    seed_count,
 )
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import (
@@ -154,7 +155,7 @@ def _table(world: World, figures: Mapping[str, Figures]) -> Table:
     rows = tuple((rule, *cells_of(of_rule, SHOWN)) for rule, of_rule in figures.items())
     ours = figures.get(named(*OURS), {})
     return Table(
-        f"{world.scenario}, {ours.get('seeds', 0)} seeds",
+        f"{world.scenario}, {seed_count(ours.get('seeds', 0))}",
         ("rule", *(heading for _, heading, _ in SHOWN)),
         rows,
     )

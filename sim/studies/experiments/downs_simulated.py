@@ -92,7 +92,7 @@ class SimulatedTable(NamedTuple):
         if not errors:
             return Outcome(title, {})
         table = Table(
-            f"{title}: his simulator, {len(options.seeds)} seeds [m]",
+            f"{title}: his simulator, {options.seed_count} [m]",
             ("landmarks, method", "runs", "median", "10 … 90 %", "mean", "sd", "the run"),
             tuple((name, *_cells(values)) for name, values in errors.items()),
             f"nothing is printed of it; the run: seed {options.seeds[0]}",

@@ -23,6 +23,11 @@ class Dataset:
     sha256: str
 
 
+def seed_count(count: int) -> str:
+    """A number of seeds with its noun: `1 seed`, `3 seeds`."""
+    return f"{count} seed{'' if count == 1 else 's'}"
+
+
 @dataclass(frozen=True)
 class Options:
     """The options of the command line: the seeds, small or full, the data sets."""
@@ -30,6 +35,11 @@ class Options:
     seeds: tuple[int, ...]
     quick: bool = False
     datasets: tuple[Dataset, ...] = ()
+
+    @property
+    def seed_count(self) -> str:
+        """The number of seeds with its noun."""
+        return seed_count(len(self.seeds))
 
 
 @dataclass(frozen=True)

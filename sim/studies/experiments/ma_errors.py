@@ -70,7 +70,7 @@ class ErrorFigure(NamedTuple):
             }
             if found:
                 caption = (
-                    f"{self.title}: {dataset.name}. Above: medians over {len(options.seeds)} seeds "
+                    f"{self.title}: {dataset.name}. Above: medians over {options.seed_count} "
                     "and the band of four fifths of them. Below: the run of seed "
                     f"{options.seeds[0]} within its own 3σ bound. Where a robot sees no landmark, "
                     "the filters say no pose, and the curve stands."
@@ -80,7 +80,7 @@ class ErrorFigure(NamedTuple):
         columns = ("set, method", "printed mean [m]", "mean [m]", "run's max [m]", "max [m]",
                    "10 … 90 %", "RMS [m]", "end [m]", "NEES/dof")  # fmt: skip
         table = Table(
-            f"{self.title}, {len(options.seeds)} seeds",
+            f"{self.title}, {options.seed_count}",
             columns,
             tuple(rows),
             f"the run: seed {options.seeds[0]}; all else: median over the seeds, of hybrid + join "

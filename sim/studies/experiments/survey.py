@@ -8,7 +8,7 @@ that are not implemented are named.
 from typing import NamedTuple
 
 from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments.experiment import Options, Outcome, Results, Table
+from sim.studies.experiments.experiment import Options, Outcome, Results, Table, seed_count
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import (
     OURS,
@@ -88,10 +88,10 @@ def tasks(options: Options) -> list[Task]:
 def outcome(options: Options, results: Results) -> Outcome:
     """One table a world, and the two of the thesis with numbers."""
     figures = {world: _world(world, options, results) for world in WORLDS}
-    seeds = len(options.seeds[:MOST_SEEDS])
+    seeds = seed_count(len(options.seeds[:MOST_SEEDS]))
     tables = [
         Table(
-            f"{world}, two robots, {seeds} seeds",
+            f"{world}, two robots, {seeds}",
             ("estimator + rule", *(heading for _, heading, _ in SHOWN)),
             tuple((name, *cells_of(of_pair, SHOWN)) for name, of_pair in of_world.items()),
             "without a fused map the robots' own; pose: online; bytes: from a robot to the centre; "

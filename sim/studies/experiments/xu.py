@@ -107,7 +107,7 @@ class ErrorFigure(NamedTuple):
         columns = ("method", "printed max [m]", "run's max [m]", "max [m]", "10 … 90 %",
                    "RMS [m]", "end [m]", "NEES/dof")  # fmt: skip
         table = Table(
-            f"{self.title}, {len(options.seeds)} seeds",
+            f"{self.title}, {options.seed_count}",
             columns,
             tuple(rows),
             f"the run: seed {options.seeds[0]}; max, RMS and end: median over the seeds; "
@@ -117,7 +117,7 @@ class ErrorFigure(NamedTuple):
             Picture(
                 panel.name.partition(",")[0].replace(" ", "-") or "errors",
                 f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
-                f"{len(options.seeds)} seeds and the band of four fifths of them. Below: the run "
+                f"{options.seed_count} and the band of four fifths of them. Below: the run "
                 f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
                 drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
             )

@@ -105,7 +105,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         rows += [(f"blind for {STRETCH_STEPS} steps, {n}", *_row(stages, n)) for n in STAGES]
         rows += [(f"anywhere, step {n}", *_row(anywhere, str(n))) for n in ANYWHERE_STEPS]
     table = Table(
-        f"Thesis, section 3.5: the filter's steps, {len(options.seeds)} seeds",
+        f"Thesis, section 3.5: the filter's steps, {options.seed_count}",
         columns,
         tuple(rows),
         "distance: of the particles' mean from the true position; σ: √(σx² + σy²) of the "

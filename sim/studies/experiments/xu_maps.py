@@ -80,7 +80,7 @@ class MapFigure(NamedTuple):
             }
             rows.append((label, *(_cell(each) for each in figures[label].values())))
         table = Table(
-            f"{self.title}: landmark RMSE [m], {len(options.seeds)} seeds",
+            f"{self.title}: landmark RMSE [m], {options.seed_count}",
             ("method", *(f"step {step}" for step in self.steps)),
             tuple(rows),
             f"the drawn run, seed {options.seeds[0]}; in brackets median (10 … 90 %) of the seeds",
