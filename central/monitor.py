@@ -121,13 +121,16 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
     """The covariance scale of the team (the empty name) and of each robot, where there is one."""
-    chi2 = np.array([chi2 for _, _, chi2, _, _ in submaps])
-    dof = np.array([dof for *_, dof, _ in submaps])
-    robots = np.array([stream[0] for stream, *_ in submaps])
-    chosen = {"": np.ones(len(submaps), dtype=np.bool_)}
-    chosen |= {str(robot): robots == robot for robot in np.unique(robots)}
+    streams = [each[0] for each in submaps]
+    chi2, dof = (np.array([each[k] for each in submaps], np.float64) for k in (2, 3))
+    places: dict[str, list[int]] = {"": list(range(len(submaps)))}
+    for place, (robot, _) in enumerate(streams):
+        places.setdefault(robot, []).append(place)
     half = np.asarray(chi2_quantile(0.5, dof))
-    found = {who: covariance_scale(chi2[own], dof[own], half[own]) for who, own in chosen.items()}
+    found = {
+        who: covariance_scale(chi2[own], dof[own], half[own])
+        for who, own in ((who, np.array(places[who], np.int64)) for who in sorted(places))
+    }
     return {
         who: Scale(each.value / normal, each.log_sigma)
         for who, each in found.items()

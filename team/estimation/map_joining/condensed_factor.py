@@ -161,18 +161,12 @@ class Condensed:
         d[self.headings] = turn + 2.0 * np.pi * np.floor((np.pi - turn) / (2.0 * np.pi))
         return d
 
-    def cost_at(self, state: Values, numbers: Indices) -> float:
-        """cost(x)."""
+    def at_state(self, state: Values, numbers: Indices) -> tuple[float, Values]:
+        """cost(x) and half of its derivative, slope + information d."""
         d = self.moved(state, numbers)
-        return self.cost + float(
-            2.0 * (dense.product(self.slope, d))
-            + dense.product(d, dense.product(self.information, d))
-        )
-
-    def gradient_at(self, state: Values, numbers: Indices) -> Values:
-        """Half of the cost's derivative: slope + information d."""
-        gradient: Values = self.slope + dense.product(self.information, self.moved(state, numbers))
-        return gradient
+        pulled = dense.product(self.information, d)
+        cost = self.cost + float(2.0 * (dense.product(self.slope, d)) + dense.product(d, pulled))
+        return cost, self.slope + pulled
 
 
 def places(offset: Indices, nodes: Indices) -> Indices:

@@ -36,6 +36,9 @@ from team.estimation.sparse_cholesky import sparse
 
 LEAST_WEIGHT = 1e-6
 """Lower bound of a landmark's weight, so that each landmark stays determined."""
+STILL = 1e-3
+"""Squared length, in standard deviations and per raw submap, of a step that a running map can do
+without: it is a tenth of what condensing moves the map by (docs/decisions/0141)."""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
@@ -180,6 +183,8 @@ class Island(least_squares.Iterate):
     @cached_property
     def whole_chi2(self) -> Float[np.ndarray, " F"]:
         """rᵀ(f P)⁻¹r of each submap, without discounting."""
+        if self.factors is self._submaps:
+            return self.chi2
         factor = self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, self._submaps, factor)
 
@@ -190,10 +195,10 @@ class Island(least_squares.Iterate):
         `dimensions` counts its numbers by the same weight: down-weighted terms are left out of the
         agreement test.
         """
-        factors, factor = (
-            self._discounted(elementary.squared(self.landmark_weight)),
-            self.settings.covariance_factor,
-        )
+        if self.factors is self._submaps:
+            return self.chi2
+        factors = self._discounted(elementary.squared(self.landmark_weight))
+        factor = self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, factors, factor)
 
     @property
@@ -244,16 +249,16 @@ class Island(least_squares.Iterate):
         """The cost of another state with the weights of this one: the quantity that an iteration
         lowers.
         """
-        state = other.state
-        factor, offset = self.settings.covariance_factor, self.graph.offset
-        costs = self.chi2
-        if other is not self:
-            costs = kernel.costs(state, offset, self.factors, factor)
+        settings = self.settings
+        if other is self or (settings.robust_c is None and not settings.joined_ranges):
+            costs = other.chi2
+        else:
+            factor = settings.covariance_factor
+            costs = kernel.costs(other.state, self.graph.offset, self.factors, factor)
         chi2 = float((self.weight * costs).sum())
         seen = float((self.sighting_weight * other.sighting_chi2).sum())
         seen += float((self.prior_weight * other.prior_chi2).sum())
-        old = self.graph.condensed
-        return chi2 + seen if old is None else chi2 + seen + old.cost_at(state, self.graph.boundary)
+        return chi2 + seen + other.condensed_terms[0]
 
     @cached_property
     def cost(self) -> float:
@@ -261,9 +266,13 @@ class Island(least_squares.Iterate):
         graph = self.graph
         sizes = len(self.age), len(self.sighting_age), len(graph.priors)
         submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
-        cost = self.cost_of_factors(submaps, seen, priors)
-        old = graph.condensed
-        return cost if old is None else cost + old.cost_at(self.state, graph.boundary)
+        return self.cost_of_factors(submaps, seen, priors) + self.condensed_terms[0]
+
+    @cached_property
+    def condensed_terms(self) -> tuple[float, Values]:
+        """Cost and half the gradient of the condensed factor; zero and none without one."""
+        old = self.graph.condensed
+        return (0.0, np.zeros(0)) if old is None else old.at_state(self.state, self.graph.boundary)
 
     def cost_of_factors(
         self,
@@ -324,7 +333,7 @@ class Island(least_squares.Iterate):
         )
         if graph.condensed is not None:
             old = graph.condensed
-            gradient[graph.boundary] += old.gradient_at(self.state, graph.boundary)
+            gradient[graph.boundary] += self.condensed_terms[1]
             sizes = np.diff(graph.offset)[old.nodes]
             add_blocks(values, old.information, sizes, graph.condensed_entry, pattern.value_start)
         at = pattern.value_start[pattern.column_start[graph.prior_factors.node]]
@@ -349,12 +358,15 @@ class Island(least_squares.Iterate):
         except sparse.NotPositiveDefiniteError as error:
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
-    def moved(self, step: Values) -> "Island":
-        """The island with `step` added to its state, headings wrapped to (−π, π]."""
+    def moved(self, step: Values, older: int = 1) -> "Island":
+        """The island with `step` added to its state, headings wrapped to (−π, π], and every factor
+        so many iterations older.
+        """
         state = self.state + step
         headings = state[self.graph.headings]
         state[self.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
-        return replace(self, state=state)
+        ages = self.age + older, self.sighting_age + older
+        return replace(self, state=state, age=ages[0], sighting_age=ages[1])
 
     @cached_property
     def selected_covariance(self) -> Values:
@@ -435,12 +447,31 @@ def is_solvable(island: Island) -> bool:
 
 
 def iterated(island: Island) -> Island:
-    """The island after the iterations of one tick."""
+    """The island after the iterations of one tick.
+
+    Where old submaps are condensed and no robust scale narrows, an iteration after the first is
+    left out whose step is shorter than STILL: the decision is a function of the state, and the map
+    is as far from its minimum as condensing puts it anyway.
+    """
     damping = 0.0
-    for _ in range(island.settings.iterations_per_tick):
-        island, (damping, _) = least_squares.iterated(island, _eased(damping))
-        island = aged(island, 1)
+    bounded = island.graph.condensed is not None and island.settings.robust_c is None
+    for k in range(island.settings.iterations_per_tick):
+        if k and bounded and damping == 0.0 and _stands_still(island):
+            break
+        island, (damping, _) = _iteration(island, damping)
     return island
+
+
+def _stands_still(island: Island) -> bool:
+    """Whether a full step is shorter than STILL: gᵀA⁻¹g bounds how far any number moves."""
+    squared = -float(dense.product(island.normal_equations[1], island.step))
+    return squared <= STILL * len(island.graph.submaps)
+
+
+def _iteration(island: Island, damping: float) -> tuple[Island, least_squares.Iteration]:
+    """One iteration; the island is one iteration older even where no step lowers the cost."""
+    after, outcome = least_squares.iterated(island, _eased(damping))
+    return aged(island, 1) if after is island else after, outcome
 
 
 def _eased(damping: float) -> float:
@@ -460,8 +491,7 @@ def settled(island: Island) -> tuple[Island, int, float]:
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
         narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
-        island, (damping, change) = least_squares.iterated(island, _eased(damping))
-        island = aged(island, 1)
+        island, (damping, change) = _iteration(island, damping)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):
             break
@@ -481,7 +511,7 @@ def solved_with_fixed(island: Island, unknown: int, by: float, iterations: int) 
         right[unknown, 1] = 1.0
         p, q = sparse.solved(island.posterior, right).T
         step = p + (missing - p[unknown]) / q[unknown] * q
-        island, missing = island.moved(step), missing - float(step[unknown])
+        island, missing = island.moved(step, 0), missing - float(step[unknown])
     return island
 
 

@@ -7,7 +7,7 @@ since its factor was added, so that a residual that is large at first is not tak
 
 import math
 from abc import ABC, abstractmethod
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -45,6 +45,11 @@ class Iterate(ABC):
     @abstractmethod
     def posterior(self) -> sparse.Cholesky:
         """Cholesky factor of A."""
+
+    @cached_property
+    def step(self) -> Values:
+        """The full step, −A⁻¹g."""
+        return -sparse.solved(self.posterior, self.normal_equations[1][:, None])[:, 0]
 
     @abstractmethod
     def factorised(self, values: Values) -> sparse.Cholesky:
@@ -86,12 +91,12 @@ def iterated(point: P, damping: float) -> tuple[P, Iteration]:
     before = point.cost_of(point)
     refused = None
     while damping < MOST_DAMPING:
-        cholesky = point.posterior
         if damping:
             damped = values.copy()
             damped[point.diagonal] *= 1.0 + damping
-            cholesky = point.factorised(damped)
-        step = -sparse.solved(cholesky, gradient[:, None])[:, 0]
+            step = -sparse.solved(point.factorised(damped), gradient[:, None])[:, 0]
+        else:
+            step = point.step
         for share in (1.0,) if damping else SHARES:
             moved = point.moved(share * step)
             if point.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:

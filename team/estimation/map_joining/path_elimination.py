@@ -67,8 +67,8 @@ def quadratic(
             np.concatenate([place[union], [total]]), np.searchsorted(union, before.nodes)
         )
         H[np.ix_(within, within)] += before.information
-        g[within] += before.gradient_at(state, graph.boundary)
-        cost = before.cost_at(state, graph.boundary)
+        cost, slope = island.condensed_terms
+        g[within] += slope
     weights = island.weight / island.settings.covariance_factor
     at_work = np.flatnonzero(leaving)
     add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)

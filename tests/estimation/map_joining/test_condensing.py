@@ -1,11 +1,18 @@
 """The bounded fold: close to the full one, consistent, and a pure function of its ticks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from team.estimation.map_joining import condensing, marginals, path_elimination
+from team.estimation.map_joining import (
+    condensing,
+    gauss_newton,
+    least_squares,
+    marginals,
+    path_elimination,
+)
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.gauss_newton import aged, final_cost
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
@@ -101,6 +108,25 @@ def test_what_is_linearised_again_is_the_full_solution():
     smaller = condensed(again, LAG, begin=0)
     assert smaller.departed == 2 * (20 - LAG)
     assert apart(full, smaller) < 1e-6
+
+
+def test_an_iteration_that_would_hardly_move_a_condensed_fold_is_left_out(monkeypatch):
+    world = team(2, submaps=20)
+    taken = []
+
+    def counted(point, damping):
+        taken.append(point)
+        return least_squares.iterated(point, damping)
+
+    monkeypatch.setattr(gauss_newton, "least_squares", SimpleNamespace(iterated=counted))
+    full, bounded = both(world, JoinSettings())
+    once = [point for point in taken if point.graph.condensed is not None]
+    assert len(taken) - len(once) == 2 * 20 + 2 * (LAG + 1)
+    assert 19 - LAG <= len(once) < 1.5 * (19 - LAG)
+    monkeypatch.setattr(gauss_newton, "STILL", -1.0)
+    _, twice = both(world, JoinSettings())
+    assert apart(twice, bounded) < 1e-4
+    assert apart(full, bounded) < 1e-3
 
 
 def test_it_is_due_when_a_size_is_passed_and_not_again():

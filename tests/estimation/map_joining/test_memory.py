@@ -95,8 +95,8 @@ def test_landmarks_that_become_one_do_so_in_what_is_condensed_exactly(laps):
     node_of = np.cumsum(np.arange(len(before.fixed)) != before.landmarks[two]) - 1
     node_of[before.landmarks[two]] = after.landmarks[one]
     equal = state[places(after.offset, node_of)]
-    cost = before.condensed.cost_at(equal, before.boundary)
-    assert after.condensed.cost_at(state, after.boundary) == pytest.approx(cost, rel=1e-9)
+    cost = before.condensed.at_state(equal, before.boundary)[0]
+    assert after.condensed.at_state(state, after.boundary)[0] == pytest.approx(cost, rel=1e-9)
 
 
 def test_what_is_linearised_again_has_the_identities_that_were_found(laps):
