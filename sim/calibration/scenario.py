@@ -1,7 +1,6 @@
 """A calibration as a scenario in TOML that a user can read, with each figure's uncertainty."""
 
 import os
-import tomllib
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import tomli_w
 from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration
 from sim.calibration.figures import Figure, nested
+from sim.scenarios.document import own_document
 from sim.scenarios.scenario import Scenario, builtin_names
 from sim.world.config import FolderWorld, LiveWorld
 from team.config import AssociationSettings, MotionModel, Sensor
@@ -43,16 +43,17 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
     return "\n".join(lines) + "\n"
 
 
-def within(own: Path, calibration: Calibration, sources: Sequence[str], output: Path) -> str:
-    """The user's scenario `own` with the learnt figures in it, as the text of the file `output`.
+def within(own: str, calibration: Calibration, sources: Sequence[str], output: Path) -> str:
+    """The user's scenario in the file `own` with the learnt figures in it, as the text of the file
+    `output`.
 
     What was learnt is every robot's, so no robot has another value of it except one learnt for that
     robot. All other fields stay.
     """
-    document = tomllib.loads(own.read_text("utf-8"))
+    document = own_document(own)
     world = document.get("world", {})
     if world.get("path"):
-        world["path"] = os.path.relpath(own.parent / world["path"], output.parent)
+        world["path"] = os.path.relpath(world["path"], output.parent)
     robots: list[Fields] = document.get("robots", [])
     comments = []
     for name, figures, declared in _parts(calibration):

@@ -8,7 +8,7 @@ from sim.datasets.kinds import UTIAS_MARKER
 from sim.datasets.tables import opened as opened_set
 from sim.datasets.utias_log import present_robots
 from sim.recorded.streams import measurements_in
-from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.scenario import Scenario, builtin_names, load, with_options
 from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from sim.world.streams import WorldStreams
 
@@ -25,10 +25,10 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
     return measurements_in(path)
 
 
-def own_scenario(path: Path) -> Path | None:
-    """The scenario that a data set brings with it as a file of its own; a log has none."""
-    own = Path(scenario_beside(path)) if path.suffix != ".mcap" else None
-    return own if own is not None and own.is_file() else None
+def own_scenario(path: Path) -> str | None:
+    """The name of the scenario that a data set brings with it; a log brings none."""
+    own = None if path.suffix == ".mcap" else scenario_beside(path)
+    return own if own not in builtin_names() else None
 
 
 def _with_its_robots(path: Path) -> Scenario:

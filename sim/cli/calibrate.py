@@ -42,14 +42,14 @@ def calibrate(
     from sim.calibration.source import measurements_of, own_scenario
     from sim.cli.importing import readable
     from sim.cli.options import scenario_of, warn_of_holes
-    from sim.scenarios.scenario import Scenario
+    from sim.scenarios.scenario import Scenario, builtin_names
     from sim.world.streams import WorldStreams
     from team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
         fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
     read: list[tuple[str, WorldStreams, Scenario]] = []
-    own = Path(scenario) if scenario is not None and Path(scenario).is_file() else None
+    own = scenario if scenario not in builtin_names() else None
     for path in source:
         typer.echo(f"reading {path}", err=True)
         with readable(path) as found_at:

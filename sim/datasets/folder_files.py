@@ -36,12 +36,25 @@ def opened_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
         return
     try:
         with zipfile.ZipFile(place) as archive:
-            root = zipfile.Path(archive)
-            entries = list(root.iterdir())
-            only = entries[0] if len(entries) == 1 and entries[0].is_dir() else root
-            yield only, _robots_in(only, path)
+            root = _root(zipfile.Path(archive))
+            yield root, _robots_in(root, path)
     except zipfile.BadZipFile as error:
         raise NoTablesError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
+
+
+def _root(archive: zipfile.Path) -> zipfile.Path:
+    """The folder that alone is in an archive, or the archive."""
+    entries = list(archive.iterdir())
+    return entries[0] if len(entries) == 1 and entries[0].is_dir() else archive
+
+
+def scenario_in(path: str | Path) -> File | None:
+    """The scenario that lies beside the files of a data set, in a folder or in a zip."""
+    place: File = Path(path)
+    if not place.is_dir():
+        place = _root(zipfile.Path(path))
+    own = place / SCENARIO
+    return own if own.is_file() else None
 
 
 def has_tables(path: str | Path) -> bool:

@@ -12,6 +12,7 @@ name, team, seed, estimator, fusion, exchange, peers, centre
 
 import re
 import tomllib
+import zipfile
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -38,13 +39,21 @@ def builtin_names() -> tuple[str, ...]:
 
 
 def named_document(name: str) -> tuple[Fields, str]:
-    """The document of a built-in scenario or of a user's file, laid over its base; its short name.
-
-    A data set's path in a file is relative to that file.
+    """The document of a built-in scenario or of a user's file, laid over its base; its short
+    name.
     """
     if name in builtin_names():
         return _builtin(name), name
-    path = Path(name)
+    return _based(own_document(name)), Path(name).stem
+
+
+def own_document(name: str) -> Fields:
+    """The document of a user's file as it stands there.
+
+    Its data set's path is relative to that file, and here to the working directory; a file within a
+    zip describes that zip.
+    """
+    archive, path = _file_at(Path(name))
     if path.is_dir():
         raise ScenarioError(
             "a folder, not a scenario: give a .toml file in it; a data set goes with --dataset"
@@ -58,11 +67,19 @@ def named_document(name: str) -> tuple[Fields, str]:
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"can not be read as UTF-8 text: {error}") from None
-    document = _based(_parsed(text))
+    document = _parsed(text)
     world = document.get("world")
     if isinstance(world, dict) and isinstance(world.get("path"), str) and world["path"]:
-        world["path"] = str(path.parent / world["path"])
-    return document, path.stem
+        world["path"] = str(archive or Path(name).parent / world["path"])
+    return document
+
+
+def _file_at(path: Path) -> tuple[Path | None, Path | zipfile.Path]:
+    """The zip on the way to a file, if there is one, and the file."""
+    for above in path.parents:
+        if above.is_file() and zipfile.is_zipfile(above):
+            return above, zipfile.Path(above, path.relative_to(above).as_posix())
+    return None, path
 
 
 def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 
 from sim.datasets.folder import folder
-from sim.datasets.folder_files import SCENARIO, robots_of
+from sim.datasets.folder_files import robots_of, scenario_in
 from sim.datasets.kinds import UTIAS_MARKER, kind_of
 from sim.datasets.tables import opened
 from sim.datasets.unlabelled import is_car, unlabelled
@@ -56,8 +56,8 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
 def scenario_beside(path: str | Path) -> str:
     """The scenario that a data set brings with it, or the built-in one for its kind."""
     kind = kind_of(path)
-    own = Path(path) / SCENARIO
-    if own.is_file():
+    own = scenario_in(path)
+    if own is not None:
         return str(own)
     if kind == "unlabelled":
         return "victoria" if is_car(path) else "dlr"

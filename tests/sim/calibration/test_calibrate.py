@@ -453,7 +453,7 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
     found = Calibration(
         (Figure("forward_scale", 1.1, 0.01, ""),), of_sensor, True, (), (), of_robots
     )
-    elsewhere.write_text(within(own, found, ["set"], elsewhere), "utf-8")
+    elsewhere.write_text(within(str(own), found, ["set"], elsewhere), "utf-8")
     before, learnt = load(own), load(elsewhere)
     assert isinstance(before.world, UtiasWorld)
     assert isinstance(learnt.world, UtiasWorld)

@@ -103,7 +103,13 @@ def test_a_set_of_another_rig_brings_its_own_models(folder: Path) -> None:
     own = folder / "scenario.toml"
     own.write_text('base = "utias"\n[defaults.sensor]\nrange_is_depth = false\n', "utf-8")
     assert scenario_beside(folder) == str(own)
-    assert own_scenario(folder) == own
+    assert own_scenario(folder) == str(own)
+    zipped = Path(shutil.make_archive(str(folder), "zip", folder.parent, folder.name))
+    within = scenario_beside(zipped)
+    assert within == own_scenario(zipped) == str(zipped / folder.name / "scenario.toml")
+    for each in (own, within):
+        loaded = with_options(load(str(each)), dataset=zipped)
+        assert [robot.sensor.range_is_depth for robot in loaded.robots] == [False] * 5
     streams, scenario = measurements_of(folder)
     assert [robot.sensor.range_is_depth for robot in scenario.robots] == [False] * 3
     assert [stream.robot for stream in streams.streams] == ["r1", "r2", "r3"]
