@@ -30,23 +30,44 @@ def is_big(width: int, m: int) -> bool:
 
 
 @compiled
+def add_products(target: Values, rows: Float[np.ndarray, "k m"], column: int, sign: float) -> None:
+    """Adds Σ sign · rows[k, column] · rows[k, column:] in place: one row after the other, four in
+    one go.
+    """
+    n, count = len(target), len(rows)
+    whole = count - count % 4
+    for k in range(0, whole, 4):
+        r0, r1 = rows[k, column:], rows[k + 1, column:]
+        r2, r3 = rows[k + 2, column:], rows[k + 3, column:]
+        f0, f1, f2, f3 = sign * r0[0], sign * r1[0], sign * r2[0], sign * r3[0]
+        for i in range(n):
+            target[i] = (((target[i] + f0 * r0[i]) + f1 * r1[i]) + f2 * r2[i]) + f3 * r3[i]
+    for k in range(whole, count):
+        row = rows[k, column:]
+        factor = sign * row[0]
+        for i in range(n):
+            target[i] += factor * row[i]
+
+
+@compiled
 def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, least: Values) -> int:
     """Dense Cholesky factorisation of these columns in place; later columns are not changed.
 
     Returns the first column whose pivot is ≤ least, else −1.
     """
-    _, m = panel.shape
-    for k in range(begin, end):
-        pivot = panel[k, k]
-        if not pivot > least[k]:
-            return k
-        root = math.sqrt(pivot)
-        for i in range(k, m):
-            panel[k, i] /= root
-        for later in range(k + 1, end):
-            factor = panel[k, later]
-            for i in range(later, m):
-                panel[later, i] -= factor * panel[k, i]
+    for first in range(begin, end, 4):
+        behind = min(first + 4, end)
+        for k in range(first, behind):
+            pivot = panel[k, k]
+            if not pivot > least[k]:
+                return k
+            row, root = panel[k, k:], math.sqrt(pivot)
+            for i in range(len(row)):
+                row[i] /= root
+            for later in range(k + 1, behind):
+                add_products(panel[later, later:], panel[k : k + 1], later, -1.0)
+        for later in range(behind, end):
+            add_products(panel[later, later:], panel[first:behind], later, -1.0)
     return -1
 
 

@@ -16,6 +16,8 @@ from team.estimation.sparse_cholesky.sparse_layout import Structure
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
+FEW = 2
+"""Number of columns up to which a solution goes column by column."""
 PIVOT_TOLERANCE = 1e-14
 """Ratio of a pivot to its diagonal entry below which it is rounding noise: the unknown is
 undetermined.
@@ -80,12 +82,8 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
             update = product[within, within:]
         else:
             update = product[0, : m - j]
-            for i in range(j, m):
-                update[i - j] = panel[0, j] * panel[0, i]
-            for k in range(1, width):
-                factor = panel[k, j]
-                for i in range(j, m):
-                    update[i - j] += factor * panel[k, i]
+            update[:] = 0.0
+            products.add_products(update, panel, j, 1.0)
         column = panel_start[t] + (rows[j] - columns_of[t]) * len(present)
         for i in range(j, m):
             panels[column + place[i - begin]] -= update[i - j]
@@ -118,8 +116,42 @@ def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Va
 
 
 @compiled
-def solve_in_place(structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]) -> None:
-    """Overwrite `right` with (L Lᵀ)⁻¹ right."""
+def _solve_column(
+    structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], c: int
+) -> None:
+    """`solve_in_place` of one column: a panel's numbers are gathered, so that a loop goes along its
+    row.
+    """
+    count = len(structure[0]) - 1
+    x = np.empty(np.max(np.diff(structure[1])))
+    for s in range(count):
+        rows, panel = _panel(structure, panels, s)
+        width, m = panel.shape
+        for i in range(m):
+            x[i] = right[rows[i], c]
+        for k in range(width):
+            row = panel[k]
+            x[k] /= row[k]
+            for i in range(k + 1, m):
+                x[i] -= row[i] * x[k]
+        for i in range(m):
+            right[rows[i], c] = x[i]
+    for s in range(count - 1, -1, -1):
+        rows, panel = _panel(structure, panels, s)
+        width, m = panel.shape
+        for i in range(m):
+            x[i] = right[rows[i], c]
+        for k in range(width - 1, -1, -1):
+            row = panel[k]
+            for i in range(k + 1, m):
+                x[k] -= row[i] * x[i]
+            x[k] /= row[k]
+            right[rows[k], c] = x[k]
+
+
+@compiled
+def _solve_many(structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]) -> None:
+    """`solve_in_place` of many columns: a loop goes along a row of them."""
     count = len(structure[0]) - 1
     many = right.shape[1]
     for s in range(count):
@@ -146,6 +178,16 @@ def solve_in_place(structure: Structure, panels: Values, right: Float[np.ndarray
                     pivot[c] -= factor * other[c]
             for c in range(many):
                 pivot[c] /= panel[k, k]
+
+
+@compiled
+def solve_in_place(structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]) -> None:
+    """Overwrite `right` with (L Lᵀ)⁻¹ right."""
+    if right.shape[1] > FEW:
+        _solve_many(structure, panels, right)
+        return
+    for c in range(right.shape[1]):
+        _solve_column(structure, panels, right, c)
 
 
 @compiled
