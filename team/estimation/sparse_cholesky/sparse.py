@@ -147,37 +147,49 @@ def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndar
     permutation = cholesky.analysis.permutation
     permuted = np.empty_like(right)
     permuted[permutation] = right
-    sparse_kernel.solve_in_place(cholesky.analysis.structure, cholesky.panels, permuted)
+    sparse_kernel.solve_in_place(cholesky.analysis.structure, cholesky.panels, permuted, 0)
     solution: Float[np.ndarray, "n k"] = permuted[permutation]
     return solution
 
 
 def inverse_columns(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "n k"]:
     """The columns of A⁻¹ of these `unknowns`: their covariance with all unknowns."""
-    total = len(cholesky.analysis.permutation)
-    columns = np.empty((total, len(unknowns)))
-    for begin in range(0, len(unknowns), COLUMNS_AT_ONCE):
-        chosen = unknowns[begin : begin + COLUMNS_AT_ONCE]
-        unit = np.zeros((total, len(chosen)))
-        unit[chosen, np.arange(len(chosen))] = 1.0
-        columns[:, begin : begin + len(chosen)] = solved(cholesky, unit)
-    return columns
+    permutation = cholesky.analysis.permutation
+    return _columns(cholesky, permutation[unknowns], permutation, 0)
 
 
 def inverse_block(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "k k"]:
     """A⁻¹ between these unknowns: their joint covariance, symmetric."""
     structure = cholesky.analysis.structure
+    place = cholesky.analysis.permutation[unknowns]
     if sparse_kernel.has_big_panel(structure):
-        place = cholesky.analysis.permutation[unknowns]
         order = np.argsort(place, kind="stable")
         block = np.empty((len(unknowns), len(unknowns)))
         block[np.ix_(order, order)] = sparse_kernel.inverse_among(
             structure, cholesky.panels, place[order]
         )
     else:
-        block = inverse_columns(cholesky, unknowns)[unknowns]
+        supernode_of = structure[4]
+        first = int(supernode_of[place].min(initial=len(supernode_of)))
+        block = _columns(cholesky, place, place, first)
     symmetric: Float[np.ndarray, "k k"] = 0.5 * (block + block.T)
     return symmetric
+
+
+def _columns(
+    cholesky: Cholesky, chosen: Indices, requested: Indices, first: int
+) -> Float[np.ndarray, "n k"]:
+    """The rows `requested` of columns of A⁻¹, both by their place in the order of elimination and
+    none before supernode `first`.
+    """
+    columns = np.empty((len(requested), len(chosen)))
+    for begin in range(0, len(chosen), COLUMNS_AT_ONCE):
+        some = chosen[begin : begin + COLUMNS_AT_ONCE]
+        unit = np.zeros((len(cholesky.analysis.permutation), len(some)))
+        unit[some, np.arange(len(some))] = 1.0
+        sparse_kernel.solve_in_place(cholesky.analysis.structure, cholesky.panels, unit, first)
+        columns[:, begin : begin + len(some)] = unit[requested]
+    return columns
 
 
 def selected_inverse(cholesky: Cholesky) -> Values:

@@ -117,14 +117,14 @@ def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Va
 
 @compiled
 def _solve_column(
-    structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], c: int
+    structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], first: int, c: int
 ) -> None:
     """`solve_in_place` of one column: a panel's numbers are gathered, so that a loop goes along its
     row.
     """
     count = len(structure[0]) - 1
     x = np.empty(np.max(np.diff(structure[1])))
-    for s in range(count):
+    for s in range(first, count):
         rows, panel = _panel(structure, panels, s)
         width, m = panel.shape
         for i in range(m):
@@ -136,7 +136,7 @@ def _solve_column(
                 x[i] -= row[i] * x[k]
         for i in range(m):
             right[rows[i], c] = x[i]
-    for s in range(count - 1, -1, -1):
+    for s in range(count - 1, first - 1, -1):
         rows, panel = _panel(structure, panels, s)
         width, m = panel.shape
         for i in range(m):
@@ -150,11 +150,13 @@ def _solve_column(
 
 
 @compiled
-def _solve_many(structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]) -> None:
+def _solve_many(
+    structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], first: int
+) -> None:
     """`solve_in_place` of many columns: a loop goes along a row of them."""
     count = len(structure[0]) - 1
     many = right.shape[1]
-    for s in range(count):
+    for s in range(first, count):
         rows, panel = _panel(structure, panels, s)
         width, m = panel.shape
         for k in range(width):
@@ -166,7 +168,7 @@ def _solve_many(structure: Structure, panels: Values, right: Float[np.ndarray, "
                 other = right[rows[i]]
                 for c in range(many):
                     other[c] -= factor * pivot[c]
-    for s in range(count - 1, -1, -1):
+    for s in range(count - 1, first - 1, -1):
         rows, panel = _panel(structure, panels, s)
         width, m = panel.shape
         for k in range(width - 1, -1, -1):
@@ -181,13 +183,19 @@ def _solve_many(structure: Structure, panels: Values, right: Float[np.ndarray, "
 
 
 @compiled
-def solve_in_place(structure: Structure, panels: Values, right: Float[np.ndarray, "n k"]) -> None:
-    """Overwrite `right` with (L Lᵀ)⁻¹ right."""
+def solve_in_place(
+    structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], first: int
+) -> None:
+    """Overwrite `right` with (L Lᵀ)⁻¹ right.
+
+    What belongs to supernodes before `first` must be zero, and stays as it is: nothing behind
+    depends on it.
+    """
     if right.shape[1] > FEW:
-        _solve_many(structure, panels, right)
+        _solve_many(structure, panels, right, first)
         return
     for c in range(right.shape[1]):
-        _solve_column(structure, panels, right, c)
+        _solve_column(structure, panels, right, first, c)
 
 
 @compiled
