@@ -200,9 +200,11 @@ def moved(
 def gaussian(window: Window, *, running: bool = False) -> LocalMap:
     """Make one Gaussian of the window so far: `landmarks_solved_again`, then `moments_matched`.
 
+    running: for a pose within the window, which is not fused: without pose nodes.
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
-    return moments_matched(window, landmarks_solved_again(window, running=running))
+    landmarks = landmarks_solved_again(window, running=running)
+    return moments_matched(window, landmarks, with_nodes=not running)
 
 
 def landmarks_solved_again(window: Window, *, running: bool = False) -> ParticleLandmarks:
@@ -235,7 +237,9 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
     return ParticleLandmarks(*found)
 
 
-def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
+def moments_matched(
+    window: Window, landmarks: ParticleLandmarks, *, with_nodes: bool = True
+) -> LocalMap:
     """One Gaussian over (end pose, pose nodes, landmarks by ascending id).
 
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
@@ -246,7 +250,8 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
     """
     ids, means, covariances = landmarks
     particles = window.particles
-    of_nodes = window.paths[window.node_keyframes]
+    nodes = window.node_keyframes if with_nodes else NO_NODES
+    of_nodes = window.paths[nodes]
     if window.sensor.is_mounted:
         mount = np.array(window.sensor.mount)
         means, covariances = base_points(means, mount), base_covariances(covariances, mount)
@@ -263,7 +268,7 @@ def moments_matched(window: Window, landmarks: ParticleLandmarks) -> LocalMap:
     )
     if fault:
         raise NotACovarianceError("the submap of a window", FAULTS[fault])
-    local = LocalMap(ids, mean, covariance, window.node_stamps)
+    local = LocalMap(ids, mean, covariance, window.node_stamps[: len(nodes)])
     return _with_sensitivity(window, local, weights) if window.front_end.biases else local
 
 
@@ -315,5 +320,6 @@ def _with_sensitivity(
     if is_mounted:
         poses = base_shifts(poses, path, mount)
         landmarks = base_points(landmarks, np.array([0.0, 0.0, mount[2]]))
-    sensitivity = rows(biases, poses, landmarks, window.node_keyframes)
+    nodes = window.node_keyframes[: len(local.node_stamps)]
+    sensitivity = rows(biases, poses, landmarks, nodes)
     return replace(local, biases=biases, sensitivity=sensitivity)

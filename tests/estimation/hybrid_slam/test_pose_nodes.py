@@ -10,6 +10,7 @@ from tests.estimation.submap_world import wrap
 
 STEP = Increment(np.array([0.5, 0.0, 0.2]), np.diag([0.03, 0.01, 0.02]) ** 2)
 NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+SENSOR = Sensor()
 LANDMARKS = {4: (2.0, 1.0), 9: (1.0, -2.0)}
 
 
@@ -19,10 +20,10 @@ def seen():
     return ids, np.abs(points), np.angle(points)
 
 
-def driven(marks, particles=200):
+def driven(marks, particles=200, sensor=SENSOR, biases=()):
     """Four keyframes; landmarks are seen at the first; marked as nodes: those in `marks`."""
     generator = np.random.default_rng(1)
-    window = windows.opened(FrontEnd(particles=particles), Sensor())
+    window = windows.opened(FrontEnd(particles=particles, biases=biases), sensor)
     for k in range(4):
         window = windows.advanced(window, STEP, *(seen() if k == 0 else NOTHING), generator)
         if k in marks:
@@ -68,3 +69,13 @@ def test_a_node_at_the_windows_end_is_the_end_pose_up_to_the_jitter():
     assert local.nodes[0].tolist() == local.end_pose.tolist()
     same = local.covariance[:3, :3] - local.covariance[:3, 3:6]
     np.testing.assert_allclose(same, np.diag(POSE_JITTER), atol=1e-15)
+
+
+def test_a_running_gaussian_is_the_windows_without_its_pose_nodes():
+    window = driven({0, 2}, sensor=Sensor(range_white=0.5), biases=("bearing", "range_scale"))
+    running, bare = windows.gaussian(window, running=True), windows.gaussian(window).without_nodes
+    assert not len(running.node_stamps)
+    assert running.biases == bare.biases
+    assert running.mean.tobytes() == bare.mean.tobytes()
+    assert running.sensitivity.tobytes() == bare.sensitivity.tobytes()
+    assert running.covariance.tobytes() == bare.covariance.tobytes()
