@@ -107,19 +107,24 @@ def targets(
     permutation: Indices,
     structure: Structure,
 ) -> Indices:
-    """Index in the panels of each number of a pattern."""
+    """Index in the panels of each number of a pattern.
+
+    The unknowns of a block variable are neighbours in the order of elimination and in each panel's
+    rows, so one of them is searched for.
+    """
     columns_of, row_start, row, panel_start, supernode_of = structure
     target = np.empty(value_start[-1], dtype=np.int64)
     for e in range(len(rows)):
-        i, j = rows[e], columns[e]
-        for p in range(sizes[i]):
-            for q in range(sizes[j]):
-                low = min(permutation[offset[i] + p], permutation[offset[j] + q])
-                high = max(permutation[offset[i] + p], permutation[offset[j] + q])
-                s = supernode_of[low]
-                begin, end = row_start[s], row_start[s + 1]
-                at = np.searchsorted(row[begin:end], high)
-                target[value_start[e] + p * sizes[j] + q] = (
-                    panel_start[s] + (low - columns_of[s]) * (end - begin) + at
+        i, j = permutation[offset[rows[e]]], permutation[offset[columns[e]]]
+        first = max(i, j)
+        s = supernode_of[min(i, j)]
+        begin, end = row_start[s], row_start[s + 1]
+        at = np.searchsorted(row[begin:end], first) - first
+        wide = sizes[columns[e]]
+        for p in range(sizes[rows[e]]):
+            for q in range(wide):
+                low, high = min(i + p, j + q), max(i + p, j + q)
+                target[value_start[e] + p * wide + q] = (
+                    panel_start[s] + (low - columns_of[s]) * (end - begin) + at + high
                 )
     return target
