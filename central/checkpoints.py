@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
 
-NEWEST = 8
+NEWEST = 4
 """Number of newest ticks whose checkpoints are all kept; of older ones as many for each doubling
 of the age."""
 NEAR = 4
@@ -62,7 +62,7 @@ class Checkpoints:
         *before, last = self.taken or (None,)
         number = 1 if last is None else last.number + 1
         new = Checkpoint(tick, fold, self.tested, number, self.is_raw and is_raw)
-        older = () if last is None else (*before, replace(last, fold=compacted(last.fold)))
+        older = () if last is None else (*before, _compacted(last))
         keep = thinned((*older, new))
         self.taken = (*(replace(each, ahead=None) for each in keep[:-NEAR]), *keep[-NEAR:])
 
@@ -96,11 +96,16 @@ class Checkpoints:
         return not self.taken or self.taken[-1].raw
 
 
+def _compacted(checkpoint: Checkpoint) -> Checkpoint:
+    ahead = None if checkpoint.ahead is None else compacted(checkpoint.ahead)
+    return replace(checkpoint, fold=compacted(checkpoint.fold), ahead=ahead)
+
+
 def thinned(taken: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
     """The checkpoints to keep: the newest, then ever fewer, and the last one of a raw fold.
 
-    Of those that are n to 2n ticks old a quarter and more of every n are kept: a late submap is
-    folded from a checkpoint that is not much older than it, and there are a few tens in all.
+    Of those that are n to 2n ticks old two to four are kept: a late submap is folded from a
+    checkpoint that is at most twice as old as it, and there are about twenty in all.
     """
     last = taken[-1].number
     raw = max((each.number for each in taken if each.raw), default=0)

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int64
 
 from team.estimation import dense
 from team.estimation.contribution import Stream
+from team.estimation.map_joining.resting_kernel import packed_of, unpacked_of
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -109,13 +110,26 @@ class Resting:
     quadratic over the other nodes. They are no nodes of the graph until a submap observes them.
 
     ids: in the order in which they came to rest; two numbers each in the other arrays.
-    covariance: its upper triangle; what is below the diagonal is not read.
+    covariance: its upper triangle, as a square matrix or packed (`packed`); `upper` has the square.
     """
 
     ids: Indices
     means: Values
     gain: Float[np.ndarray, "r n"]
-    covariance: Float[np.ndarray, "r r"]
+    covariance: Float[np.ndarray, "r r"] | Values
+
+    @cached_property
+    def upper(self) -> Float[np.ndarray, "r r"]:
+        """The upper triangle as a square matrix; what is below the diagonal is not read."""
+        if self.covariance.ndim == 2:
+            return self.covariance
+        return unpacked_of(self.covariance, len(self.means))
+
+    @property
+    def packed(self) -> "Resting":
+        """The same in half the memory."""
+        packed = packed_of(self.covariance) if self.covariance.ndim == 2 else self.covariance
+        return replace(self, covariance=packed)
 
     @cached_property
     def place(self) -> Mapping[int, int]:
@@ -151,6 +165,11 @@ class Condensed:
     redundancy: int
     departed: Departed = field(default=NOBODY)
     resting: Resting | None = None
+
+    @property
+    def packed(self) -> "Condensed":
+        """The same factor, to be stored."""
+        return self if self.resting is None else replace(self, resting=self.resting.packed)
 
     def moved(self, state: Values, numbers: Indices) -> Values:
         """Difference d = state − at, headings wrapped: the distance from the linearisation

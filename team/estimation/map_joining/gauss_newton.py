@@ -413,7 +413,7 @@ class Island(least_squares.Iterate):
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
-        return own_blocks(old.resting.covariance, self.resting_spread)
+        return own_blocks(old.resting.upper, self.resting_spread)
 
 
 def aged(island: Island, iterations: int | None) -> Island:

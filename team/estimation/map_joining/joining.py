@@ -290,12 +290,14 @@ def folded(
 def compacted(fold: Fold) -> Fold:
     """The same fold without the values that can be computed again from it: a checkpoint to store.
 
-    It shares the submaps with the folds before and after it. Of its own it has the state and the
-    graph's nodes, a hundredth of the size of a solved fold.
+    It shares the submaps with the folds before and after it. Of its own it has the state, the
+    graph's nodes and what is condensed, whose symmetric matrices are packed.
     """
-    islands = {
-        key: replace(island, graph=replace(island.graph)) for key, island in fold.islands.items()
-    }
+    islands = {}
+    for key, island in fold.islands.items():
+        old = island.graph.condensed
+        graph = replace(island.graph, condensed=None if old is None else old.packed)
+        islands[key] = replace(island, graph=graph)
     return replace(fold, islands=islands)
 
 

@@ -110,7 +110,7 @@ def _with_resting(
     numbers = places(2 * np.arange(len(rest.ids) + 1), at)
     cross = dense.product(rest.gain[numbers], with_boundary.T)
     spread = island.resting_spread[numbers]
-    among = dense.product(spread, spread.T) + between(rest.covariance, numbers, numbers)
+    among = dense.product(spread, spread.T) + between(rest.upper, numbers, numbers)
     return np.block([[covariance, cross.T], [cross, 0.5 * (among + among.T)]])
 
 

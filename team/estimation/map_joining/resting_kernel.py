@@ -22,6 +22,31 @@ def upper_of(upper: Matrix, chosen: Indices, size: int) -> Matrix:
 
 
 @compiled
+def packed_of(upper: Matrix) -> Float[np.ndarray, " _"]:
+    """The upper triangle, row after row."""
+    n = len(upper)
+    result = np.empty(n * (n + 1) // 2)
+    at = 0
+    for a in range(n):
+        for b in range(a, n):
+            result[at] = upper[a, b]
+            at += 1
+    return result
+
+
+@compiled
+def unpacked_of(packed: Float[np.ndarray, " _"], size: int) -> Matrix:
+    """The square matrix with this upper triangle, and zeros below."""
+    result = np.zeros((size, size))
+    at = 0
+    for a in range(size):
+        for b in range(a, size):
+            result[a, b] = packed[at]
+            at += 1
+    return result
+
+
+@compiled
 def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:
     """The entries of these rows and columns of a symmetric matrix of which the upper triangle is
     there.

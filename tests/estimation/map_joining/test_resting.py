@@ -107,8 +107,8 @@ def test_what_wakes_without_the_others_being_conditioned_on_it_is_seen():
             old, new = (each.main.graph.condensed for each in (before, after))
             places = np.repeat(np.isin(old.resting.ids, sorted(stays)), 2)
             kept = np.repeat(np.isin(new.resting.ids, sorted(stays)), 2)
-            wrong = new.resting.covariance.copy()
-            wrong[np.ix_(kept, kept)] = old.resting.covariance[np.ix_(places, places)]
+            wrong = new.resting.upper.copy()
+            wrong[np.ix_(kept, kept)] = old.resting.upper[np.ix_(places, places)]
             resting = replace(new.resting, covariance=wrong)
             graph = replace(after.main.graph, condensed=replace(new, resting=resting))
             mutant = replace(after, islands={after.main_key: replace(after.main, graph=graph)})
