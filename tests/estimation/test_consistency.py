@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import chdtri
 
 from team.estimation.consistency import (
     chi2_interval,
@@ -71,3 +72,9 @@ def test_what_is_no_covariance_is_named():
 def test_quantiles_that_are_written_as_numbers_are_those_of_the_library() -> None:
     assert chi2_limit(1, 1e-3) == UNLIKELY
     assert chi2_quantile(0.9999, 2) == GATE
+
+
+def test_limits_of_few_degrees_of_freedom_are_the_librarys_to_twelve_digits() -> None:
+    for tail in (1e-2, 1e-3, 1e-6):
+        for dof in (*range(1, 40), 99, 100, 599, 600):
+            assert chi2_limit(dof, tail) == float(f"{chdtri(dof, tail):.12g}")
