@@ -123,7 +123,7 @@ def _solve_column(
     row.
     """
     count = len(structure[0]) - 1
-    x = np.empty(np.max(np.diff(structure[1])))
+    x = np.empty(len(right))
     for s in range(first, count):
         rows, panel = _panel(structure, panels, s)
         width, m = panel.shape
