@@ -98,11 +98,17 @@ def exponential(xi: Pose) -> Pose:
 
 
 @compiled
+def half_cotangent(turn: float) -> float:
+    """(θ/2) cot(θ/2), the diagonal of V(θ)⁻¹ (V of `swept`); 1 at θ = 0."""
+    half = 0.5 * turn
+    return 1.0 - half * half / 3.0 if abs(turn) < 1e-4 else half / elementary.tan(half)
+
+
+@compiled
 def logarithm(pose: Pose) -> Pose:
     """Log: SE(2) → R³, the inverse of `exponential` for |theta| < π."""
     turn = wrapped(pose[2])
-    half = 0.5 * turn
-    a = 1.0 - half * half / 3.0 if abs(turn) < 1e-4 else half / elementary.tan(half)
+    half, a = 0.5 * turn, half_cotangent(turn)
     return np.array([a * pose[0] + half * pose[1], -half * pose[0] + a * pose[1], turn])
 
 

@@ -1,4 +1,11 @@
-"""Moment matching: a mixture of particles becomes one Gaussian, headings on the circle."""
+"""Moment matching: a mixture of particles becomes one Gaussian, headings on the circle.
+
+Poses after a way with an uncertain heading lie on a bent strip. The mean of their coordinates lies
+inside of its bend, short of where the robot went, and the centre, which solves for each submap's
+pose again, would find each way too short. A submap's poses have their mean and scatter on SE(2),
+where the strip is straight: pose = μ ∘ Exp(ξ) with ξ of mean zero, as odometry has its noise (Long,
+Wolfe, Mashner and Chirikjian 2012, The banana distribution is Gaussian).
+"""
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -6,8 +13,8 @@ from jaxtyping import Float, Int64, UInt32
 from team.estimation import elementary
 from team.estimation.compiled import compiled
 from team.estimation.gaussian import factor_or_fault
-from team.estimation.geometry import wrapped
-from team.estimation.placing import put_block
+from team.estimation.geometry import half_cotangent, wrapped
+from team.estimation.placing import put, put_block
 
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
@@ -54,6 +61,42 @@ def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
 
 
 @compiled
+def on_group(
+    poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "M 3"]]:
+    """The mean pose μ on SE(2), and each pose's deviation from it in (x, y, theta).
+
+    μ's heading is the mean direction, its position the one with Σ wᵢ ξᵢ = 0 for the translations of
+    ξᵢ = Log(μ⁻¹ ∘ poseᵢ). With Log(x, y, φ) = V(φ)⁻¹ (x, y), V(φ)⁻¹ = [[a, φ/2], [−φ/2, a]] and
+    a = (φ/2) cot(φ/2), that is linear: Σ wᵢ V(φᵢ)⁻¹ R(μ)ᵀ (pᵢ − p) = 0. A deviation is ξᵢ turned by
+    μ's heading.
+    """
+    count = len(poses)
+    heading = mean_direction(poses[:, 2], weights)
+    s, c = elementary.sin_and_cos(heading)
+    offs = np.empty((count, 3))
+    near, half, x, y = 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        turn = wrapped(poses[i, 2] - heading)
+        a, b = half_cotangent(turn), 0.5 * turn
+        ahead, left = c * poses[i, 0] + s * poses[i, 1], c * poses[i, 1] - s * poses[i, 0]
+        offs[i, 0], offs[i, 1], offs[i, 2] = a * ahead + b * left, a * left - b * ahead, turn
+        near += weights[i] * a
+        half += weights[i] * b
+        x += weights[i] * offs[i, 0]
+        y += weights[i] * offs[i, 1]
+    square = near * near + half * half
+    ahead, left = (near * x - half * y) / square, (near * y + half * x) / square
+    for i in range(count):
+        turn = offs[i, 2]
+        a, b = half_cotangent(turn), 0.5 * turn
+        along = offs[i, 0] - (a * ahead + b * left)
+        across = offs[i, 1] - (a * left - b * ahead)
+        offs[i, 0], offs[i, 1] = c * along - s * across, s * along + c * across
+    return np.array([c * ahead - s * left, s * ahead + c * left, heading]), offs
+
+
+@compiled
 def moments(
     poses: Float[np.ndarray, "M p"],
     weights: Float[np.ndarray, " M"],
@@ -66,6 +109,17 @@ def moments(
     Each particle has p/3 poses (x, y, theta), one behind the other. The scatter between the
     particles is taken times `between`: 1 for the mixture itself, see `sample_factor`.
     """
+    mean, deviations = _of_coordinates(poses, weights, means)
+    return mean, _covariance(deviations, weights, covariances, between)
+
+
+@compiled
+def _of_coordinates(
+    poses: Float[np.ndarray, "M p"],
+    weights: Float[np.ndarray, " M"],
+    means: Float[np.ndarray, "M L 2"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "M n"]]:
+    """The mean of the coordinates, and each particle's deviations from it."""
     count, p = poses.shape
     n = p + 2 * means.shape[1]
     deviations = np.empty((count, n))
@@ -77,17 +131,33 @@ def moments(
             mean[j] += weights[i] * deviations[i, j]
     for heading in range(2, p, 3):
         mean[heading] = mean_direction(poses[:, heading], weights)
-    P = np.zeros((n, n))
     for i in range(count):
         for j in range(n):
             deviations[i, j] -= mean[j]
         for heading in range(2, p, 3):
             deviations[i, heading] = wrapped(deviations[i, heading])
+    return mean, deviations
+
+
+@compiled
+def _covariance(
+    deviations: Float[np.ndarray, "M n"],
+    weights: Float[np.ndarray, " M"],
+    covariances: Float[np.ndarray, "M L 3"],
+    between: float,
+) -> Float[np.ndarray, "n n"]:
+    """`between` times the scatter of the deviations, and the mean of the landmarks' own
+    covariances.
+    """
+    count, n = deviations.shape
+    p = n - 2 * covariances.shape[1]
+    P = np.zeros((n, n))
+    for i in range(count):
         for j in range(n):
             scaled = between * weights[i] * deviations[i, j]
             for k in range(j + 1):
                 P[j, k] += scaled * deviations[i, k]
-        for landmark in range(means.shape[1]):
+        for landmark in range(covariances.shape[1]):
             j = p + 2 * landmark
             P[j, j] += weights[i] * covariances[i, landmark, 0]
             P[j + 1, j] += weights[i] * covariances[i, landmark, 1]
@@ -95,7 +165,7 @@ def moments(
     for j in range(n):
         for k in range(j):
             P[k, j] = P[j, k]
-    return mean, P
+    return P
 
 
 @compiled
@@ -106,10 +176,15 @@ def submap_moments(
     covariances: Float[np.ndarray, "M L 3"],
     between: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"], int]:
-    """`moments` with POSE_JITTER on each pose; and the index in `gaussian.FAULTS` of why they are
-    no Gaussian.
+    """`moments` with the poses' mean and deviations `on_group`, and POSE_JITTER on each pose; and
+    the index in `gaussian.FAULTS` of why they are no Gaussian.
     """
-    mean, P = moments(poses, weights, means, covariances, between)
+    mean, deviations = _of_coordinates(poses, weights, means)
+    for pose in range(0, poses.shape[1], 3):
+        at, off = on_group(np.ascontiguousarray(poses[:, pose : pose + 3]), weights)
+        put(mean, pose, at)
+        put_block(deviations, 0, pose, off)
+    P = _covariance(deviations, weights, covariances, between)
     for i in range(poses.shape[1]):
         P[i, i] += POSE_JITTER[i % 3]
     _, fault = factor_or_fault(P)

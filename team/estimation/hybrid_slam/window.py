@@ -243,9 +243,9 @@ def moments_matched(
     """One Gaussian over (end pose, pose nodes, landmarks by ascending id).
 
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
-    Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ, headings on the circle (Xu, eq. 4.5-4.6), plus
-    POSE_JITTER. Poses and landmarks are those of the base, in the frame of its start. The
-    derivatives by the biases come from `sensitivity.columns`.
+    Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on
+    SE(2) (`moments.on_group`), plus POSE_JITTER. Poses and landmarks are those of the base, in the
+    frame of its start. The derivatives by the biases come from `sensitivity.columns`.
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
     ids, means, covariances = landmarks

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 
 from team.estimation import dense, elementwise
 from team.estimation.geometry import Pose, wrapped
-from team.estimation.hybrid_slam.moments import POSE_JITTER, mean_direction, sample_factor
+from team.estimation.hybrid_slam.moments import POSE_JITTER, on_group, sample_factor
 from team.estimation.hybrid_slam.window import Window
 
 
@@ -35,14 +35,14 @@ class WindowPath:
 def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
     """The path of a closed window's particles, regressed on their end.
 
-    With the particles' covariances P over (x_k, end), gain = P_ke P_ee⁻¹ and what is left is
-    P_kk − gain P_ek; P_ee has POSE_JITTER as the submap's end has.
+    With the particles' covariances P over (x_k, end), about the submap's means (`on_group`), gain =
+    P_ke P_ee⁻¹ and what is left is P_kk − gain P_ek; P_ee has POSE_JITTER as the submap's end has.
     """
     weights = elementwise.exp(window.particles.log_weights)
     poses = np.concatenate((window.paths, window.particles.poses[None]))
-    means = np.array([_mean(each, weights) for each in poses])
-    off = poses - means[:, None]
-    off[:, :, 2] = elementwise.atan2(elementwise.sin(off[:, :, 2]), elementwise.cos(off[:, :, 2]))
+    means, off = (
+        np.array(each) for each in zip(*(on_group(at, weights) for at in poses), strict=True)
+    )
     scaled = sample_factor(weights) * weights[None, :, None] * off
     P_ee = dense.product(scaled[-1].T, off[-1]) + np.diag(POSE_JITTER)
     P_ke = np.einsum("kmi,mj->kij", scaled[:-1], off[-1])
@@ -97,7 +97,3 @@ def placed(
             dense.product(J, ends.covariance), J.T
         ) + covariance_factor * (dense.product(dense.product(turn, left), turn.T))
     return poses, 0.5 * (covariances + covariances.transpose(0, 2, 1))
-
-
-def _mean(poses: Float[np.ndarray, "M 3"], weights: Float[np.ndarray, " M"]) -> Pose:
-    return np.array([*(dense.product(weights, poses[:, :2])), mean_direction(poses[:, 2], weights)])

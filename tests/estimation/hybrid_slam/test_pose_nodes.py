@@ -31,14 +31,22 @@ def driven(marks, particles=200, sensor=SENSOR, biases=()):
     return window
 
 
-def test_a_node_is_the_weighted_mean_of_the_particles_of_its_keyframe():
+def off(poses, mean):
+    """Log(mean⁻¹ ∘ pose) of each pose, turned by the mean's heading."""
+    turn = wrap(poses[:, 2] - mean[2])
+    apart = (poses[:, :2] - mean[:2]) @ np.array([1.0, 1j])
+    apart *= 0.5 * turn / np.tan(0.5 * turn) - 0.5j * turn
+    return np.column_stack([apart.real, apart.imag, turn])
+
+
+def test_a_node_is_the_weighted_mean_of_the_particles_of_its_keyframe_on_se2():
     window = driven({1, 3})
     local = windows.gaussian(window)
     weights = np.exp(window.particles.log_weights)
     assert local.node_stamps.tolist() == [1000, 3000]
     for node, keyframe in zip(local.nodes, (1, 3), strict=True):
         poses = window.paths[keyframe]
-        np.testing.assert_allclose(node[:2], weights @ poses[:, :2])
+        np.testing.assert_allclose((weights @ off(poses, node))[:2], 0.0, atol=1e-12)
         direction = np.angle(weights @ np.exp(1j * poses[:, 2]))
         np.testing.assert_allclose(wrap(node[2] - direction), 0.0, atol=1e-12)
 
@@ -47,8 +55,9 @@ def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
     window = driven({1, 2})
     local = windows.gaussian(window)
     weights = np.exp(window.particles.log_weights)
-    both = np.concatenate([window.particles.poses, window.paths[1], window.paths[2]], axis=1)
-    deviations = both - local.mean[:9]
+    poses = window.particles.poses, window.paths[1], window.paths[2]
+    means = local.end_pose, *local.nodes
+    deviations = np.hstack([off(*each) for each in zip(poses, means, strict=True)])
     expected = (weights[:, None] * deviations).T @ deviations
     effective = 1.0 / np.sum(weights**2)
     expected *= effective / (effective - 5.0)  # what a sample's inverse is too large by
