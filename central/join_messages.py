@@ -21,7 +21,7 @@ from team.config import UNNAMED
 from team.estimation.contribution import Stream, named
 from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.associating import IslandView
-from team.estimation.map_joining.distinctness import maybe_the_same
+from team.estimation.map_joining.distinctness import lost, maybe_the_same, weakly_placed
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
 from team.estimation.map_joining.refusal import refusals
@@ -118,14 +118,20 @@ class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
     undecided: landmarks that are left out since each may be one with another, which is shown.
+    weak: landmarks that are left out since only submaps of a poorly known heading have them.
+    headings: of the streams that were lost, the standard deviation [rad] of their least known one.
     """
 
     ids: Sequence[int] = ()
     undecided: Mapping[int, int] = MappingProxyType({})
+    weak: Sequence[int] = ()
+    headings: Mapping[Stream, float] = MappingProxyType({})
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
-    """The landmarks of the map; the final one has only those that are known to be different."""
+    """The landmarks of the map; the final one has only those that are known to be different, and of
+    those without names only what a known heading has placed.
+    """
     if not fold.contributions:
         return Shown()
     if tail != "final":
@@ -135,8 +141,11 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     unnamed = [id_ for id_ in ids if id_ >= UNNAMED]
     if not unnamed:
         return Shown(ids)
-    undecided = maybe_the_same(IslandView(fold.main, fold.landmarks), unnamed)
-    return Shown([id_ for id_ in ids if id_ not in undecided], undecided)
+    weak = weakly_placed(fold.main, unnamed)
+    view = IslandView(fold.main, fold.landmarks)
+    undecided = maybe_the_same(view, sorted({*unnamed} - {*weak}))
+    out = {*undecided, *weak}
+    return Shown([id_ for id_ in ids if id_ not in out], undecided, weak, lost(fold.main))
 
 
 def reasons(
@@ -147,9 +156,19 @@ def reasons(
         *_apart(fold),
         *_worded(refusals(fold)),
         *fold.warnings,
+        *_lost(shown),
         *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
+
+
+def _lost(shown: Shown) -> Iterator[str]:
+    """Where robots were lost for a while, in words."""
+    for stream, sigma in sorted(shown.headings.items()):
+        yield (
+            f"{named(stream)} was lost: its heading is known to {np.degrees(sigma):.0f}° at worst; "
+            "its path there is not to be trusted"
+        )
 
 
 def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...]:
@@ -157,7 +176,7 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
     if not fold.contributions:
         return ()
     known = landmark_view.known(fold.main)
-    out = sorted({*known} - {*shown.ids, *shown.undecided})
+    out = sorted({*known} - {*shown.ids, *shown.undecided, *shown.weak})
     needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
     pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
     named_out = [str(id_) for id_ in out if id_ < UNNAMED]
@@ -166,6 +185,7 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
         for why, count, names, most in (
             (f"{needed} submaps that agree needed", len(out), named_out, NAMED),
             ("may be one with another landmark", len(pairs), pairs, FEW),
+            ("seen by robots that were lost", len(shown.weak), (), 0),
         )
         if count
     )

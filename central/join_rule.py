@@ -141,7 +141,7 @@ class JoinRule(FusionRule[SubmapInputs]):
             cost=(0.0, 0.0) if agreement is None else (agreement.chi2, agreement.dof),
             covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
             biases=biases,
-            reasons=self.reasons,
+            reasons=self.findings if final else self.reasons,
         )
         self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)

@@ -259,3 +259,9 @@ def test_without_a_submap_the_final_map_is_empty():
     fused = only.message
     assert (fused.final, fused.ids, fused.members, fused.frame) == (True, b"", (), "")
     assert decoded(encoded(fused)) == fused
+
+
+def test_a_final_map_whose_covariances_are_too_small_says_so_itself():
+    assert not final(whole()).reasons
+    tight = final(whole(msgspec.structs.replace(CONFIG, covariance_factor=0.02)))
+    assert any("its covariances are not to be trusted" in words for words in tight.reasons)

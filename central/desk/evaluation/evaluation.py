@@ -36,7 +36,7 @@ from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.desk.evaluation.verdicts import verdicts_given
-from central.desk.names import in_order
+from central.desk.names import in_order, not_joined
 from central.team_config import TeamConfig, team_config
 from team import translate
 from team.estimation.gaussian import Matrix
@@ -294,6 +294,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "final_map_frame": None if fused is None else fused.frame,
         "frame_is_arbitrary": evaluation.arbitrary_frame,
         "not_joined": [] if fused is None else list(fused.reasons),
+        "warnings": [] if fused is None else [w for w in fused.reasons if not any(not_joined([w]))],
         "joined": [] if fused is None else list(fused.joined),
         "withdrawn": [] if fused is None else list(fused.withdrawn),
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},

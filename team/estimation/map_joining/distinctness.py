@@ -1,39 +1,50 @@
-"""Which landmarks of a map are known to be different ones.
+"""Which landmarks of a map are known to be different ones, and which are placed by a known heading.
 
 Association merges two landmarks only where no rival comes near, and otherwise waits. Until it is
 decided they may be one: a map that shows both may show one landmark twice.
 """
 
+import math
 from collections.abc import Collection
 
 import numpy as np
 
+from team.estimation.contribution import Stream
 from team.estimation.map_joining.associating import IslandView
 from team.estimation.map_joining.association.growing import Indices, likelihoods
+from team.estimation.map_joining.gauss_newton import Island
+from team.estimation.map_joining.nonlinearity import heading_sigma
 
 
 def maybe_the_same(view: IslandView, ids: Collection[int]) -> dict[int, int]:
     """Of these landmarks, those that may be one with another one, each with the likeliest other
     one, which stays.
 
-    They may be one with the log-likelihood ratio (`growing`) with which a pair is merged that has
-    no rival. The landmark that more submaps have observed stays; of equal ones the one with fewer
-    such pairs, then that with the smaller identity.
+    They may be one where they are within the gate, and have the log-likelihood ratio (`growing`)
+    with which a pair is merged that has no rival, or would not have it even at one place: where
+    more landmarks may lie in the gate than there is evidence for, nothing is known. The landmark
+    whose position is known best stays, by the area of its covariance's ellipse.
     """
     profile, joint = view.profile, view.joint
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)
     one, two = (own[each] for each in np.triu_indices(len(own), 1))
     at = likelihoods(joint, one, two, profile)
-    maybe = (at.chi2 < profile.gate) & (at.llr >= profile.llr_tight) & ~joint.apart[one, two]
+    told = at.llr + 0.5 * at.chi2 >= profile.llr_tight
+    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~told)
+    maybe &= ~joint.apart[one, two]
     llr: dict[int, dict[int, float]] = {}
     for a, b, ratio in zip(
         one[maybe].tolist(), two[maybe].tolist(), at.llr[maybe].tolist(), strict=True
     ):
         llr.setdefault(a, {})[b] = llr.setdefault(b, {})[a] = ratio
-    counts = np.bincount(np.concatenate(view.seen_by), minlength=len(view.ids))
+    n = len(joint.mean)
+    xx, xy, _, yy = (
+        joint.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].reshape(n, 4).T
+    )
+    area = xx * yy - xy * xy
     stays: set[int] = set()
     out: dict[int, int] = {}
-    for each in sorted(llr, key=lambda k: (-int(counts[k]), len(llr[k]), view.ids[k])):
+    for each in sorted(llr, key=lambda k: (float(area[k]), view.ids[k])):
         others = [other for other in llr[each] if other in stays]
         if others:
             likeliest = max(others, key=lambda other: (llr[each][other], -view.ids[other]))
@@ -41,3 +52,31 @@ def maybe_the_same(view: IslandView, ids: Collection[int]) -> dict[int, int]:
         else:
             stays.add(each)
     return out
+
+
+def weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
+    """Of these landmarks, those that only submaps of a poorly known heading have, ascending.
+
+    A covariance is linear in the heading: of a place at a distance d that turns by an error θ it
+    leaves out d (1 − cos θ), which at the limit for a rigid alignment (`alignment_heading_sigma`)
+    and three standard deviations is d/3, in a direction that it takes for known.
+    """
+    best: dict[int, float] = {}
+    for submap in island.graph.submaps:
+        sigma = min(heading_sigma(island, node) for node in submap.nodes[:2].tolist())
+        for node in submap.landmarks[submap.landmarks >= 0].tolist():
+            best[node] = min(sigma, best.get(node, math.inf))
+    limit, node_of = island.settings.alignment_heading_sigma, island.graph.landmarks
+    return [id_ for id_ in sorted(ids) if best.get(node_of.get(id_, -1), 0.0) > limit]
+
+
+def lost(island: Island) -> dict[Stream, float]:
+    """The largest standard deviation [rad] of a heading of each stream where it exceeds
+    `alignment_heading_sigma`.
+    """
+    worst = {
+        stream: max(heading_sigma(island, node) for node in nodes)
+        for stream, nodes in island.graph.streams.items()
+    }
+    limit = island.settings.alignment_heading_sigma
+    return {stream: sigma for stream, sigma in worst.items() if sigma > limit}

@@ -27,7 +27,12 @@ from team.estimation.map_joining.gauss_newton import (
     final_cost,
     settled,
 )
-from team.estimation.map_joining.nonlinearity import ends, nonlinearity_warnings, profile
+from team.estimation.map_joining.nonlinearity import (
+    ends,
+    heading_sigma,
+    nonlinearity_warnings,
+    profile,
+)
 from team.estimation.map_joining.relaxation import relaxed
 from team.estimation.sparse_cholesky import sparse_kernel
 
@@ -306,10 +311,7 @@ def warnings(search: Search) -> list[str]:
 
 def _heading_sigmas(island: Island) -> dict[Stream, float]:
     """For each stream the standard deviation [rad] of its best known heading."""
-    graph, covariance = island.graph, island.selected_covariance
     return {
-        stream: 0.0
-        if graph.fixed[list(nodes)].any()
-        else min(math.sqrt(graph.pattern.diagonal_block(covariance, node)[2, 2]) for node in nodes)
-        for stream, nodes in graph.streams.items()
+        stream: min(heading_sigma(island, node) for node in nodes)
+        for stream, nodes in island.graph.streams.items()
     }

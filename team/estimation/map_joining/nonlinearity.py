@@ -7,6 +7,7 @@ ten times the rise: the robot may well be at a place that its covariance exclude
 minimum is right.
 """
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -53,6 +54,14 @@ class UnderstatedUncertainty(NamedTuple):
     def ratio(self) -> float:
         """χ² by the covariance over the rise of the cost; 1 where the cost is quadratic."""
         return self.chi2 / max(self.rise, 1.0)
+
+
+def heading_sigma(island: Island, node: int) -> float:
+    """The standard deviation [rad] of a pose's heading; 0 of a pose that is given."""
+    graph = island.graph
+    if graph.fixed[node]:
+        return 0.0
+    return math.sqrt(graph.pattern.diagonal_block(island.selected_covariance, node)[2, 2])
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:

@@ -15,9 +15,11 @@ SD = 0.01
 PAIR = [(2.0, 0.0), (2.0, 0.2)]
 
 
-def seen(sequence: int, places: list[tuple[float, float]], pose_sd: float) -> Contribution:
+def seen(
+    sequence: int, places: list[tuple[float, float]], pose_sd: float, heading_sd: float = 0.001
+) -> Contribution:
     """A submap of a robot that stands, with landmarks that one keyframe saw together."""
-    sd = np.array([pose_sd, pose_sd, 0.001, *[SD] * (2 * len(places))])
+    sd = np.array([pose_sd, pose_sd, heading_sd, *[SD] * (2 * len(places))])
     local = LocalMap(
         (UNNAMED + np.arange(len(places))).astype(np.uint32),
         np.concatenate([np.zeros(3), np.ravel(places)]),
@@ -27,12 +29,18 @@ def seen(sequence: int, places: list[tuple[float, float]], pose_sd: float) -> Co
     return Contribution("r1", 1, sequence, (sequence + 1) * 10**10, local)
 
 
-def folded(later: tuple[float, float], verdicts: tuple[Verdict, ...] = ()) -> Fold:
+def folded(
+    later: tuple[float, float],
+    verdicts: tuple[Verdict, ...] = (),
+    times: int = 2,
+    heading_sd: float = 0.001,
+) -> Fold:
     """Two neighbours are seen twice; after a motion with an error of 0.3 m one landmark is."""
-    views = [(PAIR, SD), (PAIR, 0.3), ([later], SD), ([later], SD)]
     fold = EMPTY_FOLD
-    for k, (places, pose_sd) in enumerate(views):
-        tick = Tick([seen(k, places, pose_sd)], verdicts=verdicts if k == 3 else ())
+    for k in range(2 + times):
+        places, pose_sd = (PAIR if k < 2 else [later]), (0.3 if k == 1 else SD)
+        contribution = seen(k, places, pose_sd, heading_sd if k == 1 else 0.001)
+        tick = Tick([contribution], verdicts=verdicts if k == 3 else ())
         fold = taken(fold, tick, JoinSettings())
     return fold
 
@@ -63,3 +71,25 @@ def test_a_landmark_that_is_another_one_is_shown(how: str) -> None:
     shown = shown_landmarks(fold, CentralConfig(), "final")
     assert len(shown.ids) == 3
     assert not shown.undecided
+
+
+def test_of_what_may_be_one_landmark_the_place_that_is_known_best_is_shown() -> None:
+    fold = folded((2.0, 0.1), times=4)  # more submaps have seen it than either of the two
+    one, two = (fold.landmarks.identity(member(0, k)) for k in (0, 1))
+    assert {*shown_landmarks(fold, CentralConfig(), "final").ids} == {one, two}
+
+
+@pytest.mark.parametrize(("heading_sd", "is_lost"), [(0.2, False), (0.5, True)])
+def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(
+    heading_sd: float, is_lost: bool
+) -> None:
+    fold = folded((8.0, 0.0), heading_sd=heading_sd)
+    third = fold.landmarks.identity(member(2, 0))
+    shown = shown_landmarks(fold, CentralConfig(), "final")
+    assert (third in shown.ids) is not is_lost
+    assert [*shown.weak] == [third] * is_lost
+    words = reasons(fold, shown, (), 1)
+    assert len(words) == 2 * is_lost
+    assert not is_lost or words[0].startswith("r1 (incarnation 1) was lost: its heading is known")
+    assert not is_lost or words[1] == "left out, seen by robots that were lost: 1 of 3 landmarks"
+    assert third in shown_landmarks(fold, CentralConfig(), "closed").ids

@@ -47,9 +47,10 @@ def jointly(
     """The pairs of candidates on which nearly all of the weight of joint assignments agrees.
 
     A pair needs log odds of `odds` against all assignments without it. Where the standard deviation
-    of one of the pairs exceeds `tight`, all of them together need a log-likelihood ratio of
+    of one of these pairs exceeds `tight`, all of them together need a log-likelihood ratio of
     `llr_loose`, as a single such pair does (`growing.needed`): where little is known, a few
-    landmarks fit others by chance.
+    landmarks fit others by chance. Where it exceeds `tight` but for pairs of the assignment that
+    are not accepted, the assignment as a whole needs it.
     most_sd: candidates with a larger standard deviation are left out.
     """
     at = likelihoods(joint, first, second, profile)
@@ -81,7 +82,7 @@ def jointly(
         best = longer[0].weight
         lost += sum(float(elementwise.exp(one.weight - best)) for one in longer[BEAM:])
         assigned = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
-    return _agreed(joint, assigned, involved, profile, lost)
+    return _agreed((joint, part), assigned, involved, profile, lost)
 
 
 def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
@@ -134,7 +135,7 @@ def _fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[
 
 
 def _agreed(
-    joint: Joint,
+    joints: tuple[Joint, Joint],
     assigned: list[_Assignment],
     involved: Indices,
     profile: AssociationProfile,
@@ -142,8 +143,10 @@ def _agreed(
 ) -> Grown:
     """The pairs of the best assignment that the others contain as well, by weight.
 
+    joints: of all landmarks, and of those that are involved, before any pair is taken.
     lost: the weight of the dropped assignments, relative to the best one's.
     """
+    joint, part = joints
     best = assigned[0]
     weights = elementwise.exp(np.array([one.weight - best.weight for one in assigned]))
     others = [{pair.first: pair.second for pair in one.pairs} for one in assigned]
@@ -157,13 +160,36 @@ def _agreed(
         )
         if odds >= profile.odds:
             sure.append(pair._replace(rival=pair.llr - odds))
-    if any(pair.sd > profile.tight for pair in sure) and (
-        sum(pair.llr for pair in sure) < profile.llr_loose
-    ):
-        sure = []
+    alone = sure if len(sure) == len(best.pairs) else _without_the_others(part, sure, profile)
+    if _loose(sure, profile) and sum(pair.llr for pair in sure) < profile.llr_loose:
+        alone = []
+    if _loose(alone, profile) and best.weight < profile.llr_loose:
+        alone = []
     pairs = []
-    for pair in sure:
+    for pair in alone:
         own = pair._replace(first=int(involved[pair.first]), second=int(involved[pair.second]))
         joint = conditioned(joint, own.first, own.second, profile)
         pairs.append(own)
     return Grown(tuple(pairs), joint, 0)
+
+
+def _loose(pairs: list[Pair], profile: AssociationProfile) -> bool:
+    """Whether the difference of one of these pairs is poorly known."""
+    return any(pair.sd > profile.tight for pair in pairs)
+
+
+def _without_the_others(part: Joint, sure: list[Pair], profile: AssociationProfile) -> list[Pair]:
+    """The sure pairs with their figures given each other alone; none where one does not fit then.
+
+    In its assignment each was weighed given all pairs before it. What is known well only if a pair
+    is right that is not accepted is not known well.
+    """
+    found = []
+    for pair in sure:
+        at = likelihoods(part, np.array([pair.first]), np.array([pair.second]), profile)
+        if at.chi2[0] > profile.gate:
+            return []
+        llr = float(at.llr[0])
+        found.append(pair._replace(llr=llr, sd=float(at.sd[0]), rival=llr - pair.llr + pair.rival))
+        part = conditioned(part, pair.first, pair.second, profile)
+    return found

@@ -58,6 +58,22 @@ def test_a_few_loosely_known_landmarks_that_fit_others_by_chance_wait() -> None:
         assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(pairs)]
 
 
+def test_what_only_a_doubtful_pair_makes_well_known_is_not_well_known() -> None:
+    twins_and_another = [(0.0, 0.0), (0.25, 0.0), (3.0, 1.0)]
+    points = np.array([*twins_and_another, (0.12, 0.0), (3.0, 1.0)])  # the first is either twin
+    shift = np.zeros((10, 2))  # an error of 1 m that what is seen again has in common
+    shift[6::2, 0] = shift[7::2, 1] = 1.0
+    seen = np.arange(5) >= 3
+    apart = (seen[:, None] == seen) & ~np.eye(5, dtype=np.bool_)
+    joint = Joint(points, 0.05**2 * np.eye(10) + shift @ shift.T, apart)
+    one, two = (each.ravel() for each in np.meshgrid([3, 4], [0, 1, 2], indexing="ij"))
+    for density, pairs in ((0.05, []), (0.006, [(4, 2)])):
+        profile = AssociationProfile(slack=0.0, density=density, same=0.1)
+        found = jointly(joint, one, two, profile, 2.0)
+        assert [(p.first, p.second) for p in found.pairs] == pairs
+        assert all(p.sd > 1.0 for p in found.pairs), "it is known to a metre, whatever the first is"
+
+
 def _submap(points: np.ndarray, together: bool) -> LocalMap:
     n = len(points)
     seen = np.ones((n, 1), np.bool_) if together else np.eye(n, dtype=np.bool_)
