@@ -86,7 +86,7 @@ def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(
     fold = folded((8.0, 0.0), heading_sd=heading_sd)
     third = fold.landmarks.identity(member(2, 0))
     shown = shown_landmarks(fold, CentralConfig(), "final")
-    assert (third in shown.ids) is not is_lost
+    assert (third in shown.ids) != is_lost
     assert [*shown.weak] == [third] * is_lost
     words = reasons(fold, shown, (), 1)
     assert len(words) == 2 * is_lost
