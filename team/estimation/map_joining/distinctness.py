@@ -29,8 +29,8 @@ def maybe_the_same(view: IslandView, ids: Collection[int]) -> dict[int, int]:
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)
     one, two = (own[each] for each in np.triu_indices(len(own), 1))
     at = likelihoods(joint, one, two, profile)
-    told = at.llr + 0.5 * at.chi2 >= profile.llr_tight
-    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~told)
+    decidable = at.llr + 0.5 * at.chi2 >= profile.llr_tight
+    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~decidable)
     maybe &= ~joint.apart[one, two]
     llr: dict[int, dict[int, float]] = {}
     for a, b, ratio in zip(
