@@ -1,6 +1,4 @@
-"""Makes the messages of the rule `join` from a fold: the team's map, priors for its robots,
-their paths.
-"""
+"""Makes the messages of the rule `join` from a fold: the map, priors for robots, their paths."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -21,7 +19,7 @@ from team.config import UNNAMED
 from team.estimation.contribution import Stream, named
 from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.associating import IslandView
-from team.estimation.map_joining.distinctness import lost, maybe_the_same, weakly_placed
+from team.estimation.map_joining.distinctness import lost, maybe_the_same, missed, weakly_placed
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
 from team.estimation.map_joining.refusal import refusals
@@ -33,9 +31,8 @@ from team.wire.bus import Outgoing
 PRIOR_LANDMARKS = 30
 """Most landmarks in a robot's prior: the nearest ones."""
 CONFIRMED_BY = 2
-"""Least number of submaps of a landmark without identity in the final map: a few false
-detections in a row look like a landmark in a single window. Running maps show tentative ones,
-too."""
+"""Least number of submaps of a landmark without identity in the final map: a few false detections
+in a row look like a landmark in a single window. Running maps show tentative ones, too."""
 NAMED = 10
 """Most landmarks left out of the map, refusals, and robots of an island that are named."""
 FEW = 3
@@ -119,18 +116,20 @@ class Shown(NamedTuple):
 
     undecided: landmarks that are left out since each may be one with another, which is shown.
     weak: landmarks that are left out since only submaps of a poorly known heading have them.
+    missed: landmarks that are left out since nearly all submaps that look there miss them.
     headings: of the streams that were lost, the standard deviation [rad] of their least known one.
     """
 
     ids: Sequence[int] = ()
     undecided: Mapping[int, int] = MappingProxyType({})
     weak: Sequence[int] = ()
+    missed: Sequence[int] = ()
     headings: Mapping[Stream, float] = MappingProxyType({})
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     """The landmarks of the map; the final one has only those that are known to be different, and of
-    those without names only what a known heading has placed.
+    those without names only what a known heading has placed and not most have missed.
     """
     if not fold.contributions:
         return Shown()
@@ -142,10 +141,11 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     if not unnamed:
         return Shown(ids)
     weak = weakly_placed(fold.main, unnamed)
-    view = IslandView(fold.main, fold.landmarks)
-    undecided = maybe_the_same(view, sorted({*unnamed} - {*weak}))
-    out = {*undecided, *weak}
-    return Shown([id_ for id_ in ids if id_ not in out], undecided, weak, lost(fold.main))
+    seldom = missed(fold, {*unnamed} - {*weak})
+    out, view = {*weak, *seldom}, IslandView(fold.main, fold.landmarks)
+    undecided = maybe_the_same(view, {*unnamed} - out)
+    left = [id_ for id_ in ids if id_ not in out | {*undecided}]
+    return Shown(left, undecided, weak, seldom, lost(fold.main))
 
 
 def reasons(
@@ -176,7 +176,7 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
     if not fold.contributions:
         return ()
     known = landmark_view.known(fold.main)
-    out = sorted({*known} - {*shown.ids, *shown.undecided, *shown.weak})
+    out = sorted({*known} - {*shown.ids, *shown.undecided, *shown.weak, *shown.missed})
     needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
     pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
     named_out = [str(id_) for id_ in out if id_ < UNNAMED]
@@ -186,6 +186,7 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
             (f"{needed} submaps that agree needed", len(out), named_out, NAMED),
             ("may be one with another landmark", len(pairs), pairs, FEW),
             ("seen by robots that were lost", len(shown.weak), (), 0),
+            ("missed by nearly all that looked there", len(shown.missed), (), 0),
         )
         if count
     )

@@ -117,10 +117,8 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
     memory = graph.memory.longer(taken)
     if fold.audits:
         return memory, np.zeros(0, np.int64)
-    for member in (each for verdict in fold.landmarks.verdicts for each in verdict[:2]):
-        judged = fold.landmarks.identity(member)
-        if judged is not None and judged in graph.landmarks:
-            stays[graph.landmarks[judged]] = True
+    for judged in sorted(fold.landmarks.judged() & graph.landmarks.keys()):
+        stays[graph.landmarks[judged]] = True
     return memory, memory.given_up(counts, stays, MOST)
 
 

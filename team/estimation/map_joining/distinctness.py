@@ -1,4 +1,5 @@
-"""Which landmarks of a map are known to be different ones, and which are placed by a known heading.
+"""Which landmarks of a map are known to be different ones, which are placed by a known heading, and
+which most submaps miss that look there.
 
 Association merges two landmarks only where no rival comes near, and otherwise waits. Until it is
 decided they may be one: a map that shows both may show one landmark twice.
@@ -13,6 +14,8 @@ from team.estimation.contribution import Stream
 from team.estimation.map_joining.associating import IslandView
 from team.estimation.map_joining.association.growing import Indices, likelihoods
 from team.estimation.map_joining.gauss_newton import Island
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.memory import MOST
 from team.estimation.map_joining.nonlinearity import heading_sigma
 
 
@@ -68,6 +71,33 @@ def weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
             best[node] = min(sigma, best.get(node, math.inf))
     limit, node_of = island.settings.alignment_heading_sigma, island.graph.landmarks
     return [id_ for id_ in sorted(ids) if best.get(node_of.get(id_, -1), 0.0) > limit]
+
+
+def missed(fold: Fold, ids: Collection[int]) -> list[int]:
+    """Of these landmarks of the main island, those that nearly all submaps miss which look at their
+    place, ascending; none that an operator has judged.
+
+    A landmark of n < MOST submaps is missed where each landmark of MOST or more that any of these
+    has beside it has been observed by MOST n, and each of these has one. (A running map gives up
+    what is not found since it was observed last: `memory`.) How many false landmarks two submaps
+    agree on grows with the number of submaps; the share of those that find them does not.
+    """
+    graph = fold.main.graph
+    counts = np.zeros(len(graph.fixed), np.int64)
+    before = {} if graph.condensed is None else graph.condensed.departed.believed
+    for id_, node in graph.landmarks.items():
+        counts[node] = before.get(id_, 0)
+    for submap in graph.submaps:
+        counts[submap.landmarks[submap.landmarks >= 0]] += 1
+    observed = np.full(len(counts), np.iinfo(np.int64).max)
+    for each in graph.observed:
+        beside = counts[each.known]
+        well_known = beside[beside >= MOST]
+        least = well_known.min() if len(well_known) else 0
+        observed[each.known] = np.minimum(observed[each.known], least)
+    gone = {*np.flatnonzero((counts < MOST) & (observed >= MOST * counts)).tolist()}
+    judged = fold.landmarks.judged()
+    return [id_ for id_ in sorted({*ids} - judged) if graph.landmarks.get(id_) in gone]
 
 
 def lost(island: Island) -> dict[Stream, float]:

@@ -1,4 +1,6 @@
-"""A final map shows no landmark twice: what may be one with another landmark is left out."""
+"""A final map shows no landmark twice: what may be one with another landmark is left out, and so
+is what nearly all submaps miss that look there.
+"""
 
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ from team.config import UNNAMED
 from team.estimation.map_joining.association.landmarks import LocalLandmark, Verdict
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, Fold, JoinSettings, Tick
+from team.estimation.map_joining.memory import MOST
 from team.estimation.submap import LocalMap, Unnamed
 
 SD = 0.01
+FALSE = (3.0, 0.5)
 PAIR = [(2.0, 0.0), (2.0, 0.2)]
 
 
@@ -93,3 +97,36 @@ def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(
     assert not is_lost or words[0].startswith("r1 (incarnation 1) was lost: its heading is known")
     assert not is_lost or words[1] == "left out, seen by robots that were lost: 1 of 3 landmarks"
     assert third in shown_landmarks(fold, CentralConfig(), "closed").ids
+
+
+def looked_at(times: int, found: int, verdicts: tuple[Verdict, ...] = ()) -> Fold:
+    """Two neighbours are seen so many times, and a third landmark beside them the first ones."""
+    fold = EMPTY_FOLD
+    for k in range(times):
+        places = [*PAIR, FALSE] if k < found else PAIR
+        fold = taken(
+            fold, Tick([seen(k, places, SD)], verdicts=verdicts * (k == 1)), JoinSettings()
+        )
+    return fold
+
+
+@pytest.mark.parametrize(("times", "found"), [(15, 2), (16, 2), (16, 3)])
+def test_what_fewer_than_one_submap_in_eight_finds_that_look_there_is_left_out(
+    times: int, found: int
+) -> None:
+    fold = looked_at(times, found)
+    third = fold.landmarks.identity(member(0, 2))
+    shown, is_missed = shown_landmarks(fold, CentralConfig(), "final"), times >= MOST * found
+    assert (third in shown.ids) != is_missed
+    assert [*shown.missed] == [third] * is_missed
+    words = reasons(fold, shown, (), 1)
+    left_out = "left out, missed by nearly all that looked there: 1 of 3 landmarks"
+    assert words == (left_out,) * is_missed
+    assert third in shown_landmarks(fold, CentralConfig(), "closed").ids
+
+
+def test_a_landmark_that_an_operator_has_judged_is_shown_however_many_missed_it() -> None:
+    fold = looked_at(16, 2, (Verdict(member(0, 2), member(0, 0), same=False),))
+    assert (
+        fold.landmarks.identity(member(0, 2)) in shown_landmarks(fold, CentralConfig(), "final").ids
+    )

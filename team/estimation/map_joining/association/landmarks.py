@@ -126,6 +126,11 @@ class Landmarks:
         found = self.log.identity(member)
         return None if found is None else self._name_now(found)
 
+    def judged(self) -> set[int]:
+        """The identities that an operator has judged."""
+        members = (member for verdict in self.verdicts for member in verdict[:2])
+        return {id_ for member in members if (id_ := self.identity(member)) is not None}
+
     def _name_now(self, number: int) -> int:
         while number in self.names:
             number = self.names[number]
