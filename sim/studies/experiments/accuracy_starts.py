@@ -53,7 +53,7 @@ def outcome(options: Options, results: Results) -> Outcome:
             Goal(f"{world}, unknown starts: wrong_merges", unknown.get("wrong_merges"), 0.0, 0.0),
         ]
     table = Table(
-        f"unknown start poses, {len(options.seeds)} seeds",
+        f"unknown start poses, {options.seed_count}",
         ("starts", *(heading for _, heading, _ in SHOWN)),
         tuple(rows),
         "ratio: of the aligned maps, to the same seeds with known starts",

@@ -180,7 +180,7 @@ def outcome(options: Options, results: Results) -> Outcome:
                 rows.append((f"{value:g}: {system.name}", *cells))
         tables.append(
             Table(
-                f"over {axis}, {len(options.seeds)} seeds",
+                f"over {axis}, {options.seed_count}",
                 (axis, *(heading for _, heading, _ in FIGURES)),
                 tuple(rows),
                 "ours and with names: two robots, one map; the others one robot. Wrong: detections "
