@@ -19,9 +19,15 @@ from team.estimation.map_joining.whole_map import initial_map
 from team.estimation.submap import LocalMap
 from team.wire import messages as m
 
+CONDENSED = 16
+"""Number of submaps that are condensed into the map behind them once as many follow them."""
+
 
 class TeamMap:
     """The joint map of the last prior and the robot's later submaps; recomputed when they change.
+
+    While no prior comes, the oldest submaps are condensed with it to one Gaussian, CONDENSED at a
+    time by their order alone: a pose costs the same however long the centre is away.
 
     known, refused: of the landmarks of the newest submap and the open window, the numbers that the
     rest of the map has and contradicts. doubt: a warning about the last pose, in words; empty where
@@ -82,6 +88,9 @@ class TeamMap:
             self._pending += [self._shared.taken(each.named) for each in later]
             self._submaps = len(submaps)
             try:
+                while len(self._pending) >= 2 * CONDENSED:
+                    self._whole = followed(self._whole, self._pending[:CONDENSED]).whole
+                    del self._pending[:CONDENSED]
                 self._followed = followed(self._whole, self._pending)
             except UNSOLVABLE as error:
                 self._followed = error

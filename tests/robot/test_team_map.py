@@ -1,5 +1,6 @@
 """The robot's team map: a submap is in it once, whether the prior or the robot brings it."""
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -9,7 +10,7 @@ from team.estimation.gaussian import PoseGaussian, curved
 from team.estimation.map_joining.conditioning import followed
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.plausible import prior_beyond
-from team.robot.team_map import TeamMap
+from team.robot.team_map import CONDENSED, TeamMap
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from tests.estimation.submap_world import team
@@ -36,6 +37,33 @@ def test_the_map_that_is_kept_is_the_one_that_is_made_anew() -> None:
     for known in range(2, 7):
         again = TeamMap().given(told, LOCALS[:known])
         assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
+
+
+def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest submaps are condensed, by their order alone, whenever it is asked for."""
+    submaps = [each.local for each in team(1, robots=1, submaps=5 * CONDENSED).submaps]
+    first = submaps[0]  # its frame is the team's
+    told = msgspec.structs.replace(
+        prior(0), ids=from_ids(first.ids), mean=from_floats(first.mean),
+        covariance=packed(first.covariance),
+    )  # fmt: skip
+    whole = followed(translate.prior_of(told).whole, submaps[1:]).whole
+    solved_at_once: list[int] = []
+
+    def counted(whole, pending):
+        solved_at_once.append(len(pending))
+        return followed(whole, pending)
+
+    monkeypatch.setattr("team.robot.team_map.followed", counted)
+    often, seldom = TeamMap(), TeamMap()
+    for known in range(1, len(submaps) + 1):
+        last = often.given(told, submaps[:known]).whole
+        if known in (3, 50, len(submaps)):
+            assert seldom.given(told, submaps[:known]).whole.mean.tobytes() == last.mean.tobytes()
+    assert max(solved_at_once) < 2 * CONDENSED
+    off, covariance = last.mean - whole.mean, whole.covariance
+    assert off @ np.linalg.solve(covariance, off) / len(off) < 1e-3
+    np.testing.assert_allclose(np.diag(last.covariance), np.diag(covariance), rtol=0.01)
 
 
 def test_a_pose_is_told_with_the_covariance_of_its_arc() -> None:

@@ -52,7 +52,7 @@ DRAWN_POINTS = 1000
 
 def his_protocol(scenario: Scenario) -> Scenario:
     """The scenario with measurements and submaps of one second, exact initial poses, no loss, no
-    factor and no error states.
+    factor and no error states; without running poses, which he does not have.
     """
     change = msgspec.structs.replace
     robots = tuple(
@@ -62,6 +62,7 @@ def his_protocol(scenario: Scenario) -> Scenario:
                 robot.front_end, window_s=STEP_S, window_m=0.0, keyframe_s=STEP_S, node_s=0.0,
                 biases=(),
             ),
+            pose_s=NEVER_S,
         )
         for robot in scenario.robots
     )  # fmt: skip
