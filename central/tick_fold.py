@@ -19,7 +19,9 @@ set alone, not on the order or time of arrival.
 
 The running fold is bounded (`condensing`): its old submaps are condensed before each tick. Where a
 condensed island has to move, the ticks since it was condensed are taken again raw. The full
-solution uses the raw submaps: it takes the condensed ticks again (but see FULL).
+solution uses the raw submaps: it begins where the running fold has its nodes. Only where not all
+of it can be restored, or landmarks have no names (but see FULL_UNNAMED), it takes the condensed
+ticks again.
 """
 
 import math
@@ -48,11 +50,10 @@ COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 GROWTH = 1.25
 """Suspects that were not withdrawn are tested again once the number of submaps has grown by this
 factor."""
-FULL = 2000
-"""The full solution of up to this many submaps takes all ticks again; with more it starts from
-the running fold, since the ticks would take hours."""
 FULL_UNNAMED = 1000
-"""The same where landmarks have no names: a tick in full takes ten times as long."""
+"""Where landmarks have no names, the full solution of up to this many submaps takes all ticks
+again: what counts as one landmark is decided by the ticks. With more it starts from the running
+fold, since the ticks would take hours."""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
@@ -317,11 +318,11 @@ class TickFold:
         while True:
             self.take_until(math.inf)
             fold = self.fold
-            full = FULL_UNNAMED if fold.landmarks.are_there else FULL
             if not self.checkpoints.is_raw:
-                if fold.departed and fold.size > full:
+                again = fold.landmarks.are_there and fold.size <= FULL_UNNAMED
+                if fold.departed and not again:
                     fold = self._inputs.relinearised(fold, math.inf, self._gone)
-                if fold.departed or fold.size <= full:
+                if fold.departed or again:
                     return self._solved_raw()
             if not fold.contributions:
                 return fold

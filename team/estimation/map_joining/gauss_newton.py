@@ -449,12 +449,12 @@ def is_solvable(island: Island) -> bool:
 def iterated(island: Island) -> Island:
     """The island after the iterations of one tick.
 
-    Where old submaps are condensed and no robust scale narrows, an iteration after the first is
-    left out whose step is shorter than STILL: the decision is a function of the state, and the map
-    is as far from its minimum as condensing puts it anyway.
+    Where old submaps are condensed, an iteration after the first is left out whose step is shorter
+    than STILL: the decision is a function of the state, and the map is as far from its minimum as
+    condensing puts it anyway. A robust scale that still narrows goes on at the next tick.
     """
     damping = 0.0
-    bounded = island.graph.condensed is not None and island.settings.robust_c is None
+    bounded = island.graph.condensed is not None
     for k in range(island.settings.iterations_per_tick):
         if k and bounded and damping == 0.0 and _stands_still(island):
             break

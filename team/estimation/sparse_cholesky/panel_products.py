@@ -30,21 +30,24 @@ def is_big(width: int, m: int) -> bool:
 
 
 @compiled
-def add_products(target: Values, rows: Float[np.ndarray, "k m"], column: int, sign: float) -> None:
-    """Adds Σ sign · rows[k, column] · rows[k, column:] in place: one row after the other, four in
-    one go.
+def add_products(
+    target: Values, factors: Values, rows: Float[np.ndarray, "k m"], column: int, sign: float
+) -> None:
+    """Adds Σ sign · factors[k] · rows[k, column:] in place: one row after the other, four in one
+    go.
     """
-    n, count = len(target), len(rows)
+    n, count = len(target), len(factors)
     whole = count - count % 4
     for k in range(0, whole, 4):
         r0, r1 = rows[k, column:], rows[k + 1, column:]
         r2, r3 = rows[k + 2, column:], rows[k + 3, column:]
-        f0, f1, f2, f3 = sign * r0[0], sign * r1[0], sign * r2[0], sign * r3[0]
+        f0, f1 = sign * factors[k], sign * factors[k + 1]
+        f2, f3 = sign * factors[k + 2], sign * factors[k + 3]
         for i in range(n):
             target[i] = (((target[i] + f0 * r0[i]) + f1 * r1[i]) + f2 * r2[i]) + f3 * r3[i]
     for k in range(whole, count):
         row = rows[k, column:]
-        factor = sign * row[0]
+        factor = sign * factors[k]
         for i in range(n):
             target[i] += factor * row[i]
 
@@ -65,9 +68,10 @@ def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, lea
             for i in range(len(row)):
                 row[i] /= root
             for later in range(k + 1, behind):
-                add_products(panel[later, later:], panel[k : k + 1], later, -1.0)
+                add_products(panel[later, later:], panel[k : k + 1, later], panel[k:], later, -1.0)
         for later in range(behind, end):
-            add_products(panel[later, later:], panel[first:behind], later, -1.0)
+            factors = panel[first:behind, later]
+            add_products(panel[later, later:], factors, panel[first:], later, -1.0)
     return -1
 
 

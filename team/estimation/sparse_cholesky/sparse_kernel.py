@@ -83,7 +83,7 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
         else:
             update = product[0, : m - j]
             update[:] = 0.0
-            products.add_products(update, panel, j, 1.0)
+            products.add_products(update, panel[:, j], panel, j, 1.0)
         column = panel_start[t] + (rows[j] - columns_of[t]) * len(present)
         for i in range(j, m):
             panels[column + place[i - begin]] -= update[i - j]
@@ -226,12 +226,14 @@ def _over_own_triangle(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w 
     width, m = panel.shape
     y = np.zeros((width, m))
     for k in range(width):
-        y[k, k] = 1.0 / panel[k, k]
-        for i in range(k + 1, width):
-            total = 0.0
-            for p in range(k, i):
-                total += panel[p, i] * y[k, p]
-            y[k, i] = -total / panel[i, i]
+        own = y[k]
+        own[k] = 1.0 / panel[k, k]
+        for p in range(k, width):
+            row = panel[p]
+            if p > k:
+                own[p] = -own[p] / row[p]
+            for i in range(p + 1, width):
+                own[i] += row[i] * own[p]
     for k in range(width - 1, -1, -1):
         put(y[k], width, panel[k, width:])
         for later in range(k + 1, width):
@@ -261,18 +263,15 @@ def takahashi(structure: Structure, panels: Values) -> Values:
             products.selected_by_blocks(panel, known, result)
             continue
         y = _over_own_triangle(panel)
+        across = np.ascontiguousarray(y.T)
         for k in range(width):
-            for j in range(width, m):
-                factor = y[k, j]
-                for i in range(width, m):
-                    result[k, i] -= factor * known[j - width, i - width]
+            below = result[k, width:]
+            products.add_products(below, y[k, width:], known, 0, -1.0)
+            own = np.zeros(k + 1)
+            products.add_products(own, y[k, k:width], across[k:], 0, 1.0)
+            products.add_products(own, below, across[width:], 0, -1.0)
             for later in range(k + 1):
-                total = 0.0
-                for i in range(k, width):
-                    total += y[k, i] * y[later, i]
-                for i in range(width, m):
-                    total -= result[k, i] * y[later, i]
-                result[later, k] = total
+                result[later, k] = own[later]
     return inverse
 
 
