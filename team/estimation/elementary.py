@@ -42,9 +42,13 @@ def squared(x: Number) -> Number:
 @compiled
 def sin_and_cos(angle: float) -> tuple[float, float]:
     """Sine and cosine of an angle [rad]; NaN of what is not finite."""
-    if abs(angle) > FARTHEST:
-        angle = np.fmod(angle, 2.0 * math.pi)
-    return sin_and_cos_near(angle)
+    return sin_and_cos_near(near(angle))
+
+
+@inlined
+def near(angle: float) -> float:
+    """An angle of at most a million [rad] of the same direction; NaN of what is not finite."""
+    return np.fmod(angle, 2.0 * math.pi) if abs(angle) > FARTHEST else angle  # type: ignore[no-any-return]
 
 
 @inlined

@@ -97,11 +97,13 @@ def exponential(xi: Pose) -> Pose:
     return np.array([x, y, wrapped(xi[2])])
 
 
-@compiled
+@inlined
 def half_cotangent(turn: float) -> float:
-    """(θ/2) cot(θ/2), the diagonal of V(θ)⁻¹ (V of `swept`); 1 at θ = 0."""
+    """(θ/2) cot(θ/2) of a `wrapped` θ, the diagonal of V(θ)⁻¹ (V of `swept`); 1 at θ = 0."""
     half = 0.5 * turn
-    return 1.0 - half * half / 3.0 if abs(turn) < 1e-4 else half / elementary.tan(half)
+    s, c = elementary.sin_and_cos_near(half)
+    quotient = half / (s / c)
+    return 1.0 - half * half / 3.0 if abs(turn) < 1e-4 else quotient
 
 
 @compiled

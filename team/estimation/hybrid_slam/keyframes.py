@@ -187,7 +187,7 @@ class Segmenter:
         keyframe is in them, and no scan that is one or ends one.
         """
         grid = self._grid
-        if self._sensor.is_mounted or (grid is not None and grid.carries):
+        if self._sensor.is_mounted:
             return 0
         until_ns = [] if grid is None else [grid.quiet_until_ns]
         full_ns = self._keyframe_start_ns + self._keyframe_ns
@@ -306,15 +306,9 @@ class Segmenter:
             self._since_look = self._since_look.then(step)
 
     def _is_plain(self, over: OdometryInterval) -> bool:
-        """Whether an interval's motion follows from its speeds alone and no inter-robot
-        measurement waits for it.
-        """
-        return (
-            over.moved is None
-            and self._unmeasured is None
-            and not self._sensor.is_mounted
-            and (self._grid is None or not self._grid.carries)
-        )
+        """Whether an interval's motion follows from its speeds alone."""
+        is_measured = over.moved is None and self._unmeasured is None
+        return is_measured and not self._sensor.is_mounted
 
     def _settle(self) -> None:
         """Bring the motions up to date with the intervals driven since the last call."""
@@ -322,6 +316,8 @@ class Segmenter:
             return
         if self._since_look is not None:
             self._since_look = self._run.behind(self._since_look)
+        if self._grid is not None:
+            self._grid.carry(self._run.behind)
         node = Increment.identity() if self._grid is None else self._grid.since_node
         after, poses = self._run.driven(self._increment, node, self._forward, self._scan_motion)
         self._scan_poses += list(poses)

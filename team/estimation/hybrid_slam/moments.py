@@ -27,11 +27,15 @@ MOST_SQUARE = 0.1
 @compiled
 def mean_direction(angles: Float[np.ndarray, " M"], weights: Float[np.ndarray, " M"]) -> float:
     """The direction of Σ wᵢ (cos aᵢ, sin aᵢ)."""
-    sine, cosine = 0.0, 0.0
+    near, sines, cosines = np.empty(len(angles)), np.empty(len(angles)), np.empty(len(angles))
     for i in range(len(angles)):
-        s, c = elementary.sin_and_cos(angles[i])
-        sine += weights[i] * s
-        cosine += weights[i] * c
+        near[i] = elementary.near(angles[i])
+    for i in range(len(near)):
+        sines[i], cosines[i] = elementary.sin_and_cos_near(near[i])
+    sine, cosine = 0.0, 0.0
+    for i in range(len(near)):
+        sine += weights[i] * sines[i]
+        cosine += weights[i] * cosines[i]
     return elementary.atan2(sine, cosine)
 
 
@@ -74,13 +78,16 @@ def on_group(
     count = len(poses)
     heading = mean_direction(poses[:, 2], weights)
     s, c = elementary.sin_and_cos(heading)
-    offs = np.empty((count, 3))
+    offs, turns, cotangents = np.empty((count, 3)), np.empty(count), np.empty(count)
+    for i in range(count):
+        turns[i] = wrapped(poses[i, 2] - heading)
+    for i in range(count):
+        cotangents[i] = half_cotangent(turns[i])
     near, half, x, y = 0.0, 0.0, 0.0, 0.0
     for i in range(count):
-        turn = wrapped(poses[i, 2] - heading)
-        a, b = half_cotangent(turn), 0.5 * turn
+        a, b = cotangents[i], 0.5 * turns[i]
         ahead, left = c * poses[i, 0] + s * poses[i, 1], c * poses[i, 1] - s * poses[i, 0]
-        offs[i, 0], offs[i, 1], offs[i, 2] = a * ahead + b * left, a * left - b * ahead, turn
+        offs[i, 0], offs[i, 1], offs[i, 2] = a * ahead + b * left, a * left - b * ahead, turns[i]
         near += weights[i] * a
         half += weights[i] * b
         x += weights[i] * offs[i, 0]
@@ -88,8 +95,7 @@ def on_group(
     square = near * near + half * half
     ahead, left = (near * x - half * y) / square, (near * y + half * x) / square
     for i in range(count):
-        turn = offs[i, 2]
-        a, b = half_cotangent(turn), 0.5 * turn
+        a, b = cotangents[i], 0.5 * turns[i]
         along = offs[i, 0] - (a * ahead + b * left)
         across = offs[i, 1] - (a * left - b * ahead)
         offs[i, 0], offs[i, 1] = c * along - s * across, s * along + c * across
@@ -109,33 +115,36 @@ def moments(
     Each particle has p/3 poses (x, y, theta), one behind the other. The scatter between the
     particles is taken times `between`: 1 for the mixture itself, see `sample_factor`.
     """
-    mean, deviations = _of_coordinates(poses, weights, means)
+    count, p = poses.shape
+    mean, deviations = _of_points(weights, means, p)
+    for j in range(p):
+        for i in range(count):
+            mean[j] += weights[i] * poses[i, j]
+    for heading in range(2, p, 3):
+        mean[heading] = mean_direction(poses[:, heading], weights)
+    for i in range(count):
+        for j in range(p):
+            deviations[i, j] = poses[i, j] - mean[j]
+        for heading in range(2, p, 3):
+            deviations[i, heading] = wrapped(deviations[i, heading])
     return mean, _covariance(deviations, weights, covariances, between)
 
 
 @compiled
-def _of_coordinates(
-    poses: Float[np.ndarray, "M p"],
-    weights: Float[np.ndarray, " M"],
-    means: Float[np.ndarray, "M L 2"],
+def _of_points(
+    weights: Float[np.ndarray, " M"], means: Float[np.ndarray, "M L 2"], p: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "M n"]]:
-    """The mean of the coordinates, and each particle's deviations from it."""
-    count, p = poses.shape
-    n = p + 2 * means.shape[1]
-    deviations = np.empty((count, n))
-    put_block(deviations, 0, 0, poses)
-    put_block(deviations, 0, p, np.ascontiguousarray(means).reshape(count, n - p))
-    mean = np.zeros(n)
-    for i in range(count):
-        for j in range(n):
-            mean[j] += weights[i] * deviations[i, j]
-    for heading in range(2, p, 3):
-        mean[heading] = mean_direction(poses[:, heading], weights)
-    for i in range(count):
-        for j in range(n):
-            deviations[i, j] -= mean[j]
-        for heading in range(2, p, 3):
-            deviations[i, heading] = wrapped(deviations[i, heading])
+    """The mean of the points' coordinates, and each particle's deviations from it, behind p numbers
+    of the poses, which are still zero.
+    """
+    points = np.ascontiguousarray(means).reshape(len(means), 2 * means.shape[1])
+    mean, deviations = np.zeros(p + points.shape[1]), np.zeros((len(means), p + points.shape[1]))
+    for i in range(len(points)):
+        for j in range(points.shape[1]):
+            mean[p + j] += weights[i] * points[i, j]
+    for i in range(len(points)):
+        for j in range(points.shape[1]):
+            deviations[i, p + j] = points[i, j] - mean[p + j]
     return mean, deviations
 
 
@@ -179,7 +188,7 @@ def submap_moments(
     """`moments` with the poses' mean and deviations `on_group`, and POSE_JITTER on each pose; and
     the index in `gaussian.FAULTS` of why they are no Gaussian.
     """
-    mean, deviations = _of_coordinates(poses, weights, means)
+    mean, deviations = _of_points(weights, means, poses.shape[1])
     for pose in range(0, poses.shape[1], 3):
         at, off = on_group(np.ascontiguousarray(poses[:, pose : pose + 3]), weights)
         put(mean, pose, at)

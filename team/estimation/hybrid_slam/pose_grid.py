@@ -7,6 +7,7 @@ the open window and within sighting_s. The observer's odometry carries it to tha
 measurements of one teammate at one node are reduced to one.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,15 +141,16 @@ class PoseGrid:
         self._node_ns += self._grid_ns
         return True
 
-    @property
-    def carries(self) -> bool:
-        """Whether an inter-robot measurement waits for the motion up to its node."""
-        return bool(self._ahead)
-
     def moved(self, step: Increment) -> None:
         """Take the observer's motion."""
         self.since_node = self.since_node.then(step)
-        self._ahead = [replace(each, motion=each.motion.then(step)) for each in self._ahead]
+        self.carry(lambda motion: motion.then(step))
+
+    def carry(self, behind: Callable[[Increment], Increment]) -> None:
+        """Carry the inter-robot measurements that wait for their node on; behind: a motion followed
+        by the observer's since.
+        """
+        self._ahead = [replace(each, motion=behind(each.motion)) for each in self._ahead]
 
     def sightings(self) -> tuple[NodeSighting, ...]:
         """The window's inter-robot measurements, by node and teammate, without those that
