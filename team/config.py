@@ -192,7 +192,7 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def is_mounted(self) -> bool:
         """Whether the sensor has a pose of its own on the base."""
-        return any(self.mount)
+        return self.mount != (0.0, 0.0, 0.0)
 
 
 class AssociationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -52,8 +52,9 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
         seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
     else:
         seen = ids(message.ids, "ids").astype(np.uint32)
-    own = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
-    claimed = own if message.covariances else None
+    claimed = None
+    if message.covariances:
+        claimed = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
     if isinstance(message, m.Points):
         positions = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
         return point_scan(seen, positions, claimed)

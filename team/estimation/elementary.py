@@ -48,7 +48,7 @@ def sin_and_cos(angle: float) -> tuple[float, float]:
 @inlined
 def near(angle: float) -> float:
     """An angle of at most a million [rad] of the same direction; NaN of what is not finite."""
-    return np.fmod(angle, 2.0 * math.pi) if abs(angle) > FARTHEST else angle  # type: ignore[no-any-return]
+    return np.fmod(angle, 2.0 * math.pi) if abs(angle) > FARTHEST else angle
 
 
 @inlined

@@ -57,7 +57,7 @@ class TeamMap:
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._warning(given)
-        return posed._replace(pose=curved(posed.pose))
+        return Posed(curved(posed.pose), posed.known, posed.refused)
 
     def _warning(self, given: Followed) -> str:
         if is_majority(self.refused, self.known):

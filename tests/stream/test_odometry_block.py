@@ -14,6 +14,7 @@ from team.robot.node import RobotNode
 from team.stream.odometry_block import OdometryBlock, OdometryTable, decoded_odometry
 from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.arrays import from_floats
 from team.wire.bus import Sample, opened
 from team.wire.codec import WireError, encoded
 from tests.teams import config, published, stream
@@ -158,6 +159,16 @@ def changed(**fields):
 NODES = FrontEnd(
     particles=4, window_s=3.0, keyframe_s=0.1, node_s=0.7, sighting_s=0.3, biases=("forward_scale",)
 )
+SIGHTED = [
+    m.Sightings(
+        stamp_ns=each.stamp_ns, robot="r1", incarnation=1, number=each.number,
+        teammates=("r2",), ranges=from_floats([3.0]), bearings=from_floats([0.3]),
+    )
+    if isinstance(each, m.Observations)
+    else each
+    for each in DENSE
+]  # fmt: skip
+"""The dense stream with inter-robot measurements in place of its scans."""
 SLOW = MotionModel(
     "velocity",
     forward=MotionNoise(per_m=0.02),
@@ -177,6 +188,7 @@ FEW = FrontEnd(particles=4, window_s=3.0)
     [
         ({}, DENSE, 0.1),
         ({"front_end": NODES, "fusion": "join", "motion": SLOW}, DENSE, 0.3),
+        ({"front_end": NODES, "fusion": "join", "motion": SLOW}, SIGHTED, 0.05),
         ({"motion": WHEELS, "clock_offset_s": -0.013}, DENSE, 0.1),
         (
             {"front_end": FrontEnd(particles=4, window_s=1.0, window_m=1e3, standing_s=4.0)},
@@ -201,7 +213,17 @@ FEW = FrontEnd(particles=4, window_s=3.0)
             0.5,
         ),
     ],
-    ids=["plain", "nodes", "wheels", "standing", "turns", "mounted", "other", "hostile"],
+    ids=[
+        "plain",
+        "nodes",
+        "sightings",
+        "wheels",
+        "standing",
+        "turns",
+        "mounted",
+        "other",
+        "hostile",
+    ],
 )
 def test_a_node_says_the_same_whether_odometry_comes_in_blocks_or_singly(
     options, measurements, share

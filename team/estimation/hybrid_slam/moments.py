@@ -61,7 +61,7 @@ def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
     7.7): the factor is N/(N − q − 2), with the q = 3 numbers of a pose, the directions in which no
     particle has a covariance of its own. Fewer than ten particles are taken for ten.
     """
-    return 1.0 / (1.0 - POSE_DEGREES * min(float(np.sum(weights * weights)), MOST_SQUARE))
+    return 1.0 / (1.0 - POSE_DEGREES * min(float(np.add.reduce(weights * weights)), MOST_SQUARE))
 
 
 @compiled

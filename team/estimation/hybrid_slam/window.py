@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team.config import FrontEnd, Sensor
+from team.config import Bias, FrontEnd, Sensor
 from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import FAULTS, NotACovarianceError
 from team.estimation.geometry import inverse, tangent
@@ -149,8 +149,8 @@ def advanced(
         own=noises,
     )
     paths = window.paths if info.parents is None else window.paths[:, info.parents]
-    keyframe = np.full(len(ids), len(paths))
-    read = np.empty((len(ids), 2))
+    keyframe, read = np.empty(len(ids), np.int64), np.empty((len(ids), 2))
+    keyframe[:] = len(paths)
     read[:, 0], read[:, 1] = ranges, bearings
     return replace(
         window,
@@ -268,8 +268,11 @@ def moments_matched(
     )
     if fault:
         raise NotACovarianceError("the submap of a window", FAULTS[fault])
-    local = LocalMap(ids, mean, covariance, window.node_stamps[: len(nodes)])
-    return _with_sensitivity(window, local, weights) if window.front_end.biases else local
+    stamps = window.node_stamps[: len(nodes)]
+    if not window.front_end.biases:
+        return LocalMap(ids, mean, covariance, stamps)
+    biases, sensitivity = _sensitivity(window, weights, (ids, mean), nodes)
+    return LocalMap(ids, mean, covariance, stamps, biases, sensitivity)
 
 
 def of_base(window: Window) -> Window:
@@ -295,17 +298,21 @@ def motion_alone(motion: Increment) -> LocalMap:
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))
 
 
-def _with_sensitivity(
-    window: Window, local: LocalMap, weights: Float[np.ndarray, " M"]
-) -> LocalMap:
-    """The Gaussian with its derivatives by the biases.
+def _sensitivity(
+    window: Window,
+    weights: Float[np.ndarray, " M"],
+    submap: tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, " n"]],
+    nodes: Int64[np.ndarray, " nodes"],
+) -> tuple[tuple[Bias, ...], Float[np.ndarray, "b n"]]:
+    """The biases, and the derivatives of a submap's mean by them; submap: its ids and its mean.
 
     That by `forward_scale` is left out where all of the window's motion is calibrated.
     """
     uncalibrated = bool(window.motions.shifts.any())
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
     mount, is_mounted = np.array(window.sensor.mount), window.sensor.is_mounted
-    end, points = local.end_pose, local.landmarks
+    ids, mean = submap
+    end, points = mean[:3], mean[3 + 3 * len(nodes) :].reshape(-1, 2)
     if is_mounted:
         away = inverse(mount)
         end, points = base_poses(end[None], away)[0], base_points(points, away)
@@ -313,13 +320,11 @@ def _with_sensitivity(
         (window.paths, weights),
         end,
         window.motions,
-        (local.ids, points),
+        (ids, points),
         WindowSights(window.keyframes, window.ids, window.own),
         noise_of(window.sensor),
     )
     if is_mounted:
         poses = base_shifts(poses, path, mount)
         landmarks = base_points(landmarks, np.array([0.0, 0.0, mount[2]]))
-    nodes = window.node_keyframes[: len(local.node_stamps)]
-    sensitivity = rows(biases, poses, landmarks, nodes)
-    return replace(local, biases=biases, sensitivity=sensitivity)
+    return biases, rows(biases, poses, landmarks, nodes)
