@@ -28,16 +28,12 @@ class Outbox:
         self._sent = Sent()
         self._greeted: set[str] = set()  # told of an encounter since the last window ended
         self._buffered: list[Outgoing] = []
-
-    @property
-    def _submaps(self) -> list[m.Submap]:
-        found = (out.message for out in self._buffered)
-        return [message for message in found if isinstance(message, m.Submap)]
+        self._submaps: list[m.Submap] = []
 
     @property
     def submaps(self) -> int:
         """Number of buffered submaps."""
-        return len(self._submaps) if self._buffered else 0
+        return len(self._submaps)
 
     @property
     def since_ns(self) -> int | None:
@@ -48,6 +44,7 @@ class Outbox:
         """Take a window's messages; returns those that go out now."""
         if self.buffers:
             self._buffered += out
+            self._submaps += [each.message for each in out if isinstance(each.message, m.Submap)]
             self._greeted.clear()
             return []
         self._note(out)
@@ -70,7 +67,7 @@ class Outbox:
             submaps=len(submaps),
             waited_s=max(0.0, 1e-9 * (now_ns - submaps[0].stamp_ns)) if submaps else 0.0,
         )
-        released, self._buffered = self._buffered, []
+        released, self._buffered, self._submaps = self._buffered, [], []
         self._note(released)
         return [Outgoing(ch.RENDEZVOUS, self._robot, announced), *released]
 

@@ -6,6 +6,7 @@ NumPy is imported at the first array: a router and a recorder see none, and it t
 import math
 import struct
 import sys
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ FEW = 16
 """So many numbers are looked at one by one sooner than as an array."""
 _NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
 _POSE = _NUMBERS[9]
+_SMALL = 128
+"""Up to so many rows the places of a packed triangle are kept."""
 LARGEST_JOINT = 4096
 """Number of rows of the largest covariance that is accepted."""
 
@@ -149,7 +152,7 @@ def check_pose_covariance(data: Floats, what: str) -> None:
 
 
 def _clipped(value: float) -> float:
-    return max(-2.0, min(value, 2.0))
+    return -2.0 if value < -2.0 else 2.0 if value > 2.0 else value
 
 
 def check_semidefinite(data: Floats, n: int, what: str) -> None:
@@ -177,9 +180,7 @@ def check_packed_covariance(data: Floats, n: int, what: str) -> None:
         raise ValueError(f"too large: {what} has {n} rows, {LARGEST_JOINT} at most")
     check_finite(data, what, n * (n + 1) // 2)
     if n:
-        lower = np.zeros((n, n))
-        lower.T[np.triu_indices(n)] = floats(data, what)
-        _check_positive(_unit_diagonal(lower, what), what)
+        _check_positive(_unit_diagonal(floats(data, what), n, what), what)
 
 
 def check_blocks(data: Floats, count: int, what: str) -> None:
@@ -192,14 +193,29 @@ def check_blocks(data: Floats, count: int, what: str) -> None:
 
 
 def _unit_diagonal(
-    matrix: "np.typing.NDArray[np.float64]", what: str
+    packed: "np.typing.NDArray[np.float64]", n: int, what: str
 ) -> "np.typing.NDArray[np.float64]":
-    """D⁻¹ P D⁻¹ with D = √diag P, so that units and scale do not influence the conditioning."""
+    """The lower triangle of D⁻¹ P D⁻¹ with D = √diag P, so that units and scale do not influence
+    the conditioning; zeros above it.
+    """
+    rows, columns, places, diagonal = _triangle(n) if n <= _SMALL else _triangle.__wrapped__(n)
     with np.errstate(over="ignore", invalid="ignore"):  # √ of what is negative is judged below
-        sigmas = np.sqrt(np.diag(matrix))
+        sigmas = np.sqrt(packed[diagonal])
         if not (sigmas > 0.0).all():
             raise ValueError(f"not positive definite: {what}")
-        return np.clip(matrix / sigmas / sigmas[:, None], -2.0, 2.0)
+        scaled = packed / sigmas[rows] / sigmas[columns]
+    lower = np.zeros(n * n)
+    lower[places] = np.minimum(np.maximum(scaled, -2.0), 2.0)
+    return lower.reshape(n, n)
+
+
+@lru_cache(maxsize=16)
+def _triangle(n: int) -> "tuple[np.typing.NDArray[np.intp], ...]":
+    """Row and column of each number of a packed upper triangle, its place in the transposed matrix
+    row by row, and the places of the diagonal in the triangle.
+    """
+    rows, columns = np.triu_indices(n)
+    return rows, columns, columns * n + rows, np.flatnonzero(rows == columns)
 
 
 def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
@@ -210,5 +226,5 @@ def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
         factor = np.linalg.cholesky(scaled)  # reads the lower triangle
     except np.linalg.LinAlgError:
         raise ValueError(f"not positive definite: {what}") from None
-    if np.min(np.diag(factor), initial=1.0) ** 2 <= len(scaled) * EPSILON:
+    if factor.diagonal().min() ** 2 <= len(scaled) * EPSILON:
         raise ValueError(f"not positive definite: {what}")

@@ -60,7 +60,8 @@ class Channel:
 
     def key(self, name: str = "") -> str:
         """The key for one robot or node."""
-        return _PLACE.sub(name, self.template)
+        before, after = self._around
+        return before + name + after if after is not None else before
 
     def publisher(self, name: str) -> str:
         """The node that publishes the key for one robot or node."""
@@ -75,6 +76,12 @@ class Channel:
         """
         match = self._pattern.fullmatch(key)
         return None if match is None else match.groupdict().get("name", "")
+
+    @cached_property
+    def _around(self) -> tuple[str, str | None]:
+        """The key before and behind the name; None behind it where the key has no name."""
+        parts = _PLACE.split(self.template)
+        return parts[0], parts[2] if len(parts) > 1 else None
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
