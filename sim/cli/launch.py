@@ -335,10 +335,10 @@ def _compile(scenario: Scenario) -> None:
     """Compile the kernels here where no template does: otherwise every process would compile the
     same.
     """
-    from sim.launch.warm_up import warm_up
+    from sim.launch.warm_up import FORMS, warm_up
     from team.estimation.compiling import compilations
 
-    with compilations(_Compiling().tell):
+    with compilations(_Compiling().tell, FORMS):
         warm_up(scenario.estimator, scenario.fusion)
 
 

@@ -103,7 +103,7 @@ def _noted(request: _Request, launch: int) -> list[str]:
 
 
 def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
-    """Load all kernels; if they were never compiled, two processes compile them and report the
+    """Load all kernels; if they were never compiled, three processes compile them and report the
     progress.
     """
     from sim.launch import warm_up
@@ -112,19 +112,30 @@ def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
     is_warm = warm_up.is_warm(estimator, rule)
     if not is_warm:
         gc.enable()  # compiling makes much that does not stay
-    with compilations(lambda done, of: asked.sendall(f"compiled {of}".encode())):
+    with compilations(lambda done, of: asked.sendall(f"compiled {of}".encode()), warm_up.FORMS):
         if (estimator, rule) == ("hybrid", "join") and not is_warm:
-            template = os.getpid()
-            if (centre := os.fork()) == 0:
-                end_with_parent(signal.SIGKILL)  # as an interrupted launch ends the template
-                with suppress(Exception):  # then this process compiles what is lacking
-                    if os.getppid() == template:
-                        warm_up.fold_made_up_submaps()
-                os._exit(0)
+            # Each takes kernels that the others do not need before their end.
+            others = [
+                _forked(warm_up.fold_made_up_submaps),
+                _forked(warm_up.follow_made_up_submaps),
+            ]
             warm_up.run_to_the_first_submap(estimator, rule)
-            os.waitpid(centre, 0)
+            for other in others:
+                os.waitpid(other, 0)
         warm_up.run_small_team(estimator, rule)
     warm_up.note_warm(estimator, rule)
+
+
+def _forked(run: Callable[[], object]) -> int:
+    """The process id of a child that runs this and ends; what it leaves undone, others do."""
+    template = os.getpid()
+    if child := os.fork():
+        return child
+    end_with_parent(signal.SIGKILL)  # as an interrupted launch ends the template
+    with suppress(Exception):
+        if os.getppid() == template:
+            run()
+    os._exit(0)
 
 
 def end_by(run: Callable[[], None]) -> NoReturn:

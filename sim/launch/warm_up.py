@@ -17,10 +17,13 @@ from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld
 from team.estimation.contribution import Contribution, InitialPoseFactor
+from team.estimation.gaussian import curved
 from team.estimation.geometry import inverse, logarithm, wrapped
+from team.estimation.map_joining.conditioning import Followed, followed, pose_now
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, converged, folded, started
 from team.estimation.map_joining.marginals import joint_cost, landmark_blocks, landmark_map
+from team.estimation.map_joining.whole_map import WholeMap
 from team.estimation.submap import LocalMap
 from team.wire.bus import Sample
 from team.wire.channels import SUBMAP, channel_of
@@ -28,6 +31,8 @@ from team.wire.channels import SUBMAP, channel_of
 _VERSIONS = (sys.version, numba.__version__, binding.get_host_cpu_name())
 _STEPS = 48
 """Number of one-second steps of the small team's run."""
+FORMS = 263
+"""Number of forms of kernels that a small team compiles with Hybrid-SLAM and joined submaps."""
 PLACES = np.array([[10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0], [10.0, 20.0]])
 """Positions [m] of the made-up landmarks."""
 
@@ -99,22 +104,35 @@ def run_to_the_first_submap(estimator: str, fusion: str) -> None:
 
 def fold_made_up_submaps() -> Fold:
     """The fold of six made-up submaps of two robots: this needs the kernels of the centre alone."""
-    ids = np.arange(5, dtype=np.uint32)
     fold = EMPTY_FOLD
     for robot in ("r1", "r2"):
         fold = started(fold, InitialPoseFactor(robot, 1, np.zeros(3)))
     settings = JoinSettings(robust_c=2.0)
     for k in range(3):
-        mean = np.concatenate([[1.0, 0.0, 0.0], (PLACES - [k, 0.0]).ravel()])
-        local = LocalMap(ids, mean, np.diag(np.full(len(mean), 0.01)))
         end_ns = (k + 1) * 10**9
-        taken = [Contribution(robot, 1, k, end_ns, local) for robot in ("r1", "r2")]
+        taken = [Contribution(robot, 1, k, end_ns, _made_up(k)) for robot in ("r1", "r2")]
         fold = folded(fold, taken, settings)
     fold = converged(fold, settings)
     landmark_map(fold)
     landmark_blocks(fold)
     joint_cost(fold)
     return fold
+
+
+def follow_made_up_submaps() -> Followed:
+    """A robot's map after two made-up submaps, and its pose there: this needs the kernels by which
+    robots find themselves in the team's map.
+    """
+    first, *later = map(_made_up, range(3))
+    found = followed(WholeMap(first.ids, first.mean, first.covariance), later)
+    curved(pose_now(found.whole, None).pose)
+    return found
+
+
+def _made_up(k: int) -> LocalMap:
+    """The submap of a robot that has moved k metres since it began, and moves another one."""
+    mean = np.concatenate([[1.0, 0.0, 0.0], (PLACES - [k, 0.0]).ravel()])
+    return LocalMap(np.arange(5, dtype=np.uint32), mean, np.diag(np.full(len(mean), 0.01)))
 
 
 def _small_team(estimator: str, fusion: str) -> Iterator[Sample]:

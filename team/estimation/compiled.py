@@ -27,7 +27,7 @@ from numba.core.caching import IndexDataCacheFile
 
 from team.estimation.cached_code import load_alone, loads_alone, unpickled
 from team.estimation.compiled_once import compile_once
-from team.estimation.parts import keep_parts_as_bit_code
+from team.estimation.parts import called_from_python, keep_parts_as_bit_code
 from team.sources import sources_of
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -45,12 +45,19 @@ def compiled(function: F) -> F:
         part = cache(partial(_compiler_of, kernel, no_cpython_wrapper=True))
         dispatcher.get_call_template = lambda *types: part().get_call_template(*types)
         dispatcher.get_overload = lambda form: part().get_overload(form)
+        dispatcher._compiler.compile = lambda types, _: called_from_python(_form(part(), types))
     return cast(F, dispatcher)
+
+
+def _form(part: Any, types: Sequence[Any]) -> Any:
+    """A kernel compiled as a part of others, for these types of arguments."""
+    part.compile(tuple(types))
+    return part.overloads[tuple(types)]
 
 
 def _compiler_of(kernel: Callable[..., object], **options: bool) -> Any:
     """Compiles a kernel at its first call: for Python, or as a part of others, which has no entry
-    from Python (`team.estimation.parts`).
+    from Python. The first is made of the second (`team.estimation.parts`).
     """
     compile_: Any = numba.njit
     dispatcher = compile_(

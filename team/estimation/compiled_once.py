@@ -17,6 +17,8 @@ from typing import Any
 from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
 
+from team.estimation.parts import undisturbed
+
 if sys.platform != "win32":
     import fcntl
 
@@ -47,7 +49,8 @@ def compile_once(dispatcher: Any, lock_of: Callable[[], Path]) -> None:
                 lock = lock_of() if lock is None else lock
                 with alone(lock, PATIENCE_S):
                     _number_from_anywhere()
-                    return compile_here(signature)
+                    with undisturbed():
+                        return compile_here(signature)
             finally:
                 compiling = False
 

@@ -1,10 +1,8 @@
 """Reports which kernels are being compiled: the first run on a machine takes a minute."""
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from numba.core.dispatcher import Dispatcher
 from numba.core.event import Event, Listener, install_listener
 
 from team.estimation.compiled import compiled
@@ -29,22 +27,9 @@ class _Counted(Listener):
 
 
 @contextmanager
-def compilations(report: Callable[[int, int], None]) -> Iterator[None]:
-    """While the context lasts, calls `report` after each compiled kernel: how many, of about how
-    many.
-
-    The total is the number of imported kernels; some of them belong to other estimators, some have
-    two forms.
+def compilations(report: Callable[[int, int], None], of: int) -> Iterator[None]:
+    """While the context lasts, calls `report` after each form of a kernel that is compiled: how
+    many, of about `of`.
     """
-    with install_listener("numba:compile", _Counted(report, _imported())):
+    with install_listener("numba:compile", _Counted(report, of)):
         yield
-
-
-def _imported() -> int:
-    """Number of kernels that our imported modules define."""
-    modules = [module for name, module in list(sys.modules.items()) if name.startswith(f"{OURS}.")]
-    return sum(
-        isinstance(value, Dispatcher) and value.__module__ == module.__name__
-        for module in modules
-        for value in vars(module).values()
-    )

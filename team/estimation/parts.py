@@ -5,10 +5,15 @@ as of ours, and does both again in each kernel that contains it. Here a function
 when its address is asked for, which nobody does of a part: docs/decisions/0136.
 """
 
+import copy
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from numba.core import codegen, environment
+from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
+from numba.core import codegen, cpu, environment, ir
 
 
 def keep_parts_as_bit_code(generator: Any) -> None:
@@ -16,6 +21,85 @@ def keep_parts_as_bit_code(generator: Any) -> None:
     if generator._library_class is not Library:
         generator._library_class = Library
         generator.set_env = partial(_set_environment, generator)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """While the context lasts, Numba leaves out what it does beside compiling.
+
+    It would time each call of LLVM's for each function that is being compiled, give each of its own
+    functions a wrapper for callers in C, and be interrupted some thousand times while Python looks
+    for objects that nobody uses. To be entered with Numba's lock of the compiler held.
+    """
+    thresholds = gc.get_threshold()
+    gc.set_threshold(_YOUNG, *thresholds[1:])
+    try:
+        with (
+            _replaced(binding.ffi.lib._lock, "_cblist", []),
+            _replaced(cpu.CPUContext, "create_cfunc_wrapper", lambda *_: None),
+            _replaced(ir.Inst, "_rec_list_vars", _variables),
+        ):
+            yield
+    finally:
+        gc.set_threshold(*thresholds)
+
+
+_YOUNG = 50_000
+"""Number of new objects from which on Python looks for those among them that nobody uses."""
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, value: object) -> Iterator[None]:
+    original = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, original)
+
+
+def _variables(inst: object, value: Any) -> list[Any]:
+    """The variables in a part of an instruction, as Numba lists them: most parts are none."""
+    kind = type(value)
+    if kind is ir.Var:
+        return [value]
+    if kind in _NO_VARIABLES:
+        return []
+    if kind is dict:
+        value = value.values()
+    elif kind is not list and kind is not tuple:
+        listed: Any = value
+        return listed.list_vars() if isinstance(value, ir.Inst) else []
+    return [variable for part in value for variable in _variables(inst, part)]
+
+
+_NO_VARIABLES = frozenset((str, int, bool, float, type(None), ir.Loc, ir.Const, ir.Global, ir.Arg))
+
+
+def called_from_python(part: Any) -> Any:
+    """A part's form with machine code, and the wrapper by which Python calls it.
+
+    It has constants of its own: the wrapper notes the types of arrays there.
+    """
+    part.typing_context.refresh()
+    part.target_context.refresh()
+    target = part.target_context.subtarget(enable_nrt=True)  # arrays own memory; as Numba compiles
+    library = target.codegen().create_library(part.library.name)
+    library.enable_object_caching()
+    library.add_linking_library(part.library)
+    description = copy.copy(part.fndesc)
+    description.env_name += "-called"
+    described: Any = environment.Environment
+    constants = described.from_fndesc(description)
+    target.create_cpython_wrapper(library, description, constants, None)
+    entry = target.get_executable(library, description, constants)
+    return part._replace(
+        entry_point=entry,
+        fndesc=description,
+        library=library,
+        environment=constants,
+        metadata={},
+    )
 
 
 class Library(codegen.JITCodeLibrary):
@@ -29,18 +113,38 @@ class Library(codegen.JITCodeLibrary):
 
     def get_pointer_to_function(self, name: str) -> Any:
         """The address of a function, optimised; 0 where there is none of this name."""
-        if not _defines(self, name):
+        if (function := _defined(self, name)) is None:
             return 0
         if not self._is_machine_code:
             self._is_machine_code = True
+            function.linkage = "external"
             _make_machine_code(self)
         return super().get_pointer_to_function(name)  # type: ignore[no-untyped-call] # Numba's
 
     def serialize_using_object_code(self) -> Any:
-        """Name, kind, and the pair of machine code, which is empty for a part, and bit code."""
+        """Name, kind, and the pair of machine code and bit code, of which one is empty."""
         if self._is_machine_code:
-            return super().serialize_using_object_code()  # type: ignore[no-untyped-call] # Numba's
+            return self.name, "object", (self._get_compiled_object(), b"")  # type: ignore[no-untyped-call] # Numba's
         return self.name, "object", (b"", _bit_code(self))
+
+    def _optimize_functions(self, module: Any) -> None:
+        """LLVM's passes over single functions: one row of passes for all of a module."""
+        module.data_layout = self._codegen._data_layout
+        generator: Any = self._codegen
+        passes, builder = generator._function_pass_manager()
+        for function in module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+    def _get_module_for_linking(self) -> Any:
+        """The module itself, its functions marked so that several modules may hold them."""
+        self._ensure_finalized()  # type: ignore[no-untyped-call] # Numba's
+        if self._shared_module is None:
+            for function in self._final_module.functions:
+                if not function.is_declaration and function.linkage == binding.Linkage.external:
+                    function.linkage = "linkonce_odr"
+            self._shared_module = self._final_module
+        return self._shared_module
 
 
 def _link(library: Any) -> None:
@@ -52,10 +156,14 @@ def _link(library: Any) -> None:
     library._finalized = True
 
 
-def _defines(library: Any, name: str) -> bool:
+def _defined(library: Any, name: str) -> Any:
+    """The function of this name that the library defines, or None."""
     library._ensure_finalized()
-    functions = library._final_module.functions
-    return any(each.name == name and not each.is_declaration for each in functions)
+    try:
+        function = library._final_module.get_function(name)
+    except NameError:
+        return None
+    return None if function.is_declaration else function
 
 
 def _make_machine_code(library: Any) -> None:

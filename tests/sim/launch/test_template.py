@@ -96,7 +96,7 @@ COMPILES = """
 import os, signal, socket
 from sim.launch import template, warm_up
 warm_up.is_warm = lambda *_: False
-warm_up.fold_made_up_submaps = signal.pause
+warm_up.fold_made_up_submaps = warm_up.follow_made_up_submaps = signal.pause
 warm_up.run_to_the_first_submap = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 template._load_kernels("hybrid", "join", socket.socket())
 """

@@ -15,6 +15,12 @@ def test_the_submaps_that_are_made_up_to_compile_the_centre_make_a_map() -> None
     assert landmark_map(fold).means == pytest.approx(warm_up.PLACES, abs=1e-6)
 
 
+def test_the_submaps_that_are_made_up_to_compile_the_robots_agree() -> None:
+    found = warm_up.follow_made_up_submaps()
+    assert found.known == (5, 5)
+    assert found.whole.mean == pytest.approx([3.0, 0.0, 0.0, *warm_up.PLACES.ravel()], abs=1e-6)
+
+
 def stamps() -> set[Path]:
     return set(Path(wrapped.stats.cache_path).glob("ready-*"))
 
