@@ -15,7 +15,8 @@ NUMBAS = {
     *("_codegen", "_engine", "_set_compiled_object", "_finalize_final_module"),
     *("_object_caching_enabled", "_raise_if_finalized", "_ensure_finalized", "_final_module"),
     *("_linking_libraries", "_reload_init", "_get_module_for_linking", "_library_class"),
-    *("_finalize_dynamic_globals", "_optimize_final_module"),
+    *("_finalize_dynamic_globals", "_optimize_final_module", "_function_pass_manager"),
+    *("_compiler", "_data_layout", "_get_compiled_object", "_lock"),
 }
 """What these modules of team/estimation have to ask numba for: it has no public way."""
 ASKING = ("compiled.py", "cached_code.py", "parts.py")
