@@ -188,7 +188,8 @@ def _worst(agreement: Agreement) -> list[str]:
     wrong.sort(key=lambda pair: (-pair[0], pair[1].stream, pair[1].sequence))
     return [
         f"{each.stream[0]}: submap {each.sequence} disagrees with the rest, "
-        f"cost {ratio:.1f} per degree of freedom, weight {each.weight:.2f}"
+        f"cost {ratio:.1f} per degree of freedom; "
+        f"the map takes {100.0 * each.weight:.1f} % of its information"
         for ratio, each in wrong[:NAMED]
     ]
 

@@ -73,6 +73,7 @@ def test_one_submap_that_the_rest_contradicts_is_named():
 
     named = [w for w in watched(3, shifted).warnings if "disagrees" in w]
     assert named[0].startswith("r2: submap 12 disagrees")
+    assert "% of its information" in named[0]
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, ROBUST, JoinSettings(robust_c=2.0)])
