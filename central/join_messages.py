@@ -18,6 +18,7 @@ from team import translate
 from team.config import UNNAMED
 from team.estimation.contribution import Stream, named
 from team.estimation.map_joining import landmark_view, marginals
+from team.estimation.map_joining.alignment import SharedPoints
 from team.estimation.map_joining.associating import IslandView
 from team.estimation.map_joining.distinctness import lost, maybe_the_same, missed, weakly_placed
 from team.estimation.map_joining.joining import Fold
@@ -37,7 +38,7 @@ NAMED = 10
 """Most landmarks left out of the map, refusals, and robots of an island that are named."""
 FEW = 3
 """Most pairs of landmarks without names that are named."""
-NONE_SHARED = "not joined: 0 shared landmarks, "
+NONE_SHARED = f"not joined: {SharedPoints(0)}, "
 
 
 def team_map(
