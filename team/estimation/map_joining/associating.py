@@ -33,7 +33,11 @@ from team.estimation.map_joining.association.growing import (
     conditioned,
     grow,
 )
-from team.estimation.map_joining.association.hypotheses import jointly
+from team.estimation.map_joining.association.hypotheses import (
+    MOST_ASSIGNED,
+    candidates,
+    jointly,
+)
 from team.estimation.map_joining.association.landmarks import (
     Landmarks,
     LocalLandmark,
@@ -130,7 +134,15 @@ class IslandView:
             return
         one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
         different = one != two
-        self._grow(kind, one[different], two[different], most_sd)
+        found = grow(
+            self.joint,
+            (one[different], two[different]),
+            self.profile,
+            most_sd=most_sd,
+            sure_sd=self.profile.near,
+        )
+        if found is not None and found.pairs:
+            self.take(found.pairs, found.joint, kind)
 
     def compare(self, kind: str, k: int, most_sd: float) -> None:
         """Merges the pairs of submap k and one other submap after the other on which all likely
@@ -139,33 +151,34 @@ class IslandView:
         own = self.now(self.unnamed(k))
         others = self.sees.copy()
         others[k] = False
-        for candidates in comparable(self.joint, own, others, self.profile, most_sd):
-            first, second = own[~self.gone[own]], self.now(candidates)
+        for nearby in comparable(self.joint, own, others, self.profile, most_sd):
+            first, second = own[~self.gone[own]], self.now(nearby)
             one, two = (each.ravel() for each in np.meshgrid(first, second, indexing="ij"))
             different = one != two
             found = jointly(self.joint, one[different], two[different], self.profile, most_sd)
             self.take(found.pairs, found.joint, kind)
 
-    def _grow(self, kind: str, one: Indices, two: Indices, most_sd: float) -> None:
-        found = grow(
-            self.joint, (one, two), self.profile, most_sd=most_sd, sure_sd=self.profile.near
-        )
-        if found is not None and found.pairs:
-            self.take(found.pairs, found.joint, kind)
-
     def sweep(self) -> None:
         """Merges landmarks at one place that are well known relative to each other and never seen
-        together.
+        together, where all likely joint assignments of them agree.
+
+        Of what is not decided when it is new little is certain: one pair after the other, each by
+        itself the likeliest, can turn a robot by a spacing.
         """
         at = np.flatnonzero(~self.gone)
         mean = self.joint.mean[at]
         away = np.abs(mean[:, None] - mean[None]).max(axis=2)
         later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
-        if len(later):
-            one, two = at[later], at[earlier]
-            x, y = (self.joint.mean[one] - self.joint.mean[two]).T
-            close = elementwise.hypot(x, y) < self.profile.same
-            self._grow("sweep", one[close], two[close], self.profile.tight)
+        one, two = at[later], at[earlier]
+        x, y = (self.joint.mean[one] - self.joint.mean[two]).T
+        close = elementwise.hypot(x, y) < self.profile.same
+        open_ = candidates(self.joint, one[close], two[close], self.profile, self.profile.tight)
+        one, two = one[close][open_], two[close][open_]
+        split = np.unique(one)
+        for begin in range(0, len(split), MOST_ASSIGNED):
+            own = np.isin(one, split[begin : begin + MOST_ASSIGNED]) & ~self.gone[two]
+            found = jointly(self.joint, one[own], two[own], self.profile, self.profile.tight)
+            self.take(found.pairs, found.joint, "sweep")
 
     def agreed(self, landmarks: Landmarks) -> None:
         """Merges the landmarks that an operator has declared to be one, verdict by verdict in their

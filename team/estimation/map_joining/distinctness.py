@@ -78,9 +78,9 @@ def missed(fold: Fold, ids: Collection[int]) -> list[int]:
     place, ascending; none that an operator has judged.
 
     A landmark of n < MOST submaps is missed where each landmark of MOST or more that any of these
-    has beside it has been observed by MOST n, and each of these has one. (A running map gives up
-    what is not found since it was observed last: `memory`.) How many false landmarks two submaps
-    agree on grows with the number of submaps; the share of those that find them does not.
+    has beside it has been observed by MOST n, and at least half of these have one. (A running map
+    gives up what is not found since it was observed last: `memory`.) How many false landmarks two
+    submaps agree on grows with the number of submaps; the share of those that find them does not.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)
@@ -90,12 +90,16 @@ def missed(fold: Fold, ids: Collection[int]) -> list[int]:
     for submap in graph.submaps:
         counts[submap.landmarks[submap.landmarks >= 0]] += 1
     observed = np.full(len(counts), np.iinfo(np.int64).max)
+    having, knowing = np.zeros_like(counts), np.zeros_like(counts)
     for each in graph.observed:
         beside = counts[each.known]
         well_known = beside[beside >= MOST]
-        least = well_known.min() if len(well_known) else 0
-        observed[each.known] = np.minimum(observed[each.known], least)
-    gone = {*np.flatnonzero((counts < MOST) & (observed >= MOST * counts)).tolist()}
+        having[each.known] += 1
+        if len(well_known):
+            knowing[each.known] += 1
+            observed[each.known] = np.minimum(observed[each.known], well_known.min())
+    missing = (counts < MOST) & (observed >= MOST * counts) & (2 * knowing >= having) & (having > 0)
+    gone = {*np.flatnonzero(missing).tolist()}
     judged = fold.landmarks.judged()
     return [id_ for id_ in sorted({*ids} - judged) if graph.landmarks.get(id_) in gone]
 

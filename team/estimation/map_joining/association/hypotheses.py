@@ -11,7 +11,7 @@ accept the assignment with the most pairs; here it also has to be the only likel
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from team.association import AssociationProfile
 from team.estimation import elementwise
@@ -53,12 +53,11 @@ def jointly(
     are not accepted, the assignment as a whole needs it.
     most_sd: candidates with a larger standard deviation are left out.
     """
-    at = likelihoods(joint, first, second, profile)
-    open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
-    first, second, sd = first[open_], second[open_], at.sd[open_]
+    open_ = candidates(joint, first, second, profile, most_sd)
+    first, second = first[open_], second[open_]
     if not len(first):
         return Grown((), joint, 0)
-    order = _order(first, sd)
+    order = _order(first, likelihoods(joint, first, second, profile).sd)
     taken = np.isin(first, order)
     involved = np.unique(np.concatenate((first[taken], second[taken])))
     in_window = joint.apart_in_window
@@ -83,6 +82,15 @@ def jointly(
         lost += sum(float(elementwise.exp(one.weight - best)) for one in longer[BEAM:])
         assigned = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
     return _agreed((joint, part), assigned, involved, profile, lost)
+
+
+def candidates(
+    joint: Joint, first: Indices, second: Indices, profile: AssociationProfile, most_sd: float
+) -> Bool[np.ndarray, " k"]:
+    """Marks the pairs that can be one landmark and are known to `most_sd`."""
+    at = likelihoods(joint, first, second, profile)
+    marked: Bool[np.ndarray, " k"] = (at.chi2 < profile.gate) & (at.sd <= most_sd)
+    return marked & ~joint.apart[first, second]
 
 
 def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
