@@ -89,8 +89,10 @@ def candidates(
 ) -> Bool[np.ndarray, " k"]:
     """Marks the pairs that can be one landmark and are known to `most_sd`."""
     at = likelihoods(joint, first, second, profile)
-    marked: Bool[np.ndarray, " k"] = (at.chi2 < profile.gate) & (at.sd <= most_sd)
-    return marked & ~joint.apart[first, second]
+    marked: Bool[np.ndarray, " k"] = (
+        (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
+    )
+    return marked
 
 
 def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
