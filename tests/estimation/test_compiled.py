@@ -124,7 +124,11 @@ def test_cached_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path)
 
     def run(*kernels: str) -> list[str]:
         (tmp_path / "allocating.py").write_text(ALLOCATING.format(list(kernels)))
-        environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{Path.cwd()}"}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": f"{tmp_path}:{Path.cwd()}",
+            "NUMBA_CACHE_DIR": str(tmp_path / "cached"),
+        }
         command = [sys.executable, "-m", "allocating"]
         ran = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
         assert ran.returncode == 0, ran.stderr
