@@ -47,6 +47,8 @@ PROGRESS_EVERY = 256
 """Number of measurements of a robot between two progress reports while the queue is busy."""
 _FAR_BEHIND = 20_000  # samples: the disk takes half a second for as many
 _WAIT_S = 0.05
+_PACE_S = 0.01
+"""What comes is taken by turns of this length: a turn for each message costs twice the CPU."""
 _QUIET_S = 0.5
 _STATUS_S = 1.0
 _REMIND_S = 10.0
@@ -310,7 +312,7 @@ def record(
                 if not (samples := bus.receive(_QUIET_S)):
                     break
                 loop.take(samples)
-            loop.take(bus.receive(_WAIT_S))
+            loop.take(samples := bus.receive(_WAIT_S))
             loop.mend(time.monotonic())
             loop.look(end)
             if time.monotonic() >= due:
@@ -321,6 +323,8 @@ def record(
                 if status.warnings and time.monotonic() >= remind_due:
                     remind_due = time.monotonic() + _REMIND_S
                     _LOG.info("%s", "; ".join(status.warnings))
+            if 0 < len(samples) < PROGRESS_EVERY:
+                stop.wait(_PACE_S)
         loop.take(bus.receive(0.0))
         for warning in loop.status(last=True).warnings:
             _LOG.warning("%s", warning)
