@@ -48,7 +48,7 @@ PROGRESS_EVERY = 256
 _FAR_BEHIND = 20_000  # samples: the disk takes half a second for as many
 _WAIT_S = 0.05
 _PACE_S = 0.01
-"""What comes is taken by turns of this length: a turn for each message costs twice the CPU."""
+"""What comes is taken by turns of this length: a turn for each message costs a third more CPU."""
 _QUIET_S = 0.5
 _STATUS_S = 1.0
 _REMIND_S = 10.0

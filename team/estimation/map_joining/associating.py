@@ -172,8 +172,8 @@ class IslandView:
         one, two = at[later], at[earlier]
         x, y = (self.joint.mean[one] - self.joint.mean[two]).T
         close = elementwise.hypot(x, y) < self.profile.same
-        open_ = candidates(self.joint, one[close], two[close], self.profile, self.profile.tight)
-        one, two = one[close][open_], two[close][open_]
+        one, two = one[close], two[close]
+        one, two, _ = candidates(self.joint, one, two, self.profile, self.profile.tight)
         split = np.unique(one)
         for begin in range(0, len(split), MOST_ASSIGNED):
             own = np.isin(one, split[begin : begin + MOST_ASSIGNED]) & ~self.gone[two]

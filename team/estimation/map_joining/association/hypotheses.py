@@ -11,7 +11,7 @@ accept the assignment with the most pairs; here it also has to be the only likel
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from team.association import AssociationProfile
 from team.estimation import elementwise
@@ -53,11 +53,10 @@ def jointly(
     are not accepted, the assignment as a whole needs it.
     most_sd: candidates with a larger standard deviation are left out.
     """
-    open_ = candidates(joint, first, second, profile, most_sd)
-    first, second = first[open_], second[open_]
+    first, second, sd = candidates(joint, first, second, profile, most_sd)
     if not len(first):
         return Grown((), joint, 0)
-    order = _order(first, likelihoods(joint, first, second, profile).sd)
+    order = _order(first, sd)
     taken = np.isin(first, order)
     involved = np.unique(np.concatenate((first[taken], second[taken])))
     in_window = joint.apart_in_window
@@ -86,13 +85,13 @@ def jointly(
 
 def candidates(
     joint: Joint, first: Indices, second: Indices, profile: AssociationProfile, most_sd: float
-) -> Bool[np.ndarray, " k"]:
-    """Marks the pairs that can be one landmark and are known to `most_sd`."""
+) -> tuple[Indices, Indices, Float[np.ndarray, " k"]]:
+    """The pairs that can be one landmark and whose difference is known to `most_sd` [m], with its
+    standard deviations.
+    """
     at = likelihoods(joint, first, second, profile)
-    marked: Bool[np.ndarray, " k"] = (
-        (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
-    )
-    return marked
+    open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
+    return first[open_], second[open_], at.sd[open_]
 
 
 def _order(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
