@@ -15,7 +15,7 @@ MOST = 7
 FOLDERS = ("team", "central", "sim", "tests", "benchmarks", "examples")
 COMPILED = (
     "add_sightings", "add_submaps", "agreement", "predictive_of_known", "left_out",
-    "normal_equations", "step", "_filter_step", "filter_step",
+    "normal_equations", "step", "filter_step",
 )  # fmt: skip
 """Compiled kernels and the steps of estimators, which share one order: state, motion, sensor, …"""
 COMMANDS = ("_ip", "ip")

@@ -5,10 +5,10 @@ noise of motion carried to the tangent space of the motion's end, so that motion
 """
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, Self
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -23,8 +23,7 @@ OFF_AXIS = 0.17364817766693041
 """Least cosine of the angle to the optical axis at which a depth tells a range."""
 
 
-@dataclass(frozen=True)
-class Increment:
+class Increment(msgspec.Struct, frozen=True, gc=False):
     """b_from_b': truth = mean ∘ Exp(xi), xi ~ N(0, covariance) in (forward, left, turn).
 
     mean:       (x [m], y [m], theta [rad]).

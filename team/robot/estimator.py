@@ -3,9 +3,9 @@ have.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
@@ -61,8 +61,7 @@ def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
     return Cloud(np.array(poses), weights / weights.sum())
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimates:
+class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """What an odometry interval led to: a submap, and the stamps of a new running pose and map.
 
     cloud: the particles, where there are any. judged: the innovation of an estimator without

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
@@ -21,6 +22,16 @@ from team.estimation.models import Increment, variances
 from team.estimation.scans import Own, unclaimed
 
 Proposal = Literal["fastslam2", "fastslam1"]
+Arrays = tuple[
+    Float[np.ndarray, "M 3"],
+    Float[np.ndarray, " M"],
+    UInt32[np.ndarray, " L"],
+    Float[np.ndarray, "M L 2"],
+    Float[np.ndarray, "M L 3"],
+]
+"""The fields of `Particles`, in their order."""
+Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
+"""Ids, ranges [m], bearings [rad] and claimed noises of measurements."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +51,13 @@ class Particles:
     means: Float[np.ndarray, "M L 2"]
     covariances: Float[np.ndarray, "M L 3"]
 
+    @property
+    def arrays(self) -> Arrays:
+        """The fields, as kernels take them."""
+        return self.poses, self.log_weights, self.ids, self.means, self.covariances
 
-@dataclass(frozen=True)
-class StepInfo:
+
+class StepInfo(msgspec.Struct, frozen=True, gc=False):
     """Statistics of one step.
 
     effective_sample_size: 1/Σ w² after the step, in [1, M].
@@ -108,22 +123,30 @@ def systematic_parents(
     return parents
 
 
+@compiled
+def copies_of(particles: Arrays, parents: Int64[np.ndarray, " M"]) -> Arrays:
+    """The fields of equal particles, each a copy of its parent."""
+    start, log_weights, ids, means, covariances = particles
+    poses, equal = np.empty_like(start), np.empty_like(log_weights)
+    placed, spread = np.empty_like(means), np.empty_like(covariances)
+    of_each = -elementary.log(float(len(parents)))
+    for i in range(len(parents)):
+        parent, equal[i] = parents[i], of_each
+        for j in range(3):
+            poses[i, j] = start[parent, j]
+        for k in range(means.shape[1]):
+            placed[i, k, 0], placed[i, k, 1] = means[parent, k, 0], means[parent, k, 1]
+            for j in range(3):
+                spread[i, k, j] = covariances[parent, k, j]
+    return poses, equal, ids, placed, spread
+
+
 def resampled(
     particles: Particles, generator: np.random.Generator
 ) -> tuple[Particles, Int64[np.ndarray, " M"]]:
     """Equal weights again, each particle a copy of its parent; draws one uniform number."""
     parents = systematic_parents(particles.log_weights, generator.random())
-    count = len(parents)
-    return (
-        Particles(
-            particles.poses[parents],
-            np.full(count, -elementary.log(count)),
-            particles.ids,
-            particles.means[parents],
-            particles.covariances[parents],
-        ),
-        parents,
-    )
+    return Particles(*copies_of(particles.arrays, parents)), parents
 
 
 def propagated_and_updated(
@@ -169,58 +192,46 @@ def filter_step(
     own: Own | None = None,
 ) -> tuple[Particles, float]:
     """As `propagated_and_updated` without resampling; returns also the log evidence."""
-    poses, log_weights, ids_after, means, covariances, log_evidence = _filter_step(
-        particles.poses,
-        particles.log_weights,
-        particles.ids,
-        particles.means,
-        particles.covariances,
-        increment.mean,
-        increment.covariance,
+    noises = unclaimed(len(ids)) if own is None else own
+    moved, log_evidence = particles_after(
+        particles.arrays,
+        (increment.mean, increment.covariance),
         generator.standard_normal((len(particles.poses), 3)),
-        ids,
-        ranges,
-        bearings,
+        (ids, ranges, bearings, noises),
         variances(sensor),
-        unclaimed(len(ids)) if own is None else own,
         proposal == "fastslam2",
     )
-    if not len(poses):
+    return particles_of(moved), log_evidence
+
+
+def particles_of(arrays: Arrays) -> Particles:
+    """The particles that a kernel returned.
+
+    Raises NotACovarianceError where there are none, as of `particles_after`.
+    """
+    if not len(arrays[0]):
         raise NotACovarianceError("the motion", "not positive semi-definite")
-    return Particles(poses, log_weights, ids_after, means, covariances), log_evidence
+    return Particles(*arrays)
 
 
 @compiled
-def _filter_step(
-    start: Float[np.ndarray, "M 3"],
-    log_weights: Float[np.ndarray, " M"],
-    known: UInt32[np.ndarray, " K"],
-    means: Float[np.ndarray, "M K 2"],
-    covariances: Float[np.ndarray, "M K 3"],
-    motion: Float[np.ndarray, "3"],
-    motion_covariance: Float[np.ndarray, "3 3"],
+def particles_after(
+    particles: Arrays,
+    motion: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
     normals: Float[np.ndarray, "M 3"],
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
+    seen: Seen,
     sensor: tuple[float, float, float],
-    own: Own,
     improved: bool,
-) -> tuple[
-    Float[np.ndarray, "M 3"],
-    Float[np.ndarray, " M"],
-    UInt32[np.ndarray, " L"],
-    Float[np.ndarray, "M L 2"],
-    Float[np.ndarray, "M L 3"],
-    float,
-]:
+) -> tuple[Arrays, float]:
     """The fields of the particles after a step, and its log evidence.
 
-    No poses, where the motion's covariance is not positive semi-definite.
+    motion: mean and covariance. No poses, where the covariance is not positive semi-definite.
     """
-    L = semidefinite_factor(motion_covariance)
+    start, log_weights, known, means, covariances = particles
+    ids, ranges, bearings, own = seen
+    L = semidefinite_factor(motion[1])
     if not np.isfinite(L).all():
-        return start[:0], log_weights, known, means, covariances, math.nan
+        return (start[:0], log_weights[:0], known, means[:0], covariances[:0]), math.nan
     after, slots, first = slots_of(known, ids)
     # The kernel writes into these.
     poses, weights = np.empty_like(start), log_weights.copy()
@@ -233,11 +244,11 @@ def _filter_step(
                 spread[i, k, j] = covariances[i, k, j]
     rows = measured(ranges, bearings, sensor, own)
     step(
-        start, motion, L, normals, len(known), slots, first, rows, improved, poses, weights,
+        start, motion[0], L, normals, len(known), slots, first, rows, improved, poses, weights,
         placed, spread,
     )  # fmt: skip
     weights, log_evidence = normalised(weights)
-    return poses, weights, after, placed, spread, log_evidence
+    return (poses, weights, after, placed, spread), log_evidence
 
 
 def propagated(

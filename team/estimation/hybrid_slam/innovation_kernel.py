@@ -215,6 +215,8 @@ def predictive_of_known(
     """
     _, slots, _ = slots_of(known, ids)
     chosen = slots < len(known)
+    if not chosen.any():
+        return 0.0, np.empty(0), np.empty((0, 0))
     rows = measured(ranges[chosen], bearings[chosen], sensor, own[chosen])
     L = semidefinite_factor(motion_covariance)
     error, S = predictive(poses, log_weights, means, covariances, motion, L, slots[chosen], rows)

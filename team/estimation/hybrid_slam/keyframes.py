@@ -4,10 +4,11 @@ takes.
 
 from bisect import bisect_right, insort
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
+from msgspec.structs import force_setattr, replace
 
 from team.config import MotionModel, Sensor
 from team.estimation import dense, geometry
@@ -29,8 +30,7 @@ UNMEASURED = (1.0, 0.5)
 large as the motion itself."""
 
 
-@dataclass(frozen=True)
-class Keyframe:
+class Keyframe(msgspec.Struct, frozen=True, gc=False):
     """The motion since the last keyframe and what was seen at its end (accepted and calibrated).
 
     own: the noises that the measurements claim (`team.estimation.scans`); without rows: none do.
@@ -46,15 +46,15 @@ class Keyframe:
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
     bearings: Float[np.ndarray, " n"]
-    own: Own = field(default_factory=lambda: unclaimed(0))
+    own: Own = msgspec.field(default_factory=lambda: unclaimed(0))
     looks: tuple[KeyframeScan, ...] = ()
     rest: Increment | None = None
     is_node: bool = False
-    forward: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    forward: Float[np.ndarray, "3"] = msgspec.field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         if len(self.own) != len(self.ids):
-            object.__setattr__(self, "own", unclaimed(len(self.ids)))
+            force_setattr(self, "own", unclaimed(len(self.ids)))
 
     def only(self, taken: Bool[np.ndarray, " n"]) -> "Keyframe":
         """The keyframe with only these of its measurements."""

@@ -43,7 +43,7 @@ class OpenWindow:
         self._key = incarnation, sequence
         self._gate = OutlierGate(config.sensor, config.front_end.outlier_share)
         self._solvable = True
-        self.motion = Increment.identity()
+        self._motions: list[Increment] = []
         self.last_keyframe_ns: int | None = None
         self._keyframes: list[Keyframe] = []
         self.settled = Settled(())
@@ -60,13 +60,22 @@ class OpenWindow:
         self.keyframes_ns: tuple[int, ...] = ()
 
     @property
+    def motion(self) -> Increment:
+        """The base's motion by odometry, as the sensor's."""
+        motion, sensor = Increment.identity(), self._config.sensor
+        for each in self._motions:
+            step = of_base(each, np.array(sensor.mount)) if sensor.is_mounted else each
+            motion = motion.then(step)
+        return motion
+
+    @property
     def gated(self) -> int:
         """Number of measurements that no others of the window confirmed."""
         return self._gate.gated + self.settled.gated
 
     def advance(self, keyframe: Keyframe) -> None:
         """Move and weigh the particles with the measurements that agree with others so far."""
-        self._follow(keyframe.increment)
+        self._motions.append(keyframe.increment)
         self.last_keyframe_ns = keyframe.stamp_ns
         self._try(lambda: self._admit(keyframe))
 
@@ -84,7 +93,7 @@ class OpenWindow:
         of speed.
         """
         if rest.mean.any() or rest.covariance.any():
-            self._follow(rest)
+            self._motions.append(rest)
             self._try(lambda: self._go(rest, forward))
 
     def solved(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
@@ -100,13 +109,6 @@ class OpenWindow:
     def is_sensible(self, submap: LocalMap | None) -> bool:
         """Whether there is a submap and it lies within the bounds."""
         return submap is not None and submap_beyond(submap, self._config.bounds) is None
-
-    def _follow(self, motion: Increment) -> None:
-        """The base's motion as the sensor's."""
-        sensor = self._config.sensor
-        if sensor.is_mounted:
-            motion = of_base(motion, np.array(sensor.mount))
-        self.motion = self.motion.then(motion)
 
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks

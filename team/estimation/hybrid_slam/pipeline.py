@@ -161,7 +161,7 @@ class HybridSlam:
             last_measurement=self._last_measurement,
             start_ns=start_ns,
             end_ns=end_ns,
-            local=windows.motion_alone(self._open.motion),
+            local=submap if is_sensible and submap is not None else self._moved_alone(),
             gated=self._open.gated,
             late=late,
             unsolved=0 if is_sensible else scans - late,
@@ -209,7 +209,11 @@ class HybridSlam:
         if self.last_keyframe_ns is None:
             return None
         found = self._open.solved(lambda window: windows.gaussian(window, running=True))
-        return windows.motion_alone(self._open.motion) if found is None else found
+        return self._moved_alone() if found is None else found
+
+    def _moved_alone(self) -> LocalMap:
+        """The Gaussian of the open window's odometry alone."""
+        return windows.motion_alone(self._open.motion)
 
     @property
     def innovation(self) -> Innovation:

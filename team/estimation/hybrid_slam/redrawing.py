@@ -15,6 +15,7 @@ correct what is not Gaussian, and the paths have no ancestors in common.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
@@ -72,7 +73,7 @@ def redrawn(
         means=means,
         covariances=covariances,
     )
-    return replace(window, particles=particles, paths=paths)
+    return msgspec.structs.replace(window, particles=particles, paths=paths)
 
 
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:

@@ -1,9 +1,8 @@
 """Reduces several scans of a moment to one range and bearing for each landmark."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
@@ -15,8 +14,7 @@ from team.estimation.models import Increment, located
 from team.estimation.scans import SENSOR, Own, carried, mean_claim, together, unclaimed
 
 
-@dataclass(frozen=True)
-class KeyframeScan:
+class KeyframeScan(msgspec.Struct, frozen=True, gc=False):
     """One scan at at_ns (its stamp, or the start of the odometry that covers it).
 
     back: the robot's pose relative to the keyframe's end; None: it is the keyframe itself, or that
@@ -32,10 +30,10 @@ class KeyframeScan:
     motion: Increment | None = None
     back: Pose | None = None
 
-    @cached_property
+    @property
     def is_unnamed(self) -> bool:
         """Whether it has detections without identities; it has no others then."""
-        return bool((self.ids >= UNNAMED).any())
+        return max(self.ids.tolist(), default=0) >= UNNAMED
 
 
 Measured = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]

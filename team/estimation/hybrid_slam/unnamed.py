@@ -6,11 +6,12 @@ again with them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int64
+from msgspec.structs import replace
 
 from team.config import UNNAMED, AssociationSettings, Sensor
 from team.estimation.association.association import associated

@@ -6,11 +6,12 @@ measurements along that particle's path: an EKF is linearised at the first, nois
 and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
+import dataclasses
 import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
@@ -19,7 +20,7 @@ from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import FAULTS, NotACovarianceError
 from team.estimation.geometry import inverse, tangent
 from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.fastslam import Particles, particles_of
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_of_window
 from team.estimation.hybrid_slam.moments import (
@@ -36,16 +37,16 @@ from team.estimation.hybrid_slam.sensitivity import (
     rows,
 )
 from team.estimation.hybrid_slam.sensitivity_kernel import Noise
-from team.estimation.models import Increment
+from team.estimation.hybrid_slam.window_kernel import NO_RESAMPLING, advanced_by
+from team.estimation.models import Increment, variances
 from team.estimation.mount import base_covariances, base_points, base_poses, base_shifts
-from team.estimation.scans import Own, together, unclaimed
+from team.estimation.scans import Own, unclaimed
 from team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)
 
 
-@dataclass(frozen=True)
-class Window:
+class Window(msgspec.Struct, frozen=True, gc=False):
     """Particles since the window's start, their paths, and the measurements that they have used.
 
     paths:    the pose of each particle's line of descent at each of the K keyframes.
@@ -70,8 +71,8 @@ class Window:
     node_stamps: Int64[np.ndarray, " nodes"]
     node_keyframes: Int64[np.ndarray, " nodes"]
     own: Own
+    effective: float
     innovation: Innovation = NOTHING
-    effective: float = math.inf
     motions: WindowMotions = NO_MOTIONS
 
 
@@ -98,10 +99,12 @@ def noise_of(sensor: Sensor) -> Noise:
 
 def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
     """Open a window: every particle exactly at zero, without landmarks or measurements."""
+    particles = fastslam.at_poses(np.zeros((front_end.particles, 3)))
     return Window(
         front_end=front_end,
         sensor=sensor,
-        particles=fastslam.at_poses(np.zeros((front_end.particles, 3))),
+        particles=particles,
+        effective=fastslam.effective_sample_size(particles.log_weights),
         paths=np.empty((0, front_end.particles, 3)),
         keyframes=np.empty(0, np.int64),
         ids=np.empty(0, np.uint32),
@@ -131,37 +134,38 @@ def advanced(
     own: the noises that the measurements claim (`team.estimation.scans`).
     """
     noises = unclaimed(len(ids)) if own is None else own
-    expected = NOTHING
-    with suppress(NotACovarianceError):  # then it is not known how well they were predicted
-        expected = innovation(
-            window.particles, increment, window.sensor, ids, ranges, bearings, noises
-        )
-    particles, info = fastslam.propagated_and_updated(
-        particles=window.particles,
-        increment=increment,
-        sensor=window.sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-        proposal=window.front_end.proposal,
-        resample_below=window.front_end.resample_below,
-        generator=generator,
-        own=noises,
+    front, particles = window.front_end, window.particles
+    count = len(particles.poses)
+    is_thin = window.effective < front.resample_below * count
+    uniform = generator.random() if is_thin else NO_RESAMPLING
+    after, paths, record, effective, squared, dof = advanced_by(
+        particles.arrays,
+        window.paths,
+        (window.keyframes, window.ids, window.measurements, window.own),
+        (increment.mean, increment.covariance),
+        (ids, ranges, bearings, noises),
+        (uniform, generator.standard_normal((count, 3))),
+        (variances(window.sensor), front.proposal == "fastslam2"),
     )
-    paths = window.paths if info.parents is None else window.paths[:, info.parents]
-    keyframe, read = np.empty(len(ids), np.int64), np.empty((len(ids), 2))
-    keyframe[:] = len(paths)
-    read[:, 0], read[:, 1] = ranges, bearings
-    return replace(
+    moved = particles_of(after)
+    expected = Innovation(squared, dof)
+    if not math.isfinite(squared):
+        expected = NOTHING
+        with suppress(NotACovarianceError):  # then it is not known how well they were predicted
+            expected = innovation(
+                particles, increment, window.sensor, ids, ranges, bearings, noises
+            )
+    keyframes, ids, measurements, owns = record
+    return msgspec.structs.replace(
         window,
-        particles=particles,
-        paths=np.concatenate((paths, particles.poses[None])),
-        keyframes=np.concatenate((window.keyframes, keyframe)),
-        ids=np.concatenate((window.ids, ids)),
-        measurements=np.concatenate((window.measurements, read)),
-        own=together([(len(window.ids), window.own), (len(ids), noises)]),
+        particles=moved,
+        paths=paths,
+        keyframes=keyframes,
+        ids=ids,
+        measurements=measurements,
+        own=owns,
         innovation=window.innovation.plus(expected),
-        effective=info.effective_sample_size,
+        effective=effective,
         motions=_with_motion(window, increment, forward),
     )
 
@@ -176,7 +180,7 @@ def _with_motion(
 
 def marked(window: Window, stamp_ns: int) -> Window:
     """Make the particles' poses at the last keyframe a pose node at this team time."""
-    return replace(
+    return msgspec.structs.replace(
         window,
         node_stamps=np.append(window.node_stamps, stamp_ns),
         node_keyframes=np.append(window.node_keyframes, len(window.paths) - 1),
@@ -194,7 +198,9 @@ def moved(
     It never resamples: the weights of the last measurements stay as they are.
     """
     particles = fastslam.propagated(window.particles, increment, generator)
-    return replace(window, particles=particles, motions=_with_motion(window, increment, forward))
+    return msgspec.structs.replace(
+        window, particles=particles, motions=_with_motion(window, increment, forward)
+    )
 
 
 def gaussian(window: Window, *, running: bool = False) -> LocalMap:
@@ -255,9 +261,11 @@ def moments_matched(
     if window.sensor.is_mounted:
         mount = np.array(window.sensor.mount)
         means, covariances = base_points(means, mount), base_covariances(covariances, mount)
-        particles = replace(particles, poses=base_poses(particles.poses, mount))
+        particles = dataclasses.replace(particles, poses=base_poses(particles.poses, mount))
         of_nodes = base_poses(of_nodes, mount)
-    poses = np.concatenate((particles.poses, *of_nodes), axis=1)
+    poses = np.ascontiguousarray(particles.poses)
+    if len(nodes):
+        poses = np.concatenate((poses, *of_nodes), axis=1)
     weights = elementwise.exp(particles.log_weights)
     mean, covariance, fault = submap_moments(
         poses,
@@ -282,13 +290,13 @@ def of_base(window: Window) -> Window:
     if not window.sensor.is_mounted:
         return window
     mount, particles = np.array(window.sensor.mount), window.particles
-    based = replace(
+    based = dataclasses.replace(
         particles,
         poses=base_poses(particles.poses, mount),
         means=base_points(particles.means, mount),
         covariances=base_covariances(particles.covariances, mount),
     )
-    return replace(window, particles=based, paths=base_poses(window.paths, mount))
+    return msgspec.structs.replace(window, particles=based, paths=base_poses(window.paths, mount))
 
 
 def motion_alone(motion: Increment) -> LocalMap:

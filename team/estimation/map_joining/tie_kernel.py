@@ -58,8 +58,8 @@ def tied(
             lever[point, 0], lever[point, 1] = x, u
             y[i] = c * seen[i] - s * seen[j] + mean[0] - mean[3 + i] + x * turn
             y[j] = s * seen[i] + c * seen[j] + mean[1] - mean[3 + j] + u * turn
-        U = _of_map(covariance, lever)
-        V = _of_seen(seen_covariance, c, s)
+        U = of_map(covariance, lever)
+        V = of_seen(seen_covariance, c, s)
         for point in range(m // 2):
             i, j = 2 * point, 2 * point + 1
             for k in range(m):
@@ -70,8 +70,8 @@ def tied(
         if not _invert(S):
             return Constraints(c, s, lever, z, S), False
         _multiply(S, y, z)
-        _step(mean, U, z, state)
-        _step(seen, V, z, local)
+        moved_by(mean, U, z, state)
+        moved_by(seen, V, z, local)
     return Constraints(c, s, lever, z, S), True
 
 
@@ -118,7 +118,7 @@ def agreed(
     known = len(in_whole)
     behind = len(local_mean) - 2 * len(ids)
     while True:
-        place, sights = _coordinates(in_whole, 3, 3), _coordinates(in_local, behind, 0)
+        place, sights = coordinates(in_whole, 3, 3), coordinates(in_local, behind, 0)
         mean, covariance = _part(whole_mean, whole_covariance, place)
         seen, spread = _part(local_mean, local_covariance, sights)
         tie, sound = tied(mean, covariance, seen, spread, ITERATIONS)
@@ -148,7 +148,7 @@ def _shared(
 
 
 @compiled
-def _coordinates(
+def coordinates(
     index: Int64[np.ndarray, " k"], behind: int, before: int
 ) -> Int64[np.ndarray, " m"]:
     """The entries 0 … before − 1 and those of the points with these indices, behind `behind`."""
@@ -237,7 +237,7 @@ def end_pose_of(
 
 
 @compiled
-def _of_map(
+def of_map(
     covariance: Float[np.ndarray, "q p"], lever: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "q m"]:
     """Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ."""
@@ -252,7 +252,7 @@ def _of_map(
 
 
 @compiled
-def _of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[np.ndarray, "q m"]:
+def of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[np.ndarray, "q m"]:
     """Rows of the local map's covariance (columns: the landmarks) times Hᵀ."""
     V = np.empty_like(covariance)
     for row in range(len(covariance)):
@@ -275,7 +275,7 @@ def _multiply(
 
 
 @compiled
-def _step(
+def moved_by(
     mean: Float[np.ndarray, " q"],
     gain: Float[np.ndarray, "q m"],
     z: Float[np.ndarray, " m"],
@@ -302,10 +302,10 @@ def tied_pose(
         the observed landmarks.
     """
     gain = np.concatenate(
-        (_of_map(covariance[:3], tie.lever), _of_seen(end_of_seen, tie.cos, tie.sin))
+        (of_map(covariance[:3], tie.lever), of_seen(end_of_seen, tie.cos, tie.sin))
     )
     before, state = np.concatenate((mean[:3], end)), np.empty(6)
-    _step(before, gain, tie.multiplier, state)
+    moved_by(before, gain, tie.multiplier, state)
     joint, row = np.zeros((6, 6)), np.empty(len(tie.multiplier))
     put_block(joint, 0, 0, covariance[:3, :3])
     put_block(joint, 3, 3, end_covariance)

@@ -13,10 +13,10 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team.estimation import dense, elementwise
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
 from team.estimation.geometry import wrapped
-from team.estimation.map_joining.tie_kernel import INDEFINITE, SINGULAR, agreed, end_pose_of
+from team.estimation.map_joining.join_kernel import joined_by_id
+from team.estimation.map_joining.tie_kernel import INDEFINITE, SINGULAR, end_pose_of
 from team.estimation.submap import LocalMap
 
 Maps = tuple[
@@ -56,44 +56,9 @@ def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
     landmarks) with its Jacobian. The update has rank 2k for k known landmarks and the Jacobian is
     the identity for the landmarks of the whole map: O(n²k) for its n numbers.
     """
-    local = local.without_nodes
-    found = agreed(*_parts(whole, local), math.inf)
-    _refuse(found.fault)
-    in_whole, in_local, tie = found.in_whole, found.in_local, found.tie
-    n, m = len(whole.mean), len(local.mean)
-    sights, known = 3 + _points(in_local), 3 + _points(in_whole)
-    k = len(in_whole)
-    of_pose = np.tile(np.eye(2, 3), (k, 1))
-    of_pose[:, 2] = tie.lever.ravel()
-    turn = np.array([[tie.cos, -tie.sin], [tie.sin, tie.cos]])
-    U = dense.product(whole.covariance[:, :3], of_pose.T) - whole.covariance[:, known]
-    V = (dense.product(local.covariance[:, sights].reshape(m, k, 2), turn.T)).reshape(m, 2 * k)
-    state = whole.mean - dense.product(U, tie.multiplier)
-    ended = local.mean - dense.product(V, tie.multiplier)
-    of_whole, of_local = dense.product(U, tie.inverse), dense.product(V, tie.inverse)
-    # (pose, local): what the new pose and the new landmarks are made of.
-    own = np.empty((3 + m, 3 + m))
-    own[:3, :3] = whole.covariance[:3, :3] - dense.product(of_whole[:3], U[:3].T)
-    own[3:, 3:] = local.covariance - dense.product(of_local, V.T)
-    own[:3, 3:] = dense.product(-of_whole[:3], V.T)
-    own[3:, :3] = own[:3, 3:].T
-    old = np.concatenate(
-        [
-            whole.covariance[3:, :3] - dense.product(of_whole[3:], U[:3].T),
-            dense.product(-of_whole[3:], V.T),
-        ],
-        axis=1,
-    )
-    fresh = np.setdiff1d(np.arange(len(local.ids)), in_local)
-    made, G = _composed(state[:3], ended, fresh)
-    covariance = np.empty((n + 2 * len(fresh), n + 2 * len(fresh)))
-    made_at = np.concatenate([np.arange(3), np.arange(n, len(covariance))])
-    covariance[3:n, 3:n] = whole.covariance[3:, 3:] - dense.product(of_whole[3:], U[3:].T)
-    covariance[np.ix_(made_at, made_at)] = dense.product(dense.product(G, own), G.T)
-    covariance[3:n, made_at] = dense.product(old, G.T)
-    covariance[made_at, 3:n] = covariance[3:n, made_at].T
-    mean = np.concatenate([made[:3], state[3:], made[3:]])
-    return _by_id(np.concatenate([whole.ids, local.ids[fresh]]), mean, covariance)
+    ids, mean, covariance, fault = joined_by_id(*_parts(whole, local.without_nodes))
+    _refuse(fault)
+    return WholeMap(ids, mean, covariance)
 
 
 def end_pose(
@@ -195,24 +160,3 @@ def _by_id(
         place = _entries(order)
         ids, mean, covariance = ids[order], mean[place], covariance[np.ix_(place, place)]
     return WholeMap(ids, mean, 0.5 * (covariance + covariance.T))
-
-
-def _composed(
-    pose: Float[np.ndarray, "3"], local: Float[np.ndarray, " m"], fresh: Int64[np.ndarray, " f"]
-) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q p"]]:
-    """(pose ∘ end pose, pose ∘ fresh local landmarks) and its Jacobian by (pose, local)."""
-    s, c = elementwise.sin_and_cos(pose[2])
-    at = np.concatenate([np.arange(2), 3 + _points(fresh)]).reshape(-1, 2)
-    rows = np.concatenate([np.arange(2), 3 + np.arange(2 * len(fresh))]).reshape(-1, 2)
-    points = local[at]
-    mean = np.empty(3 + 2 * len(fresh))
-    G = np.zeros((len(mean), 3 + len(local)))
-    mean[rows] = pose[:2] + dense.product(points, np.array([[c, s], [-s, c]]))
-    mean[2] = wrapped(pose[2] + local[2])
-    G[rows[:, 0], 0] = G[rows[:, 1], 1] = 1.0
-    G[rows[:, 0], 2] = -s * points[:, 0] - c * points[:, 1]
-    G[rows[:, 1], 2] = c * points[:, 0] - s * points[:, 1]
-    G[rows[:, 0], 3 + at[:, 0]] = G[rows[:, 1], 3 + at[:, 1]] = c
-    G[rows[:, 0], 3 + at[:, 1]], G[rows[:, 1], 3 + at[:, 0]] = -s, s
-    G[2, 2] = G[2, 5] = 1.0
-    return mean, G

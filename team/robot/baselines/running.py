@@ -1,9 +1,9 @@
 """An estimator that has one state from the start of a stream to its end."""
 
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from team.config import UNNAMED, RobotConfig
@@ -215,7 +215,8 @@ class RunningEstimator:
         if self._segmenter.now_ns is not None:
             for keyframe in self._segmenter.cut(self._segmenter.now_ns)[0]:
                 self._take(keyframe)
-        return replace(self._driven(before, last=True), became=self._became()), uncovered
+        driven = self._driven(before, last=True)
+        return msgspec.structs.replace(driven, became=self._became()), uncovered
 
     def own_pose(self) -> PoseGaussian:
         """The pose at the last keyframe."""
