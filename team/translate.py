@@ -16,7 +16,16 @@ from team.estimation.odometry import OdometryInterval, moved, steered
 from team.estimation.scans import Scan, point_scan, polar_scan
 from team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
 from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, from_ids, from_stamps, ids, octets, stamps
+from team.wire.arrays import (
+    floats,
+    from_floats,
+    from_ids,
+    from_numbers,
+    from_stamps,
+    ids,
+    octets,
+    stamps,
+)
 from team.wire.codec import unsound
 
 
@@ -235,15 +244,16 @@ def pose_message(
     covariance: Float[np.ndarray, "3 3"],
 ) -> m.PoseEstimate:
     """The message of a pose with its covariance, which is made exactly symmetric."""
-    symmetric = 0.5 * (covariance + covariance.T)
+    rows = covariance.tolist()  # so few numbers are added sooner one by one
+    symmetric = [0.5 * (rows[i][j] + rows[j][i]) for i in range(3) for j in range(3)]
     return m.PoseEstimate(
         stamp_ns=stamp_ns,
         robot=robot,
         incarnation=incarnation,
         sequence=sequence,
         map_digest=digest,
-        pose=from_floats(pose),
-        covariance=from_floats(symmetric),
+        pose=from_numbers(pose.tolist()),
+        covariance=from_numbers(symmetric),
     )
 
 

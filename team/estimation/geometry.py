@@ -38,6 +38,16 @@ def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
 
 
 @compiled
+def composed_with(a_from_b: Pose, poses: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """`compose` with each of some poses."""
+    found = np.empty_like(poses)
+    for k in range(len(poses)):
+        pose = compose(a_from_b, poses[k])
+        found[k, 0], found[k, 1], found[k, 2] = pose[0], pose[1], pose[2]
+    return found
+
+
+@compiled
 def inverse(a_from_b: Pose) -> Pose:
     """b_from_a."""
     s, c = elementary.sin_and_cos(a_from_b[2])

@@ -143,9 +143,9 @@ class LocalMap:
     @property
     def named(self) -> "LocalMap":
         """The marginal without the unnamed landmarks, which have no meaning in another window."""
-        named = int(np.searchsorted(self.ids, UNNAMED))
-        if named == len(self.ids):
+        if not len(self.ids) or self.ids[-1] < UNNAMED:
             return self
+        named = int(np.searchsorted(self.ids, UNNAMED))
         size = len(self.mean) - 2 * (len(self.ids) - named)
         return replace(
             self,

@@ -57,8 +57,8 @@ def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
     every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
     logs = particles.log_weights[::every]
     weights = elementwise.exp(logs - logs.max())
-    poses = [geometry.compose(origin, pose) for pose in particles.poses[::every]]
-    return Cloud(np.array(poses), weights / weights.sum())
+    poses = np.ascontiguousarray(particles.poses[::every])
+    return Cloud(geometry.composed_with(origin, poses), weights / weights.sum())
 
 
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):

@@ -131,8 +131,7 @@ class HybridEstimator:
         """
         window = self.open_window()
         try:
-            with np.errstate(all="ignore"):
-                return pose_now(self.whole, window).pose
+            return pose_now(self.whole, window).pose
         except UNSOLVABLE:
             return pose_now(self.whole, None if window is None else window.motion).pose
 
@@ -150,9 +149,8 @@ class HybridEstimator:
         numerically.
         """
         try:
-            with np.errstate(all="ignore"):
-                after = joined(self.whole, local)
-        except (NotACovarianceError, np.linalg.LinAlgError):
+            after = joined(self.whole, local)
+        except NotACovarianceError:
             after = None
         if after is not None and are_landmarks(after.covariance[3:, 3:]):
             return after

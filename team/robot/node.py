@@ -280,7 +280,8 @@ class RobotNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
-        return self._sound([*self._handled(message), *self._go_on()])
+        out = [*self._handled(message), *self._go_on()]
+        return self._sound(out) if out else out
 
     def drive_on(self, block: OdometryBlock) -> tuple[int, list[Outgoing]]:
         """Take the first of many odometry intervals at once: those that only move the robot, as

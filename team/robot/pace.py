@@ -44,10 +44,8 @@ class Pace:
         """
         if self.lockstep:
             return self.awaited > self.exchange and self.centre_alive is not False
-        return self.credit and bool(self.centre_alive) and self._ahead(submaps)
-
-    def _ahead(self, submaps: int) -> bool:
-        return submaps - self.acknowledged > CREDIT_SUBMAPS
+        is_ahead = submaps - self.acknowledged > CREDIT_SUBMAPS
+        return is_ahead and self.credit and bool(self.centre_alive)
 
     def answered(self, exchange: int) -> bool:
         """Take the answer of a round; returns whether it is new."""

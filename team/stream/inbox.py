@@ -113,9 +113,10 @@ class Inbox:
                     self._began_ns = measurement.stamp_ns
                 yield measurement
                 continue
-            following = min((e for e, r in self._later.items() if 0 in r), default=None)
-            if following is None:
+            beginnings = [e for e, r in self._later.items() if 0 in r] if self._later else None
+            if not beginnings:
                 return
+            following = min(beginnings)
             self.incarnation, self.next_measurement = following, 0
             self._waiting = self._later.pop(following)
             self._forget(following)

@@ -6,6 +6,7 @@ NumPy is imported at the first array: a router and a recorder see none, and it t
 import math
 import struct
 import sys
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ Stamps = bytes
 """int64 nanoseconds, little-endian."""
 
 EPSILON = sys.float_info.epsilon
+_SIZES = {"<f8": 8, "<u4": 4, "<i8": 8, "u1": 1}
 FEW = 16
 """So many numbers are looked at one by one sooner than as an array."""
 _NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
@@ -41,7 +43,7 @@ LARGEST_JOINT = 4096
 
 
 def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
-    size = np.dtype(dtype).itemsize
+    size = _SIZES[dtype]
     if len(data) % size:
         raise ValueError(f"wrong length: {what} has {len(data)} bytes, not a multiple of {size}")
     return np.frombuffer(data, dtype=dtype)
@@ -70,6 +72,11 @@ def octets(data: bytes, what: str) -> "np.typing.NDArray[np.uint8]":
 def from_floats(values: Any) -> Floats:
     """Little-endian float64 bytes, C order."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def from_numbers(values: Sequence[float]) -> Floats:
+    """The same of at most FEW plain floats, without an array."""
+    return _NUMBERS[len(values)].pack(*values)
 
 
 def from_ids(values: Any) -> Ids:

@@ -136,7 +136,10 @@ class Segmenter:
             ids, r, b, noises = ids[mask], r[mask], b[mask], noises[mask]
         noises = calibrated(noises, self._sensor)
         scan = KeyframeScan(stamp_ns, ids, r, b, noises)
-        insort(self._waiting, scan, key=lambda each: each.stamp_ns)
+        if self._waiting:
+            insort(self._waiting, scan, key=lambda each: each.stamp_ns)
+        else:
+            self._waiting.append(scan)
         return None
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> list[Keyframe]:

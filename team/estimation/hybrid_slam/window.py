@@ -257,7 +257,7 @@ def moments_matched(
     ids, means, covariances = landmarks
     particles = window.particles
     nodes = window.node_keyframes if with_nodes else NO_NODES
-    of_nodes = window.paths[nodes]
+    of_nodes = window.paths[nodes] if len(nodes) else window.paths[:0]
     if window.sensor.is_mounted:
         mount = np.array(window.sensor.mount)
         means, covariances = base_points(means, mount), base_covariances(covariances, mount)

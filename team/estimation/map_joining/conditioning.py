@@ -90,6 +90,8 @@ class SubmapCorrection(NamedTuple):
         A bias without an estimate is zero.
         """
         known = [each for each in self.biases if each[0] in local.biases]
+        if not known and self.covariance_factor == 1.0 and not local.biases:
+            return local
         if not known:
             return LocalMap(
                 local.ids,
