@@ -163,9 +163,10 @@ def packed(covariance: Matrix) -> Float[np.ndarray, " m"]:
 
 def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
     """The symmetric n × n matrix of a packed upper triangle."""
-    upper = np.zeros((n, n))
-    upper[upper_triangle(n)] = triangle
-    return upper + np.triu(upper, 1).T
+    rows, columns = upper_triangle(n)
+    matrix = np.empty((n, n))
+    matrix[rows, columns] = matrix[columns, rows] = triangle + 0.0  # a zero is positive
+    return matrix
 
 
 def curved(pose: PoseGaussian) -> PoseGaussian:

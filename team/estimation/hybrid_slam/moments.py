@@ -15,6 +15,7 @@ from team.estimation.compiled import compiled
 from team.estimation.gaussian import factor_or_fault
 from team.estimation.geometry import half_cotangent, wrapped
 from team.estimation.placing import put, put_block
+from team.estimation.summing import total
 
 POSE_JITTER = (1e-6, 1e-6, 1e-8)
 """Added to each pose's variances [m², m², rad²]: motion noise of rank 2 leaves P singular."""
@@ -53,6 +54,7 @@ def mean_path(
     return means
 
 
+@compiled
 def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
     """What the scatter of particles is to be taken times for its inverse to be right on average.
 
@@ -61,7 +63,7 @@ def sample_factor(weights: Float[np.ndarray, " M"]) -> float:
     7.7): the factor is N/(N − q − 2), with the q = 3 numbers of a pose, the directions in which no
     particle has a covariance of its own. Fewer than ten particles are taken for ten.
     """
-    return 1.0 / (1.0 - POSE_DEGREES * min(float(np.add.reduce(weights * weights)), MOST_SQUARE))
+    return 1.0 / (1.0 - POSE_DEGREES * min(total(weights * weights), MOST_SQUARE))
 
 
 @compiled
@@ -180,14 +182,20 @@ def _covariance(
 @compiled
 def submap_moments(
     poses: Float[np.ndarray, "M p"],
-    weights: Float[np.ndarray, " M"],
+    log_weights: Float[np.ndarray, " M"],
+    ids: UInt32[np.ndarray, " L"],
     means: Float[np.ndarray, "M L 2"],
     covariances: Float[np.ndarray, "M L 3"],
-    between: float,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"], int]:
-    """`moments` with the poses' mean and deviations `on_group`, and POSE_JITTER on each pose; and
-    the index in `gaussian.FAULTS` of why they are no Gaussian.
+) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, " n"], Float[np.ndarray, "n n"], int]:
+    """`moments` by ascending id with the poses' mean and deviations `on_group`, the scatter times
+    `sample_factor`, and POSE_JITTER on each pose; and the index in `gaussian.FAULTS` of why they
+    are no Gaussian.
     """
+    weights = np.empty(len(log_weights))
+    for i in range(len(weights)):
+        weights[i] = elementary.exp(log_weights[i])
+    between = sample_factor(weights)
+    ids, means, covariances = by_landmark(ids, means, covariances)
     mean, deviations = _of_points(weights, means, poses.shape[1])
     for pose in range(0, poses.shape[1], 3):
         at, off = on_group(np.ascontiguousarray(poses[:, pose : pose + 3]), weights)
@@ -197,7 +205,7 @@ def submap_moments(
     for i in range(poses.shape[1]):
         P[i, i] += POSE_JITTER[i % 3]
     _, fault = factor_or_fault(P)
-    return mean, P, fault
+    return ids, mean, P, fault
 
 
 @compiled

@@ -197,7 +197,8 @@ class OdometryRun:
         first scan at the marks.
         """
         whole, self._stretches = self._whole(), []
-        marks, self._marks, self._count = np.array(self._marks, np.int64), [], 0
+        marks = np.array(self._marks, np.int64) if self._marks else NO_MARKS
+        self._marks, self._count = [], 0
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
         return gone_on(since, self._model, *whole, marks)

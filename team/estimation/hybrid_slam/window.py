@@ -25,8 +25,6 @@ from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovati
 from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_of_window
 from team.estimation.hybrid_slam.moments import (
     POSE_JITTER,
-    by_landmark,
-    sample_factor,
     submap_moments,
 )
 from team.estimation.hybrid_slam.sensitivity import (
@@ -77,9 +75,7 @@ class Window(msgspec.Struct, frozen=True, gc=False):
 
 
 class ParticleLandmarks(NamedTuple):
-    """The landmarks of each of M particles, by ascending id [m, m²]; covariances as (xx, xy,
-    yy).
-    """
+    """The landmarks of each of M particles [m, m²]; covariances as (xx, xy, yy)."""
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "M L 2"]
@@ -230,7 +226,7 @@ def landmarks_solved_again(window: Window, *, running: bool = False) -> Particle
         np.ascontiguousarray(particles.covariances),
     )
     if running and window.sensor.range_white == window.sensor.bearing_white == 1.0:
-        return ParticleLandmarks(*by_landmark(*estimates))
+        return ParticleLandmarks(*estimates)
     found = landmarks_of_window(
         *estimates,
         np.ascontiguousarray(window.paths),
@@ -266,19 +262,19 @@ def moments_matched(
     poses = np.ascontiguousarray(particles.poses)
     if len(nodes):
         poses = np.concatenate((poses, *of_nodes), axis=1)
-    weights = elementwise.exp(particles.log_weights)
-    mean, covariance, fault = submap_moments(
+    ids, mean, covariance, fault = submap_moments(
         poses,
-        weights,
+        particles.log_weights,
+        ids,
         np.ascontiguousarray(means),
         np.ascontiguousarray(covariances),
-        sample_factor(weights),
     )
     if fault:
         raise NotACovarianceError("the submap of a window", FAULTS[fault])
     stamps = window.node_stamps[: len(nodes)]
     if not window.front_end.biases:
         return LocalMap(ids, mean, covariance, stamps)
+    weights = elementwise.exp(particles.log_weights)
     biases, sensitivity = _sensitivity(window, weights, (ids, mean), nodes)
     return LocalMap(ids, mean, covariance, stamps, biases, sensitivity)
 
