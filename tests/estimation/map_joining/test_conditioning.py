@@ -192,6 +192,15 @@ def test_before_the_first_map_the_pose_is_composed_from_the_exact_start():
     np.testing.assert_allclose(covariance, path.covariances[0], atol=1e-12)
 
 
+def test_of_each_submap_the_landmarks_are_counted_that_the_map_or_another_submap_has():
+    spread = np.diag([1.0, 1.0, 1e-6, *[1e-4] * 6])
+    means = np.array([1.0, 0.0, 0.0, 3.0, 1.0, 2.0, -1.0, 4.0, 2.0])
+    first = LocalMap(np.array([2, 3, 8], np.uint32), means, spread)
+    second = LocalMap(np.array([3, 4, 9], np.uint32), means, spread)
+    prior = RobotPrior(np.zeros(3), np.array([2], np.uint32), np.array([[3.0, 1.0]]), np.eye(5))
+    assert followed(prior.whole, [first, second]).known == (2, 1)
+
+
 def test_a_landmark_that_only_the_later_submaps_see_does_no_harm_and_ties_them():
     prior = RobotPrior(np.zeros(3), np.zeros(0, np.uint32), np.zeros((0, 2)), 1e-4 * np.eye(3))
     spread = np.diag([1.0, 1.0, 1e-6, 1e-4, 1e-4])
