@@ -1,8 +1,9 @@
 """Decides which priors a robot needs: those with information that it can not have by itself.
 
 A robot joins its last prior with its own later submaps, so a new prior is worth its bytes only for
-information from teammates, or for landmarks that it comes near to. Priors are most of the centre's
-traffic; in a map that does not change, most of them contain nothing new.
+information from teammates (landmarks that have moved, inter-robot measurements), or for landmarks
+that it comes near to. Priors are most of the centre's traffic; in a map that does not change, most
+of them contain nothing new.
 """
 
 from dataclasses import dataclass, replace
@@ -23,16 +24,21 @@ MOVED = 0.1
 """Least root mean square of the landmarks' movements for a new prior, in standard deviations."""
 SURER = 0.8
 """… or their variance has fallen to this share."""
+NEVER = -1
+"""Before all team time: there is no inter-robot measurement."""
 
 
 @dataclass(frozen=True)
 class _Sent:
-    """The map of a robot's last prior and the landmarks in it; since: the number of broadcasts
-    since.
+    """The map of a robot's last prior and the landmarks in it.
+
+    encounter_ns: team time of the newest inter-robot measurement of the robot or by it. since: the
+    number of broadcasts since.
     """
 
     blocks: LandmarkBlocks
     ids: UInt32[np.ndarray, " L"]
+    encounter_ns: int
     since: int
 
 
@@ -44,14 +50,27 @@ class SentPriors:
         self._sent: dict[Stream, _Sent] = {}
 
     def is_worth(
-        self, stream: Stream, pose: Float[np.ndarray, "3"], blocks: LandmarkBlocks
+        self,
+        stream: Stream,
+        pose: Float[np.ndarray, "3"],
+        blocks: LandmarkBlocks,
+        encounter_ns: int = NEVER,
     ) -> bool:
-        """Whether to send a prior at this pose in this map; if so, it is noted as sent."""
+        """Whether to send a prior at this pose in this map; if so, it is noted as sent.
+
+        encounter_ns: team time of the newest inter-robot measurement of this robot or by it.
+        """
         offsets = blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
         old = self._sent.get(stream)
-        if old is None or old.since + 1 >= EVERY or _has_changed(old, blocks, nearest[:NEEDED]):
-            self._sent[stream] = _Sent(blocks, np.sort(blocks.ids[nearest[: self._most]]), 0)
+        if (
+            old is None
+            or old.since + 1 >= EVERY
+            or encounter_ns > old.encounter_ns
+            or _has_changed(old, blocks, nearest[:NEEDED])
+        ):
+            ids = np.sort(blocks.ids[nearest[: self._most]])
+            self._sent[stream] = _Sent(blocks, ids, encounter_ns, 0)
             return True
         self._sent[stream] = replace(old, since=old.since + 1)
         return False

@@ -1,9 +1,16 @@
 """A prior is sent when it says what its robot can not know, and now and then."""
 
+import msgspec
 import numpy as np
 
+from central import sent_priors as priors
 from central.sent_priors import EVERY, SentPriors
+from sim.in_memory.team import run_team
+from sim.world.simulator import simulated
+from team.wire import channels as ch
+from team.wire.bus import opened
 from team.estimation.map_joining.marginals import LandmarkBlocks
+from tests.central.test_withdrawal import scenario
 
 HERE = np.zeros(3)
 ROBOT = ("r1", 1)
@@ -49,3 +56,31 @@ def test_a_robot_that_comes_to_landmarks_that_it_was_not_told_is_told():
     sent_priors.is_worth(ROBOT, HERE, blocks())
     assert not sent_priors.is_worth(ROBOT, np.array([20.0, 0.0, 0.0]), blocks())
     assert sent_priors.is_worth(ROBOT, np.array([30.0, 0.0, 0.0]), blocks())
+
+
+def test_an_inter_robot_measurement_is_told_once_to_those_that_it_is_of():
+    sent_priors = SentPriors(30)
+    said = [sent_priors.is_worth(ROBOT, HERE, blocks(), met) for met in (-1, -1, 5, 5, 3, 7)]
+    assert said == [True, False, True, False, False, True]
+
+
+def test_of_inter_robot_measurements_the_robots_are_told_that_they_are_of(monkeypatch):
+    monkeypatch.setattr(priors, "NEEDED", 0)
+    monkeypatch.setattr(priors, "EVERY", 1_000_000)
+    of = scenario()
+    met: dict[str, set[int]] = {each.id: set() for each in of.robots}
+    told: dict[str, list[int]] = {each.id: [] for each in of.robots}
+    for sample in run_team(of, simulated(of.world, of.robots, of.seed)):
+        channel, robot, message = opened(sample)
+        if channel is ch.SIGHTING_FACTOR:
+            met[message.robot].add(message.stamp_ns)
+            met[message.teammate].add(message.stamp_ns)
+        elif channel is ch.PRIOR:
+            told[robot].append(message.stamp_ns)
+    until = max(max(each) for each in told.values())
+    newest = {}
+    for robot, stamps in told.items():
+        newest[robot] = [max(each for each in met[robot] if each <= stamp) for stamp in stamps]
+        assert len(set(newest[robot])) == len(stamps), "told again without a new measurement"
+        assert newest[robot][-1] == max(each for each in met[robot] if each <= until)
+    assert len(told["r1"]) > 3 > len(told["r3"])
