@@ -1,15 +1,14 @@
 """A prior is sent when it says what its robot can not know, and now and then."""
 
-import msgspec
 import numpy as np
 
 from central import sent_priors as priors
 from central.sent_priors import EVERY, SentPriors
 from sim.in_memory.team import run_team
 from sim.world.simulator import simulated
+from team.estimation.map_joining.marginals import LandmarkBlocks
 from team.wire import channels as ch
 from team.wire.bus import opened
-from team.estimation.map_joining.marginals import LandmarkBlocks
 from tests.central.test_withdrawal import scenario
 
 HERE = np.zeros(3)
