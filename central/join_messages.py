@@ -12,7 +12,7 @@ from central.config import CentralConfig
 from central.fused import JOINT_LANDMARKS, version_entry
 from central.monitor import miscalibrations
 from central.rule import Tail
-from central.sent_priors import NEVER, SentPriors
+from central.sent_priors import SentPriors
 from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
@@ -211,15 +211,7 @@ def priors(
         latest[robot] = max(latest.get(robot, 0), incarnation)
     streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
     if isinstance(requested, SentPriors):
-        blocks = marginals.landmark_blocks(fold, shown)
-        met = _encounters(fold)
-        streams = [
-            each
-            for each in streams
-            if requested.is_worth(
-                each, marginals.last_pose(fold, each), blocks, met.get(each[0], NEVER)
-            )
-        ]
+        streams = requested.worth(fold, streams, shown)
     else:
         streams = [each for each in streams if each[0] in requested]
     if not streams:
@@ -234,16 +226,6 @@ def priors(
         )
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
-
-
-def _encounters(fold: Fold) -> dict[str, int]:
-    """Team time [ns] of the newest inter-robot measurement of each robot or by it."""
-    newest: dict[str, int] = {}
-    for encounter in fold.main.graph.sightings:
-        seen = encounter.sighting
-        for robot in (seen.robot, seen.teammate):
-            newest[robot] = max(newest.get(robot, NEVER), seen.stamp_ns)
-    return newest
 
 
 def trajectories(

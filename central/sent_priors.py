@@ -6,6 +6,7 @@ that it comes near to. Priors are most of the centre's traffic; in a map that do
 of them contain nothing new.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,8 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.estimation import elementary
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.marginals import LandmarkBlocks
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.marginals import LandmarkBlocks, landmark_blocks, last_pose
 
 EVERY = 8
 """One of so many broadcasts brings a prior at least, which bounds the robot's own submaps to
@@ -49,6 +51,15 @@ class SentPriors:
         self._most = most
         self._sent: dict[Stream, _Sent] = {}
 
+    def worth(self, fold: Fold, streams: Sequence[Stream], shown: Sequence[int]) -> list[Stream]:
+        """The streams to which a prior of this fold with these landmarks is to be sent."""
+        blocks, newest = landmark_blocks(fold, shown), _newest_encounters(fold)
+        return [
+            each
+            for each in streams
+            if self.is_worth(each, last_pose(fold, each), blocks, newest.get(each[0], NEVER))
+        ]
+
     def is_worth(
         self,
         stream: Stream,
@@ -74,6 +85,16 @@ class SentPriors:
             return True
         self._sent[stream] = replace(old, since=old.since + 1)
         return False
+
+
+def _newest_encounters(fold: Fold) -> dict[str, int]:
+    """Team time [ns] of the newest inter-robot measurement of each robot or by it."""
+    newest: dict[str, int] = {}
+    for encounter in fold.main.graph.sightings:
+        seen = encounter.sighting
+        for robot in (seen.robot, seen.teammate):
+            newest[robot] = max(newest.get(robot, NEVER), seen.stamp_ns)
+    return newest
 
 
 def _has_changed(old: _Sent, now: LandmarkBlocks, needed: Int64[np.ndarray, " k"]) -> bool:
