@@ -71,8 +71,8 @@ def are_landmarks(covariance: Matrix) -> bool:
     """Whether a joint covariance of points is finite and each point's own block is a covariance."""
     if not np.isfinite(covariance).all():
         return False
-    x = np.arange(0, len(covariance), 2)
-    xx, xy, yy = covariance[x, x], covariance[x, x + 1], covariance[x + 1, x + 1]
+    variances = covariance.diagonal()
+    xx, xy, yy = variances[::2], covariance.diagonal(1)[::2], variances[1::2]
     if not ((xx > 0.0) & (yy > 0.0)).all():
         return False
     return bool((np.abs(xy) < np.sqrt(xx) * np.sqrt(yy)).all())
@@ -92,10 +92,10 @@ def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | Non
         return "a variance that is not positive"
     sigmas = np.sqrt(variances)
     for of, unit, (least, most) in (
-        (sigmas[~angles], "m", bounds.sigma_m),
-        (sigmas[angles], "rad", bounds.sigma_rad),
+        (sigmas[~angles].tolist(), "m", bounds.sigma_m),
+        (sigmas[angles].tolist(), "rad", bounds.sigma_rad),
     ):
-        worst = [s for s in (of.min(initial=most), of.max(initial=least)) if not least <= s <= most]
+        worst = [s for s in (min([most, *of]), max([least, *of])) if not least <= s <= most]
         if worst:
             return f"a sigma of {worst[0]:.3g} {unit}, not from {least:g} to {most:g} {unit}"
     try:

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
@@ -38,7 +37,7 @@ class RunningPoses:
         """Take a prior from the team's map; the newest one is used."""
         if not is_newer_prior(prior, self._prior):
             return
-        whole = translate.prior_of(prior).whole
+        whole = self.team_map.decoded(prior).whole
         why = prior_beyond(whole.mean, whole.covariance, self._bounds)
         if why is None:
             self._prior = prior

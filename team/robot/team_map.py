@@ -9,6 +9,7 @@ from team.estimation.gaussian import curved
 from team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
+    RobotPrior,
     SubmapCorrection,
     followed,
     is_majority,
@@ -39,6 +40,7 @@ class TeamMap:
         self._submaps = 0
         self._shared = SubmapCorrection()
         self._whole = initial_map(np.zeros(3), None)
+        self._decoded: tuple[m.Prior, RobotPrior] | None = None
         self._pending: list[LocalMap] = []
         self._followed: Followed | Exception | None = None
         self.known = 0
@@ -58,6 +60,12 @@ class TeamMap:
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._warning(given)
         return Posed(curved(posed.pose), posed.known, posed.refused)
+
+    def decoded(self, prior: m.Prior) -> RobotPrior:
+        """The estimate in a prior; that of the last one asked for is kept."""
+        if self._decoded is None or self._decoded[0] is not prior:
+            self._decoded = prior, translate.prior_of(prior)
+        return self._decoded[1]
 
     def _warning(self, given: Followed) -> str:
         if is_majority(self.refused, self.known):
@@ -82,7 +90,7 @@ class TeamMap:
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             if prior is not self._prior or len(submaps) < self._submaps:
                 self._prior, self._submaps, self._pending = prior, 0, []
-                decoded = translate.prior_of(prior)
+                decoded = self.decoded(prior)
                 self._whole, self._shared = decoded.whole, decoded.shared
             later = submaps[max(self._submaps, prior.sequence + 1) :]
             self._pending += [self._shared.taken(each.named) for each in later]
