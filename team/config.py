@@ -285,9 +285,10 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     exchange_s: under a rule with feedback, the least team time between two exchanges of maps (at
     window ends; for `hybrid-thesis` at keyframes). pose_s: the least team time between two running
-    poses. clock_offset_s: odometry stamped t belongs to t + clock_offset_s of team time, the
-    sensor's clock; the robot corrects the stamp before it uses it. bounds: measurements beyond them
-    are rejected.
+    poses; a running map and particles go out for each window in which a multiple of it lies.
+    clock_offset_s: odometry stamped t belongs to t + clock_offset_s of team time, the sensor's
+    clock; the robot corrects the stamp before it uses it. bounds: measurements beyond them are
+    rejected.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]

@@ -64,15 +64,15 @@ def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """What an odometry interval led to: a submap, and the stamps of a new running pose and map.
 
-    cloud: the particles, where there are any. judged: the innovation of an estimator without
-    windows since it was last reported, and its time. became: the outcomes of all detections without
-    identities, from such an estimator at the end of its stream.
+    cloud: returns the particles, where there are any, until the next interval is taken. judged: the
+    innovation of an estimator without windows since it was last reported, and its time. became: the
+    outcomes of all detections without identities, from such an estimator at the end of its stream.
     """
 
     closed: ClosedWindow | None = None
     pose_ns: int | None = None
     map_ns: int | None = None
-    cloud: Cloud | None = None
+    cloud: Callable[[], Cloud] | None = None
     judged: tuple[Innovation, int] | None = None
     became: Became | None = None
 

@@ -7,11 +7,15 @@ them are one over several submaps, and until then the pose follows odometry and 
 identities.
 """
 
+from collections import deque
+from functools import partial
+
 import numpy as np
 
 from team.config import RobotConfig
 from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.pose_grid import TeammateScan
@@ -27,6 +31,7 @@ from team.robot.estimator import (
     AT_ORIGIN,
     NOTHING_KNOWN,
     NOTHING_NEW,
+    Cloud,
     Estimates,
     InitialPose,
     KnownMap,
@@ -52,7 +57,9 @@ class HybridEstimator:
         self._slam = HybridSlam(config, incarnation)
         self.associates = config.fusion == "join"
         origin = np.zeros(3) if initial.pose is None else initial.pose
-        self.whole: WholeMap = initial_map(origin, initial.covariance)
+        self._whole: WholeMap = initial_map(origin, initial.covariance)
+        self._behind: deque[LocalMap] = deque()
+        self._origin = origin
         self._open: tuple[LocalMap | None] | None = None
 
     @property
@@ -73,7 +80,8 @@ class HybridEstimator:
         """Continue behind a submap of an earlier process: the next window begins where that one
         ended.
         """
-        self.whole, self._open = self._joined(closed.local.named), None
+        self._behind.append(closed.local.named)
+        self._open = None
         self._slam.resume(closed)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
@@ -111,11 +119,23 @@ class HybridEstimator:
         return Estimates() if closed is None else self._with_submap(closed), uncovered
 
     def _with_submap(self, closed: ClosedWindow) -> Estimates:
-        """Update pose and map by a submap."""
-        origin = self.whole.mean[:3]
-        cloud = None if closed.window is None else thinned(closed.window.particles, origin)
-        self.whole = self._joined(closed.local.named)
+        """A submap is new: pose and map are updated by it as soon as they are asked for."""
+        self._behind.append(closed.local.named)
+        cloud = None
+        if closed.window is not None:
+            cloud = partial(self._cloud, closed.window.particles)
         return Estimates(closed=closed, pose_ns=closed.end_ns, map_ns=closed.end_ns, cloud=cloud)
+
+    def _cloud(self, particles: Particles) -> Cloud:
+        """The particles of the last closed window, around the pose at its beginning."""
+        self._join()
+        return thinned(particles, self._origin)
+
+    @property
+    def whole(self) -> WholeMap:
+        """The own whole map, of all submaps."""
+        self._join()
+        return self._whole
 
     def open_window(self) -> LocalMap | None:
         """The Gaussian of the open window at its last keyframe, if there is one; kept until it
@@ -142,16 +162,25 @@ class HybridEstimator:
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the landmarks of the own whole map by the fused ones; submaps never see it."""
-        self.whole = absorbed(self.whole, *landmarks)
+        self._whole = absorbed(self.whole, *landmarks)
+
+    def _join(self) -> None:
+        """Join the submaps behind the own map, one by one: the map is the same whenever it is asked
+        for.
+        """
+        while self._behind:
+            local = self._behind.popleft()
+            self._origin = self._whole.mean[:3]
+            self._whole = self._joined(local)
 
     def _joined(self, local: LocalMap) -> WholeMap:
         """The own map joined with a submap, or with its motion alone if it contradicts the map
         numerically.
         """
         try:
-            after = joined(self.whole, local)
+            after = joined(self._whole, local)
         except NotACovarianceError:
             after = None
         if after is not None and are_landmarks(after.covariance[3:, 3:]):
             return after
-        return joined(self.whole, local.motion)
+        return joined(self._whole, local.motion)

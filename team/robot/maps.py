@@ -21,11 +21,13 @@ MiB."""
 
 
 class RunningMaps:
-    """Decides when the own map is published. last: the sequence of the last one that was exchanged;
-    −1: none.
+    """Decides when the own map is published, and with it the particles.
 
-    Under a rule on whole maps one goes out every `exchange_s`, with its joint covariance; under one
-    with feedback the robot then waits for the answer (`Pace`).
+    For viewers they go out for each window in which a multiple of `pose_s` lies: by the stamps
+    alone, so that a robot that is started again publishes the same ones. Under a rule on whole maps
+    a map goes out every `exchange_s`, with its joint covariance; under one with feedback the robot
+    then waits for the answer (`Pace`). last: the sequence of the last one that was exchanged; −1:
+    none.
     """
 
     def __init__(self, config: RobotConfig, pace: Pace, warnings: list[str]) -> None:
@@ -33,6 +35,7 @@ class RunningMaps:
         self._pace = pace
         self._warnings = warnings
         self._exchanges = PAIRS[config.estimator, config.fusion] == "own/map"
+        self._period_ns = round(config.pose_s * 1e9)
         self._map_ns: int | None = None
         self._exchange_ns: int | None = None
         self.last = -1
@@ -40,6 +43,11 @@ class RunningMaps:
     def begin_incarnation(self) -> None:
         """Begin an incarnation: its maps are numbered from 0."""
         self.last = -1
+
+    def due(self, begin_ns: int, end_ns: int) -> bool:
+        """Whether a map at the end of this window is published, or may be exchanged."""
+        period_ns = self._period_ns
+        return self._exchanges or period_ns == 0 or end_ns // period_ns > begin_ns // period_ns
 
     def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
         """A new running map: publish it for viewers, or in an exchange that is due."""

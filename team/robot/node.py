@@ -484,7 +484,8 @@ class RobotNode:
             return []
         closed, writer = estimates.closed, self._writer
         if closed is not None:
-            return [*writer.cloud(closed.end_ns, estimates.cloud), *self._send(closed)]
+            cloud = estimates.cloud if self._maps.due(closed.start_ns, closed.end_ns) else None
+            return [*writer.cloud(closed.end_ns, cloud), *self._send(closed)]
         self._taken()
         out: list[Outgoing] = []
         if estimates.pose_ns is not None:
@@ -512,11 +513,12 @@ class RobotNode:
         self._front.close(closed)
         self._on_window(closed)
         self._pending += self._outbox.put(messages)
+        shown = self._maps.due(closed.start_ns, closed.end_ns)
         return [
             writer.innovation(closed.end_ns, closed.sequence, closed.innovation),
             *writer.association(closed.sequence, closed.end_ns, closed.became),
             *self._poses.at(closed.end_ns, self._front, writer),
-            *self._maps.at(closed.end_ns, self._front, writer),
+            *(self._maps.at(closed.end_ns, self._front, writer) if shown else ()),
             self._progress(),
         ]
 

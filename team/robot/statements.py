@@ -1,5 +1,6 @@
 """Turns what a robot's estimator has found into messages on their channels."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,11 +67,11 @@ class MessageWriter:
         message = translate.sighting_message(sighting, self.config, each.measurements)
         return Outgoing(ch.SIGHTING_FACTOR, self.robot, message)
 
-    def cloud(self, stamp_ns: int, cloud: Cloud | None) -> list[Outgoing]:
+    def cloud(self, stamp_ns: int, cloud: Callable[[], Cloud] | None) -> list[Outgoing]:
         """The thinned particles at this time, if there are any."""
         if cloud is None:
             return []
-        poses, weights = (from_floats(x) for x in cloud)
+        poses, weights = (from_floats(x) for x in cloud())
         message = m.ParticleCloud(stamp_ns=stamp_ns, robot=self.robot, poses=poses, weights=weights)
         return [Outgoing(ch.PARTICLES, self.robot, message)]
 

@@ -443,6 +443,23 @@ def test_a_sound_map_is_checked_once_and_of_a_spoilt_one_the_rest_is_sent(monkey
     ]
 
 
+def test_running_maps_and_particles_go_out_for_the_windows_with_a_multiple_of_pose_s() -> None:
+    """Windows end at 3, 6, 9 and 12 s; the maps are the very ones of a robot that sends them all."""
+    every = driven(RobotNode(config()), MEASUREMENTS)
+    some = driven(RobotNode(config(pose_s=4.0)), MEASUREMENTS)
+    never = driven(RobotNode(config(pose_s=1e6)), MEASUREMENTS)
+    for channel in (ch.OWN_MAP, ch.PARTICLES):
+        sent = of(every, channel)
+        assert [x.stamp_ns // 10**9 for x in sent] == [3, 6, 9, 12]
+        assert of(some, channel) == [x for x in sent if x.stamp_ns // 10**9 != 3]
+        assert not of(never, channel)
+
+    def means(out):
+        return [x.mean for x in of(out, ch.SUBMAP)]
+
+    assert means(every) == means(some) == means(never)
+
+
 def test_the_final_map_ends_it():
     node = RobotNode(config())
     driven(node, MEASUREMENTS)

@@ -50,11 +50,22 @@ DRAWN_POINTS = 1000
 """Most points of a drawn path."""
 
 
-def his_protocol(scenario: Scenario) -> Scenario:
-    """The scenario with measurements and submaps of one second, exact initial poses, no loss, no
-    factor and no error states; without running poses, which he does not have.
+def final_maps_only(scenario: Scenario) -> Scenario:
+    """The scenario without running poses and maps and without broadcasts, of which his tables have
+    nothing; the final map and the smoothed paths are the same without them.
     """
     change = msgspec.structs.replace
+    robots = tuple(change(robot, pose_s=NEVER_S) for robot in scenario.robots)
+    central = change(scenario.central, broadcast_s=NEVER_S)
+    return change(scenario, robots=robots, central=central)
+
+
+def his_protocol(scenario: Scenario) -> Scenario:
+    """The scenario with measurements and submaps of one second, exact initial poses, no loss, no
+    factor and no error states.
+    """
+    change = msgspec.structs.replace
+    scenario = final_maps_only(scenario)
     robots = tuple(
         change(
             robot,
@@ -62,13 +73,12 @@ def his_protocol(scenario: Scenario) -> Scenario:
                 robot.front_end, window_s=STEP_S, window_m=0.0, keyframe_s=STEP_S, node_s=0.0,
                 biases=(),
             ),
-            pose_s=NEVER_S,
         )
         for robot in scenario.robots
     )  # fmt: skip
     central = change(
-        scenario.central, tick_s=NEVER_S, broadcast_s=NEVER_S, robust_c=None,
-        covariance_factor=1.0, withdraw_above=None,
+        scenario.central, tick_s=NEVER_S, robust_c=None, covariance_factor=1.0,
+        withdraw_above=None,
     )  # fmt: skip
     world = scenario.world
     if isinstance(world, UtiasWorld):

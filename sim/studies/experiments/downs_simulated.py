@@ -16,7 +16,7 @@ from scipy.stats import ttest_rel
 
 from central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, RED, TRUTH_COLOUR, VERMILION
 from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.downs_joined import spherical_task, whole_run_task
+from sim.studies.experiments.downs_joined import final_maps_only, spherical_task, whole_run_task
 from sim.studies.experiments.drawing import draw_map, figure, ruled, spread
 from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
 from sim.studies.experiments.task import Task
@@ -57,11 +57,15 @@ def _ekf(scenario: Scenario) -> Task:
     return whole_run_task(with_options(scenario, estimator="ekf-slam", fusion="alone"))
 
 
+def _ours(scenario: Scenario) -> Task:
+    return team_task(final_maps_only(scenario))
+
+
 EKF = Simulated("EKF", _ekf, 1, VERMILION, robot=True)
 HIS_JOINED = Simulated("joined, his protocol", spherical_task, TEAM, ORANGE, robot=True)
-OUR_JOINED = Simulated("joined, ours", team_task, 1, BLUE)
+OUR_JOINED = Simulated("joined, ours", _ours, 1, BLUE)
 HIS_TEAM = Simulated("team, his protocol", spherical_task, TEAM, GREEN, part="team")
-OUR_TEAM = Simulated("team, ours", team_task, TEAM, BLACK)
+OUR_TEAM = Simulated("team, ours", _ours, TEAM, BLACK)
 
 
 class SimulatedTable(NamedTuple):

@@ -11,7 +11,8 @@ Gauss-Newton steps. The graph provides the measurements, and the indices in the 
 and landmark.
 """
 
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,8 @@ from scipy.sparse.linalg import splu
 from team.estimation.map_joining.submap_graph import Graph
 
 Values = Float[np.ndarray, " _"]
-Rows = Float[np.ndarray, "r _"]
+Rows = Float[np.ndarray, "_ _"]
+Blocks = Float[np.ndarray, "K r m"]
 Indices = Int64[np.ndarray, " _"]
 
 AT_REST = 1e-9
@@ -46,6 +48,16 @@ class Solution(NamedTuple):
     at_rest: bool
 
 
+class Whitened(NamedTuple):
+    """The whitened residuals of K terms of one kind and size, their Jacobians, and the indices of
+    their coordinates in the state.
+    """
+
+    residuals: Float[np.ndarray, "K r"]
+    jacobians: Float[np.ndarray, "K r m"]
+    at: Int64[np.ndarray, "K m"]
+
+
 class PlainCost:
     """The cost of a graph's states. fixed: coordinates of the state that are not solved for."""
 
@@ -54,13 +66,13 @@ class PlainCost:
     ) -> None:
         if graph.biases:
             raise NotImplementedError("the judge knows no biases: front_end.biases must be []")
-        self._graph = graph
         self.free: Indices = np.flatnonzero(~fixed)
-        self._of_submap = [
-            _whitening(covariance_factor * c.local.covariance) for c, *_ in graph.submaps
-        ]
-        self._of_sighting = [_whitening(each.sighting.covariance) for each in graph.sightings]
-        self._of_prior = [np.linalg.cholesky(each.information).T for each in graph.priors]
+        self._terms_of: Kinds = [
+            *_submaps(graph, covariance_factor), *_sightings(graph), *_priors(graph)
+        ]  # fmt: skip
+        self._column = np.full(len(fixed), len(self.free))
+        self._column[self.free] = np.arange(len(self.free))
+        self._sum = _Sum([self._column[kind.at] for kind in self._terms_of], len(self.free))
 
     def of(self, state: Values) -> float:
         """The χ² of a state."""
@@ -68,12 +80,25 @@ class PlainCost:
         return float(r @ r)
 
     def residuals(self, state: Values) -> Values:
-        """The whitened residuals, term by term; the sum of their squares is the cost."""
-        return np.concatenate([W @ r for W, r, _, _ in self._terms(state)])
+        """The whitened residuals, kind by kind; the sum of their squares is the cost."""
+        found = [each.residuals.ravel() for each in self._terms(state)]
+        return np.concatenate([np.zeros(0), *found])
 
     def jacobian(self, state: Values) -> sparse.csr_array:
         """The Jacobian of the whitened residuals with respect to the free coordinates."""
-        return self._rows((at, W @ J) for W, _, at, J in self._terms(state))
+        entries, rows, columns, begin = [np.zeros(0)], [np.zeros(0, int)], [np.zeros(0, int)], 0
+        for each in self._terms(state):
+            row = begin + np.arange(each.residuals.size).reshape(*each.residuals.shape, 1)
+            column = self._column[each.at][:, None, :]
+            shape = each.jacobians.shape
+            entries.append(each.jacobians.ravel())
+            rows.append(np.broadcast_to(row, shape).ravel())
+            columns.append(np.broadcast_to(column, shape).ravel())
+            begin += each.residuals.size
+        where = (np.concatenate(rows), np.concatenate(columns))
+        free = len(self.free)
+        whole = sparse.csc_array((np.concatenate(entries), where), shape=(begin, free + 1))
+        return whole[:, :free].tocsr()
 
     def solved(self, state: Values) -> Solution:
         """The minimum that the steps reach from a state.
@@ -102,84 +127,148 @@ class PlainCost:
 
     def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
         """JᵀJ and Jᵀ r."""
-        terms = [(W @ r, at, W @ J) for W, r, at, J in self._terms(state)]
-        J = self._rows((at, WJ) for _, at, WJ in terms)
-        return (J.T @ J).tocsc(), J.T @ np.concatenate([Wr for Wr, *_ in terms])
+        return self._sum.normal(self._terms(state))
 
-    def _rows(self, terms: Iterable[tuple[Indices, Rows]]) -> sparse.csr_array:
-        """The blocks of rows as one matrix, with the columns of the free coordinates."""
-        entries, rows, columns, begin = [], [], [], 0
-        for at, J in terms:
-            entries.append(J.ravel())
-            rows.append(np.repeat(begin + np.arange(len(J)), len(at)))
-            columns.append(np.tile(at, len(J)))
-            begin += len(J)
-        where = (np.concatenate(rows), np.concatenate(columns))
-        shape = (begin, int(self._graph.offset[-1]))
-        whole = sparse.csc_array((np.concatenate(entries), where), shape=shape)
-        return whole[:, self.free].tocsr()
-
-    def _terms(self, state: Values) -> Iterator[tuple[Rows, Values, Indices, Rows]]:
-        """For each term its whitening matrix, its residual, the indices of its coordinates and its
-        Jacobian.
-        """
-        offset = self._graph.offset
-        for W, (contribution, nodes, *_) in zip(self._of_submap, self._graph.submaps, strict=True):
-            poses = 1 + len(contribution.local.node_stamps)
-            h, at, J = _submap(state, offset[nodes], poses)
-            r = h - contribution.local.mean
-            headings = np.arange(2, 3 * poses, 3)
-            r[headings] = _around(r[headings])
-            yield W, r, at, J
-        for W, (sighting, observer, teammate) in zip(
-            self._of_sighting, self._graph.sightings, strict=True
-        ):
-            h, at, J = _sighting(state, int(offset[observer]), int(offset[teammate]))
-            r = h - sighting.measurement
-            r[1:] = _around(r[1:])
-            yield W, r, at, J
-        for W, (node, mean, _) in zip(self._of_prior, self._graph.priors, strict=True):
-            at = int(offset[node]) + np.arange(len(mean))
-            r = state[at] - mean
-            r[2:] = _around(r[2:])
-            yield W, r, at, np.eye(len(mean))
+    def _terms(self, state: Values) -> list[Whitened]:
+        """The terms at a state; a column behind the last is that of what is not solved for."""
+        return [kind.whitened(state) for kind in self._terms_of]
 
 
-def _submap(state: Values, first: Indices, poses: int) -> tuple[Values, Indices, Rows]:
-    """The predicted submap, the indices of its coordinates (start, poses, points), and its
-    Jacobian.
+class _Sum:
+    """Sums the terms' normal equations, which have the same entries at every state."""
 
-    first: the first index of each node in the state.
+    def __init__(self, columns: Sequence[Int64[np.ndarray, "_ _"]], free: int) -> None:
+        keys = [(c[:, None, :] * (free + 1) + c[:, :, None]).ravel() for c in columns]
+        diagonal = np.arange(free) * (free + 2)
+        here, self._entry = np.unique(np.concatenate([diagonal, *keys]), return_inverse=True)
+        column, self._row = np.divmod(here, free + 1)
+        self._kept = (column < free) & (self._row < free)
+        self._begin = np.searchsorted(column[self._kept], np.arange(free + 1))
+        self._columns, self._free = columns, free
+
+    def normal(self, terms: Sequence[Whitened]) -> tuple[sparse.csc_array, Values]:
+        """Σ JᵀJ and Σ Jᵀ r over the free coordinates."""
+        gradient, entries = np.zeros(self._free + 1), [np.zeros(self._free)]
+        for (r, J, _), column in zip(terms, self._columns, strict=True):
+            transposed = J.transpose(0, 2, 1)
+            np.add.at(gradient, column, (transposed @ r[:, :, None])[:, :, 0])
+            entries.append((transposed @ J).ravel())
+        summed = np.bincount(self._entry, np.concatenate(entries), len(self._row))
+        parts = (summed[self._kept], self._row[self._kept], self._begin)
+        return sparse.csc_array(parts, shape=(self._free, self._free)), gradient[:-1]
+
+
+class _Submaps(NamedTuple):
+    """K submaps with the same numbers of poses and points. at: the indices in the state of the
+    coordinates of each one's start, poses and landmarks; points: the first ones of the latter two.
     """
-    s, points = int(first[0]), first[1:]
-    turn = np.exp(-1j * state[s + 2])
-    local = turn * (state[points] + 1j * state[points + 1] - state[s] - 1j * state[s + 1])
-    sizes = np.where(np.arange(len(points)) < poses, 3, 2)
-    rows = np.concatenate([[0], np.cumsum(sizes)])
-    own = (p + np.arange(k) for p, k in zip(points, sizes, strict=True))
-    at = np.concatenate([s + np.arange(3), *own])
-    h, J = np.zeros(rows[-1]), np.zeros((rows[-1], 3 + rows[-1]))
-    x, y = rows[:-1], rows[:-1] + 1
-    h[x], h[y] = local.real, local.imag
-    for part, of in ((turn, 0), (1j * turn, 1)):
-        J[x, 3 + x + of], J[y, 3 + x + of] = part.real, part.imag
-        J[x, of], J[y, of] = -part.real, -part.imag
-    J[x, 2], J[y, 2] = (-1j * local).real, (-1j * local).imag
-    heading = rows[:poses] + 2
-    h[heading] = state[points[:poses] + 2] - state[s + 2]
-    J[heading, 3 + heading], J[heading, 2] = 1.0, -1.0
-    return h, at, J
+
+    whitening: Float[np.ndarray, "K n n"]
+    means: Float[np.ndarray, "K n"]
+    at: Int64[np.ndarray, "K m"]
+    points: Int64[np.ndarray, "K p"]
+    poses: int
+
+    def whitened(self, state: Values) -> Whitened:
+        """The submaps as the state predicts them, less what they are."""
+        poses, count = self.poses, self.points.shape[1]
+        x = np.concatenate([3 * np.arange(poses), 3 * poses + 2 * np.arange(count - poses)])
+        y, heading = x + 1, 3 * np.arange(poses) + 2
+        start, turned = state[self.at[:, 0]] + 1j * state[self.at[:, 1]], state[self.at[:, 2]]
+        turn = np.exp(-1j * turned)[:, None]
+        local = turn * (state[self.points] + 1j * state[self.points + 1] - start[:, None])
+        h, J = np.zeros(self.means.shape), np.zeros((*self.means.shape, self.at.shape[1]))
+        h[:, x], h[:, y] = local.real, local.imag
+        for part, of in ((turn, 0), (1j * turn, 1)):
+            J[:, x, 3 + x + of], J[:, y, 3 + x + of] = part.real, part.imag
+            J[:, x, of], J[:, y, of] = -part.real, -part.imag
+        J[:, x, 2], J[:, y, 2] = (-1j * local).real, (-1j * local).imag
+        h[:, heading] = state[self.points[:, :poses] + 2] - turned[:, None]
+        J[:, heading, 3 + heading], J[:, heading, 2] = 1.0, -1.0
+        r = h - self.means
+        r[:, heading] = _around(r[:, heading])
+        return _whitened(self, r, J)
 
 
-def _sighting(state: Values, observer: int, teammate: int) -> tuple[Values, Indices, Rows]:
-    """Range and bearing of a teammate, and their Jacobian over both poses."""
-    way = complex(state[teammate] - state[observer], state[teammate + 1] - state[observer + 1])
-    distance = abs(way)
-    h = np.array([distance, np.angle(way) - state[observer + 2]])
-    to = np.array([[way.real, way.imag], [-way.imag / distance, way.real / distance]]) / distance
-    J = np.zeros((2, 6))
-    J[:, :2], J[1, 2], J[:, 3:5] = -to, -1.0, to
-    return h, np.concatenate([observer + np.arange(3), teammate + np.arange(3)]), J
+class _Sightings(NamedTuple):
+    """K inter-robot measurements. at: the coordinates of the observer's pose and the teammate's."""
+
+    whitening: Float[np.ndarray, "K 2 2"]
+    means: Float[np.ndarray, "K 2"]
+    at: Int64[np.ndarray, "K 6"]
+
+    def whitened(self, state: Values) -> Whitened:
+        """Range and bearing of the teammate as the state predicts them, less those measured."""
+        pose = state[self.at]
+        x, y = pose[:, 3] - pose[:, 0], pose[:, 4] - pose[:, 1]
+        distance = np.hypot(x, y)
+        r = np.stack([distance, np.arctan2(y, x) - pose[:, 2]], axis=1) - self.means
+        r[:, 1] = _around(r[:, 1])
+        to = np.array([[x, y], [-y / distance, x / distance]]) / distance
+        J = np.zeros((len(x), 2, 6))
+        J[:, :, 3:5] = np.moveaxis(to, 2, 0)
+        J[:, :, :2], J[:, 1, 2] = -J[:, :, 3:5], -1.0
+        return _whitened(self, r, J)
+
+
+class _Priors(NamedTuple):
+    """K Gaussians of coordinates of the state; the third is a heading where there is one."""
+
+    whitening: Float[np.ndarray, "K n n"]
+    means: Float[np.ndarray, "K n"]
+    at: Int64[np.ndarray, "K n"]
+
+    def whitened(self, state: Values) -> Whitened:
+        """The coordinates less their means."""
+        r = state[self.at] - self.means
+        r[:, 2:] = _around(r[:, 2:])
+        return _whitened(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))
+
+
+Kinds = list[_Submaps | _Sightings | _Priors]
+
+
+def _submaps(graph: Graph, covariance_factor: float) -> Iterator[_Submaps]:
+    """The graph's submaps by their numbers of poses and points."""
+    kinds = defaultdict(list)
+    for contribution, nodes, *_ in graph.submaps:
+        kinds[1 + len(contribution.local.node_stamps), len(nodes) - 1].append((contribution, nodes))
+    for (poses, count), submaps in kinds.items():
+        first = graph.offset[np.array([nodes for _, nodes in submaps])]
+        sizes = np.array([3] * (1 + poses) + [2] * (count - poses))
+        own = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        yield _Submaps(
+            np.array([_whitening(covariance_factor * c.local.covariance) for c, _ in submaps]),
+            np.array([c.local.mean for c, _ in submaps]),
+            np.repeat(first, sizes, axis=1) + own,
+            first[:, 1:],
+            poses,
+        )
+
+
+def _sightings(graph: Graph) -> Iterator[_Sightings]:
+    """The graph's inter-robot measurements, if there are any."""
+    if graph.sightings:
+        sightings = [each for each, *_ in graph.sightings]
+        first = graph.offset[np.array([nodes for _, *nodes in graph.sightings])]
+        yield _Sightings(
+            np.array([_whitening(each.covariance) for each in sightings]),
+            np.array([each.measurement for each in sightings]),
+            (first[:, :, None] + np.arange(3)).reshape(-1, 6),
+        )
+
+
+def _priors(graph: Graph) -> Iterator[_Priors]:
+    """The graph's priors, each by itself: they are few."""
+    for node, mean, information in graph.priors:
+        whitening = np.linalg.cholesky(information).T
+        yield _Priors(
+            whitening[None], mean[None], (graph.offset[node] + np.arange(len(mean)))[None]
+        )
+
+
+def _whitened(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whitened:
+    return Whitened((kind.whitening @ r[:, :, None])[:, :, 0], kind.whitening @ J, kind.at)
 
 
 def _step(N: sparse.csc_array, damping: float, gradient: Values) -> tuple[Values, float]:
@@ -195,6 +284,6 @@ def _whitening(covariance: Rows) -> Rows:
     return np.asarray(solve_triangular(L, np.eye(len(L)), lower=True))
 
 
-def _around(angles: Values) -> Values:
+def _around(angles: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
     """Angles in (−π, π]."""
     return np.asarray(np.angle(np.exp(1j * angles)))

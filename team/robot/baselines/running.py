@@ -1,6 +1,8 @@
 """An estimator that has one state from the start of a stream to its end."""
 
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -124,11 +126,11 @@ class RunningEstimator:
             pose_ns=pose_ns, map_ns=map_ns, cloud=self._cloud(map_ns), judged=innovation
         )
 
-    def _cloud(self, map_ns: int | None) -> Cloud | None:
-        """The particles, where there are any and a map is published."""
+    def _cloud(self, map_ns: int | None) -> Callable[[], Cloud] | None:
+        """Returns the particles, where there are any and a map is published."""
         if map_ns is None or self._filter.particles is None:
             return None
-        return thinned(self._filter.particles(self._state), np.zeros(3))
+        return partial(thinned, self._filter.particles(self._state), np.zeros(3))
 
     def _take(self, keyframe: Keyframe) -> None:
         """Takes a keyframe: its scans without identities one by one, then all observations with
