@@ -21,6 +21,8 @@ from team.extras import install_command
 
 FOLDER = "cases"
 """Folder of the stored results, in the folder of an experiment."""
+_STORED = "output.pkl"
+"""Name of joblib's file of a stored result."""
 IDLE_S = 5
 """Time [s] after which a worker without a case ends."""
 Cached = Callable[..., dict[str, Any]]
@@ -47,9 +49,12 @@ class Cases:
 
     def __init__(self, folder: Path) -> None:
         self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
+        self._has_any = any((folder / FOLDER).rglob(_STORED))
 
     def found(self, task: Task) -> dict[str, Any] | None:
-        """The stored result of a case; None where it is to be computed."""
+        """The result of a case that was stored before; None where it is to be computed."""
+        if not self._has_any:
+            return None
         arguments = _arguments(task)
         if not self._cached.check_call_in_cache(**arguments):
             return None

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -37,13 +38,16 @@ def _parameters(task: Task) -> Iterator[str]:
 
 def _differences(scenario: Mapping[str, Any]) -> Iterator[str]:
     """`path = value` of each field that differs from the built-in scenario of the same name."""
-    built_in = msgspec.to_builtins(
-        with_options(load(scenario["name"]), robots=len(scenario["robots"]))
-    )
-    before = dict(_flat(built_in, ""))
+    before = _built_in(scenario["name"], len(scenario["robots"]))
     for path, value in _flat(scenario, ""):
         if path not in IN_THE_LABEL | COPIES and before.get(path) != value:
             yield f"{path} = {value}"
+
+
+@cache
+def _built_in(name: str, robots: int) -> Mapping[str, str]:
+    """The leaves of a built-in scenario with so many robots."""
+    return dict(_flat(msgspec.to_builtins(with_options(load(name), robots=robots)), ""))
 
 
 def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
