@@ -142,8 +142,8 @@ class _Sum:
         diagonal = np.arange(free) * (free + 2)
         here, self._entry = np.unique(np.concatenate([diagonal, *keys]), return_inverse=True)
         column, self._row = np.divmod(here, free + 1)
-        self._kept = (column < free) & (self._row < free)
-        self._begin = np.searchsorted(column[self._kept], np.arange(free + 1))
+        self._is_free = (column < free) & (self._row < free)
+        self._begin = np.searchsorted(column[self._is_free], np.arange(free + 1))
         self._columns, self._free = columns, free
 
     def normal(self, terms: Sequence[Whitened]) -> tuple[sparse.csc_array, Values]:
@@ -154,7 +154,7 @@ class _Sum:
             np.add.at(gradient, column, (transposed @ r[:, :, None])[:, :, 0])
             entries.append((transposed @ J).ravel())
         summed = np.bincount(self._entry, np.concatenate(entries), len(self._row))
-        parts = (summed[self._kept], self._row[self._kept], self._begin)
+        parts = (summed[self._is_free], self._row[self._is_free], self._begin)
         return sparse.csc_array(parts, shape=(self._free, self._free)), gradient[:-1]
 
 
