@@ -498,20 +498,28 @@ def settled(island: Island) -> tuple[Island, int, float]:
     return island, count, change
 
 
-def solved_with_fixed(island: Island, unknown: int, by: float, iterations: int) -> Island:
+def solved_with_fixed(
+    island: Island, unknown: int, by: float, iterations: int, *, shortest: float = 0.0
+) -> Island:
     """Moves one number of the state by `by` and solves for all others given that.
 
     With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose
     component along w is what remains to be moved: the point on the constraint with the least cost
-    to second order.
+    to second order. An iteration whose squared length (p + λ q)ᵀ A (p + λ q), in standard
+    deviations, is below `shortest` is the last one.
     """
     missing = by
     for _ in range(iterations):
-        right = np.column_stack([-island.normal_equations[1], np.zeros(len(island.state))])
+        gradient = island.normal_equations[1]
+        right = np.column_stack([-gradient, np.zeros(len(island.state))])
         right[unknown, 1] = 1.0
         p, q = sparse.solved(island.posterior, right).T
-        step = p + (missing - p[unknown]) / q[unknown] * q
+        force = (missing - p[unknown]) / q[unknown]
+        step = p + force * q
+        squared = float(force * step[unknown] - dense.product(gradient, step))
         island, missing = island.moved(step, 0), missing - float(step[unknown])
+        if squared < shortest:
+            break
     return island
 
 

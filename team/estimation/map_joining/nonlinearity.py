@@ -28,6 +28,9 @@ from team.estimation.map_joining.gauss_newton import (
 STEPS = (1.0, 2.0, 3.0)
 """Displacements of a heading, in its standard deviations."""
 ITERATIONS = 4
+SHORTEST = 0.01
+"""Squared length in standard deviations of a step that is the last one: the cost, whose rises are
+reported to a tenth, changes by less behind it."""
 STRAIGHT_RAD = 0.1
 """Standard deviation [rad] of a heading below which the cost is taken as quadratic."""
 BENT = 4.0
@@ -74,11 +77,12 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
     if sigma < STRAIGHT_RAD:
         return
     island = aged(island, FULL_AGE)
+    heading = int(island.graph.offset[node]) + 2
     for sign in (1.0, -1.0):
         walked = island
         for before, after in zip((0.0, *STEPS), STEPS, strict=False):
             by = sign * (after - before) * sigma
-            walked = solved_with_fixed(walked, int(island.graph.offset[node]) + 2, by, ITERATIONS)
+            walked = solved_with_fixed(walked, heading, by, ITERATIONS, shortest=SHORTEST)
             rise = walked.cost - island.cost
             if not rise <= UNLIKELY:  # nor where the cost is no number
                 break
