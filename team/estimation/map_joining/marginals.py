@@ -95,12 +95,32 @@ def bias_estimates(fold: Fold) -> list[BiasEstimate]:
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
 
+_BIASES: WeakKeyDictionary[Island, list[BiasEstimate]] = WeakKeyDictionary()
+"""The biases of islands that are still there: a map's message and its priors ask for the same."""
+
+
 def _biases_in(island: Island) -> list[BiasEstimate]:
+    found = _BIASES.get(island)
+    if found is None:
+        found = _BIASES[island] = _found_biases(island)
+    return found
+
+
+def _found_biases(island: Island) -> list[BiasEstimate]:
+    """The biases of an island, from one joint covariance with those that the team has in common."""
+    common = island.graph.common
+    own = sorted(island.graph.biases.items())
+    joined = [(node, common[bias]) for (_, bias), node in own if bias in common]
+    union = sorted({node for pair in joined for node in pair})
+    among = joint_marginal(island, union)[1] if union else np.empty((0, 0))
+    place = {node: k for k, node in enumerate(union)}
     found = []
-    for (stream, bias), node in sorted(island.graph.biases.items()):
-        common = island.graph.common
+    for (stream, bias), node in own:
         if bias in common:
-            mean, covariance = joint_marginal(island, [node, common[bias]])
+            pair = [node, common[bias]]
+            mean = island.state[island.graph.offset[pair]]
+            of = [place[node] for node in pair]
+            covariance = among[np.ix_(of, of)]
         else:
             mean, covariance = _own_marginal(island, node)
         sigma = float(np.sqrt(covariance.sum()))
