@@ -5,12 +5,13 @@ Bar-Shalom, Li and Kirubarajan 2001, section 5.4.
 
 import math
 from functools import lru_cache
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from team.estimation import dense
+from team.estimation.chi2_kernel import chi2_quantiles
 from team.estimation.gaussian import cholesky_factor
 
 MEDIAN_PRICE = 1.3
@@ -43,14 +44,11 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 def chi2_limit(dof: int, tail: float) -> float:
     """What χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
-    Rounded to twelve digits: the last ones of a library's differ from processor to processor. Of
-    few degrees of freedom it is found by bisection of the finite sum (Abramowitz & Stegun 26.4.4
-    and 26.4.5), since a robot would need SciPy for nothing else: 0.16 s and 25 MB.
+    Rounded to twelve digits. Of few degrees of freedom it is found by bisection of the finite sum
+    (Abramowitz & Stegun 26.4.4 and 26.4.5), of more by `chi2_kernel`.
     """
     if dof > FEW:
-        from scipy.special import chdtri
-
-        return float(f"{chdtri(dof, tail):.12g}")
+        return float(f"{chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
     low, high = 0.0, float(max(dof, 1))
     while _chi2_tail(high, dof) > tail:
         high *= 2.0
@@ -77,15 +75,13 @@ def chi2_quantile(
 ) -> Float[np.ndarray, " n"] | float:
     """The value that χ² of `dof` degrees of freedom does not exceed with this probability.
 
-    Twice the inverse of the regularised incomplete gamma function of dof/2, as `scipy.stats` has
-    it, whose import would add half a second to every process's start. Rounded to 36 bits: the last
-    ones of the library's differ from processor to processor.
+    NaN of less than one degree of freedom. Rounded to 36 bits, as it was when a library's last bits
+    differed from processor to processor.
     """
-    from scipy.special import gammaincinv
-
-    mantissa, exponent = np.frexp(2.0 * gammaincinv(0.5 * dof, probability))
+    exact = chi2_quantiles(probability, 1.0 - probability, np.atleast_1d(np.asarray(dof, float)))
+    mantissa, exponent = np.frexp(exact)
     quantile = np.ldexp(np.rint(mantissa * 2.0**36) * 2.0**-36, exponent)
-    return cast(Float[np.ndarray, " n"] | float, quantile)
+    return quantile if np.ndim(dof) else float(quantile[0])
 
 
 def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float]:

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.special import chdtri
+from scipy.special import chdtri, gammaincinv
 
+from team.estimation.chi2_kernel import chi2_quantiles
 from team.estimation.consistency import (
     chi2_interval,
     chi2_limit,
@@ -78,3 +79,14 @@ def test_limits_of_few_degrees_of_freedom_are_the_librarys_to_twelve_digits() ->
     for tail in (1e-2, 1e-3, 1e-6):
         for dof in (*range(1, 40), 99, 100, 599, 600):
             assert chi2_limit(dof, tail) == float(f"{chdtri(dof, tail):.12g}")
+
+
+def test_limits_and_quantiles_of_any_degrees_of_freedom_are_the_librarys() -> None:
+    dof = np.concatenate([np.linspace(1.0, 60.0, 119), np.geomspace(1.0, 30_000.0, 40)])
+    for below in (1e-3, 0.025, 0.5, 0.975, 0.999, 1.0 - 1e-7):
+        found = chi2_quantiles(below, 1.0 - below, dof)
+        np.testing.assert_allclose(found, 2.0 * gammaincinv(0.5 * dof, below), rtol=1e-13)
+        assert chi2_quantile(below, 7.5) == pytest.approx(2.0 * gammaincinv(3.75, below), rel=1e-11)
+    for many in (601, 2_500, 40_000):
+        assert chi2_limit(many, 1e-5) == pytest.approx(chdtri(many, 1e-5), rel=1e-11)
+    assert np.isnan(chi2_quantiles(0.5, 0.5, np.array([0.0, -1.0, 0.9]))).all()
