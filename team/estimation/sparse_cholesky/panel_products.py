@@ -9,7 +9,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.compiled import compiled
+from team.estimation.compiled import compiled, inlined
 from team.estimation.dense_kernel import matrix_product
 from team.estimation.placing import put_block
 
@@ -29,7 +29,7 @@ def is_big(width: int, m: int) -> bool:
     return m >= ROWS and width >= WIDTH
 
 
-@compiled
+@inlined
 def add_products(
     target: Values, factors: Values, rows: Float[np.ndarray, "k m"], column: int, sign: float
 ) -> None:
@@ -52,7 +52,7 @@ def add_products(
             target[i] += factor * row[i]
 
 
-@compiled
+@inlined
 def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, least: Values) -> int:
     """Dense Cholesky factorisation of these columns in place; later columns are not changed.
 

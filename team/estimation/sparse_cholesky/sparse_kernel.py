@@ -8,7 +8,7 @@ by `panel_products` instead.
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation.compiled import compiled
+from team.estimation.compiled import compiled, inlined
 from team.estimation.dense_kernel import matrix_product
 from team.estimation.placing import put
 from team.estimation.sparse_cholesky import panel_products as products
@@ -24,7 +24,7 @@ undetermined.
 """
 
 
-@compiled
+@inlined
 def _panel(
     structure: Structure, panels: Values, s: int
 ) -> tuple[Indices, Float[np.ndarray, "w m"]]:
@@ -35,7 +35,7 @@ def _panel(
     return rows, panels[panel_start[s] : panel_start[s + 1]].reshape(width, len(rows))
 
 
-@compiled
+@inlined
 def _places(requested: Indices, present: Indices, place: Indices) -> None:
     """place[i] := index of wanted[i] in `present`; both ascending, all wanted are present."""
     at = 0
