@@ -362,17 +362,18 @@ def _priors(island: Island) -> list[tuple[str, float, float]]:
     """(robot, χ², dof) of each prior on an initial pose or a bias; a common bias counts for the
     frame's robot.
     """
-    robots = {nodes[0]: stream[0] for stream, nodes in island.graph.streams.items()}
-    robots |= {node: stream[0] for (stream, _), node in island.graph.biases.items()}
-    robots |= dict.fromkeys(island.graph.common.values(), min(island.graph.streams)[0])
-    return [
-        (
-            robots[prior.node],
-            float(weight * chi2),
-            len(prior.mean)
-            - float(weight * np.sum(prior.information * _own_marginal(island, prior.node)[1])),
-        )
-        for prior, chi2, weight in zip(
-            island.graph.priors, island.prior_chi2, island.prior_weight, strict=True
-        )
-    ]
+    graph = island.graph
+    robots = {nodes[0]: stream[0] for stream, nodes in graph.streams.items()}
+    robots |= {node: stream[0] for (stream, _), node in graph.biases.items()}
+    robots |= dict.fromkeys(graph.common.values(), min(graph.streams)[0])
+    factors, pattern = graph.prior_factors, graph.pattern
+    begin = pattern.value_start[pattern.column_start[factors.node]]
+    absorbed = factors.information[:, 0, 0] * island.selected_covariance[begin]
+    absorbed[graph.fixed[factors.node]] = 0.0
+    for k in np.flatnonzero(factors.size > 1).tolist():
+        prior = graph.priors[k]
+        absorbed[k] = np.sum(prior.information * _own_marginal(island, prior.node)[1])
+    weight = island.prior_weight
+    chi2, dof = weight * island.prior_chi2, factors.size - weight * absorbed
+    of = [robots[node] for node in factors.node.tolist()]
+    return list(zip(of, chi2.tolist(), dof.tolist(), strict=True))
