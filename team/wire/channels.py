@@ -127,14 +127,14 @@ SIGHTING_FACTOR = Channel(name="sighting_factor", template="robot/{robot}/sighti
 RENDEZVOUS = Channel(name="rendezvous", template="robot/{robot}/rendezvous", message=m.Rendezvous,
                      rate="0-1 per window and meeting", delivery="all", recorded=True, recomputable=False,
                      meaning="buffered submaps are released when a teammate is encountered; both robots transmit")  # fmt: skip
-OWN_MAP = Channel(name="own_map", template="robot/{robot}/own/map", message=m.MapEstimate, rate="one per window or exchange",
+OWN_MAP = Channel(name="own_map", template="robot/{robot}/own/map", message=m.MapEstimate, rate="one per window (pose_s) or exchange",
                   delivery="latest", recorded=True, recomputable=True,
                   meaning="running landmark means and covariances; consumed by rules with feedback")  # fmt: skip
 OWN_POSE = Channel(name="own_pose", template="robot/{robot}/own/pose", message=m.PoseEstimate, rate="one per keyframe", delivery="latest",
                    recorded=True, recomputable=True, meaning="running pose from own measurements alone")  # fmt: skip
 TEAM_POSE = Channel(name="team_pose", template="robot/{robot}/team/pose", message=m.PoseEstimate, rate="one per keyframe",
                     delivery="latest", recorded=True, recomputable=True, meaning="pose given the fused map; never an input of fusion")  # fmt: skip
-PARTICLES = Channel(name="particles", template="robot/{robot}/particles", message=m.ParticleCloud, rate="one per window",
+PARTICLES = Channel(name="particles", template="robot/{robot}/particles", message=m.ParticleCloud, rate="one per window (pose_s)",
                     delivery="latest", recorded=True, recomputable=True, meaning="thinned cloud, for viewers")  # fmt: skip
 INNOVATION = Channel(name="innovation", template="robot/{robot}/innovation", message=m.Innovation, rate="one per window", delivery="latest",
                      recorded=True, recomputable=True, meaning="how well a window's measurements were predicted (NIS)")  # fmt: skip
