@@ -11,7 +11,7 @@ a warning of a right map that is about more than a large or nonlinear covariance
 import msgspec
 
 from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.accuracy_starts import WRONG_CHI2, unknown_starts
+from sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
 from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import (
@@ -121,7 +121,7 @@ def is_beyond(run: Figures) -> bool:
         return True
     robots = run["robots"]
     first = [each["first_pose_chi2"] for name, each in robots.items() if name != min(robots)]
-    return any(chi2 is not None and chi2 > WRONG_CHI2 for chi2 in first)
+    return any(chi2 is not None and is_wrong(chi2) for chi2 in first)
 
 
 def _cases(options: Options) -> dict[str, list[Task]]:
