@@ -1,6 +1,6 @@
 """One palette, one colour per robot and one ellipse, for the pictures, the page and Foxglove."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +36,19 @@ def colour_of(number: int) -> str:
 def robot_colours(names: Iterable[str]) -> dict[str, str]:
     """The colour of each robot of a team; the same team has the same colours everywhere."""
     return {name: colour_of(number) for number, name in enumerate(in_order(names))}
+
+
+def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict[str, str]:
+    """What a legend has for each robot: its name; of more than `most` robots one entry for all.
+
+    Matplotlib leaves out a label that begins with an underscore.
+    """
+    ordered = in_order(names)
+    if len(ordered) <= most:
+        return {name: name for name in ordered}
+    return {
+        name: "_" if number else f"{len(ordered)} robots" for number, name in enumerate(ordered)
+    }
 
 
 def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:

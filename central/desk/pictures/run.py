@@ -17,6 +17,7 @@ from central.desk.drawing import (
     draw_ellipses,
     landmark_blocks,
     robot_colours,
+    robot_labels,
 )
 from central.desk.evaluation.errors import Path, moved
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
@@ -51,14 +52,14 @@ def map_picture(
     evaluation = _in_the_maps_frame(evaluation)
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
-    colours = robot_colours(evaluation.robots)
+    colours, labels = robot_colours(evaluation.robots), robot_labels(evaluation.robots)
     smoothed = {
         name for name, each in evaluation.robots.items() if len(each.smoothed_path.stamps_ns)
     }
     for i, (name, robot) in enumerate(evaluation.robots.items()):
         _draw_paths(
-            axis, name, robot, colours[name], first=i == 0, dense=paths.get(name),
-            apart=bool(smoothed) and name not in smoothed,
+            axis, name, robot, colours[name], label=labels[name], first=i == 0,
+            dense=paths.get(name), apart=bool(smoothed) and name not in smoothed,
         )  # fmt: skip
     _draw_landmarks(axis, evaluation)
     axis.set_aspect("equal", adjustable="datalim")
@@ -155,6 +156,7 @@ def _draw_paths(
     robot: RobotResult,
     colour: str,
     *,
+    label: str,
     first: bool,
     dense: SmoothedPath | None,
     apart: bool,
@@ -169,8 +171,8 @@ def _draw_paths(
     known = truth if len(truth.stamps_ns) else line
     if len(truth.stamps_ns):
         x, y, _ = truth.poses.T
-        label = "true paths" if first else None
-        axis.plot(x, y, color=TRUTH_COLOUR, linewidth=0.7, label=label, zorder=1)
+        truths = "true paths" if first else None
+        axis.plot(x, y, color=TRUTH_COLOUR, linewidth=0.7, label=truths, zorder=1)
     if len(known.stamps_ns):
         x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
         axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
@@ -180,12 +182,12 @@ def _draw_paths(
         axis.plot(
             *smoothed.poses.T[:2], color=colour, linestyle="", marker="o", markersize=3.5, zorder=3
         )
-        axis.plot([], [], color=colour, marker="o", label=name)
+        axis.plot([], [], color=colour, marker="o", label=label)
     elif apart:
         axis.plot([], [], color=colour, linestyle=":", label=f"{name}: not in this map")
     else:
         x, y, _ = _thinned(robot.online_path).poses.T
-        axis.plot(x, y, color=colour, linewidth=1.0, zorder=3, label=f"{name}, online")
+        axis.plot(x, y, color=colour, linewidth=1.0, zorder=3, label=f"{label}, online")
 
 
 def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:

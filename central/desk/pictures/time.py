@@ -19,6 +19,7 @@ from central.desk.drawing import (
     VERMILION,
     colour_of,
     robot_colours,
+    robot_labels,
 )
 from central.desk.evaluation.evaluation import Evaluation
 from central.desk.evaluation.history import History, Traffic
@@ -122,7 +123,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhspan(low, high, color=BAND_COLOUR, zorder=0, label="95 % of single poses")
     axis.axhline(1.0, color="#888888", linewidth=0.8)
     largest = 0.0
-    colours = robot_colours(evaluation.robots)
+    colours, labels = robot_colours(evaluation.robots), robot_labels(evaluation.robots)
     for name, robot in evaluation.robots.items():
         if robot.online is None:
             continue
@@ -132,7 +133,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
             robot.online.nees / 3.0,
             np.ones(len(robot.online.nees)),
         )
-        axis.plot(centres, sums / counts, color=colours[name], linewidth=1.2, label=name)
+        axis.plot(centres, sums / counts, color=colours[name], linewidth=1.2, label=labels[name])
         largest = max(largest, float((sums / counts).max()))
     nees = history.map_nees
     if len(nees.values):
@@ -148,7 +149,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
 
 def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     largest, lows, highs = 0.0, [], []
-    colours = robot_colours(evaluation.robots)
+    colours, labels = robot_colours(evaluation.robots), robot_labels(history.innovations)
     for name, of in history.innovations.items():
         centres, (squared, dof) = binned(
             history, of.stamps_ns, of.squared, of.dof.astype(np.float64)
@@ -162,7 +163,7 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
             values,
             color=colours.get(name, MAP_COLOUR),
             linewidth=1.2,
-            label=name,
+            label=labels[name],
         )
         largest = max(largest, float(values.max()))
         low, high = chi2_interval(int(np.median(dof[measured])), BAND, 1)
@@ -189,11 +190,11 @@ def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
             level, color=colour, linewidth=0.9, linestyle="--", label=f"above {level}: {name}"
         )
     largest = FAIL
-    colours = robot_colours(evaluation.robots)
+    colours, labels = robot_colours(evaluation.robots), robot_labels(history.robot_cost)
     for name, of in history.robot_cost.items():
         axis.plot(
             history.seconds(of.stamps_ns), of.values, color=colours.get(name, MAP_COLOUR),
-            linewidth=1.0, marker=".", markersize=3, label=name,
+            linewidth=1.0, marker=".", markersize=3, label=labels[name],
         )  # fmt: skip
         largest = max(largest, float(of.values.max(initial=0.0)))
     cost = history.map_cost
@@ -272,6 +273,7 @@ def _rate(
 def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Traffic]]) -> None:
     span_s = max((history.end_ns - history.start_ns) * 1e-9, 1e-9)
     at_s = np.linspace(0.0, span_s, RATE_POINTS)
+    labels = robot_labels(groups, 2 * len(ROBOT_COLOURS))
     for k, (name, parts) in enumerate(groups.items()):
         stamps = np.concatenate([part.stamps_ns for part in parts])
         sizes = np.concatenate([part.sizes for part in parts]).astype(np.float64)
@@ -279,7 +281,7 @@ def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Tr
         style = "-" if k < len(ROBOT_COLOURS) else "--"
         axis.plot(
             at_s[rate > 0.0], rate[rate > 0.0], color=colour_of(k), linestyle=style, linewidth=1.2,
-            label=name,
+            label=labels[name],
         )  # fmt: skip
     _log_scale(axis, axis.yaxis)
     axis.grid(color="#eeeeee", linewidth=0.6)

@@ -18,6 +18,7 @@ from central.desk.drawing import (
     curve_through,
     ellipses,
     robot_colours,
+    robot_labels,
 )
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.evaluation.history import history
@@ -75,6 +76,15 @@ def test_a_robot_has_the_same_colour_in_the_report_and_on_the_page() -> None:
     colours = robot_colours(sorted(names))
     assert [colours[name] for name in in_order(names)] == [colour_of(i) for i in range(11)]
     assert colours["r10"] != colours["r2"]
+
+
+def test_a_legend_names_ten_robots_and_counts_more() -> None:
+    few, many = [f"r{i}" for i in range(1, 11)], [f"r{i}" for i in range(1, 51)]
+    assert robot_labels(few) == {name: name for name in few}
+    said = robot_labels(sorted(many))
+    assert said.pop("r1") == "50 robots"
+    assert set(said) == set(many[1:])
+    assert set(said.values()) == {"_"}
 
 
 def test_both_pictures_are_drawn(run: Evaluation, tmp_path: Path) -> None:
