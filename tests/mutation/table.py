@@ -42,6 +42,10 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
             *GENERAL,
         ),
     ),
+    "team/estimation/hybrid_slam/window_kernel.py": (
+        8,
+        (*WINDOW, "estimation/hybrid_slam/test_innovation.py", *GENERAL),
+    ),
     "team/estimation/hybrid_slam/moments.py": (6, WINDOW),
     "team/estimation/hybrid_slam/arrow_kernel.py": (
         6,
@@ -169,6 +173,12 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "central/join_messages.py": (8, CENTRE),
     "central/scheduler.py": (12, CENTRE),
     "central/submap_intake.py": (10, CENTRE),
+    "central/sent_priors.py": (10, ("central/test_sent_priors.py",)),
+    "team/estimation/chi2_kernel.py": (8, ("estimation/test_consistency.py",)),
+    "team/estimation/map_joining/join_kernel.py": (
+        8,
+        ("estimation/map_joining/test_whole_map.py", "estimation/map_joining/test_conditioning.py"),
+    ),
     "team/estimation/consistency.py": (
         6,
         ("estimation/test_consistency.py", "central/test_monitor.py"),
