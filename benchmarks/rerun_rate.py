@@ -17,7 +17,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from central.desk.verification.verification import verify
-from team.recording.reader import open_log
+from team.recording.reader import LogError, open_log
 
 LEAST = 35.0
 """× real time for a team of five."""
@@ -33,12 +33,13 @@ def plain(path: Path) -> tuple[int, float]:
 
 def figures(path: Path) -> dict[str, Any]:
     """Of one log; CPU time of this process, which is that of one core."""
-    messages, measurement_s = plain(path)
+    log = open_log(path)
+    messages, measurement_s = plain(log.path)
     began = time.process_time()
-    result = verify(open_log(path))
+    result = verify(log)
     rerun_s = time.process_time() - began
     return {
-        "log": path.name,
+        "log": log.path.name,
         "team_time_s": result.span_s,
         "measurements": result.measurements,
         "verified": result.messages,
@@ -57,7 +58,10 @@ def main() -> int:
     parser.add_argument("logs", nargs="+", type=Path)
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
-    found = [figures(path) for path in told.logs]
+    try:
+        found = [figures(path) for path in told.logs]
+    except LogError as error:
+        parser.error(str(error))
     print(json.dumps(found, indent=1))
     if told.json:
         told.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -58,6 +58,8 @@ def own_document(name: str) -> Fields:
         raise ScenarioError(
             "a folder, not a scenario: give a .toml file in it; a data set goes with --dataset"
         )
+    if not path.is_file() and path.suffix == ".toml":
+        raise ScenarioError(f"no such file; built in are {', '.join(builtin_names())}")
     if not path.is_file():
         raise ScenarioError(
             f"no such scenario; built in: {', '.join(builtin_names())}; "

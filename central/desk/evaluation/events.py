@@ -82,7 +82,7 @@ class EventDetector:
                 node = robot_node(message.robot)
                 self._done.add(node)
                 text = (
-                    f"{message.robot} used all its {message.measurements:,} measurements, "
+                    f"{message.robot} has taken all its {message.measurements:,} measurements, "
                     f"{message.submaps} submaps"
                 )
                 return [Event(now_ns, "done", node, text)]

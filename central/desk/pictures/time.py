@@ -112,7 +112,7 @@ def consistency_picture(evaluation: Evaluation, history: History, path: FilePath
         draw(axis, evaluation, history)
         axis.grid(color="#eeeeee", linewidth=0.6)
         axis.set_axisbelow(True)
-        axis.legend(loc="upper left", fontsize=8, ncols=4, framealpha=0.85)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
     axes[-1][0].set_xlabel("team time [s]")
     save(figure, path)
     return True

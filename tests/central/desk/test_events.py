@@ -33,7 +33,7 @@ def test_a_robot_that_is_done_leaves() -> None:
         stamp_ns=0, robot="r1", incarnation=1, measurements=1200, steps=5, submaps=4, ledger=()
     )
     assert told(alive(True), done, done, alive(False))[1:] == [
-        ("done", "r1 used all its 1,200 measurements, 4 submaps"),
+        ("done", "r1 has taken all its 1,200 measurements, 4 submaps"),
         ("left", "r1 left"),
     ]
 

@@ -374,3 +374,8 @@ def test_the_fields_of_a_scenario_are_looked_up_once(monkeypatch: pytest.MonkeyP
     load("thesis")
     monkeypatch.setattr(msgspec.structs, "fields", lambda each: pytest.fail(f"again: {each}"))
     load("thesis")
+
+
+def test_a_file_that_is_not_there_is_told_as_a_file(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"nofile\.toml: no such file; built in are .*thesis"):
+        load(tmp_path / "nofile.toml")
