@@ -64,20 +64,27 @@ class Process:
             pid, status, used = os.wait4(self.pid, os.WNOHANG)
             if pid:
                 self.exit = os.waitstatus_to_exitcode(status)
-                # Bytes on macOS, kilobytes elsewhere.
-                peak_rss_mb = used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+                # Bytes on macOS, kilobytes elsewhere. It has the peak of what was there before
+                # the program, too: that of whoever started it.
+                most_mb = used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
                 cpu_s = used.ru_utime + used.ru_stime
+                peak_rss_mb = self.used.peak_rss_mb or most_mb
                 self.used = replace(self.used, cpu_s=cpu_s, peak_rss_mb=peak_rss_mb)
                 if self._started is not None:
                     self._started.returncode = self.exit
         return self.exit
 
     def measure(self) -> None:
-        """Note its share of memory, where the system tells (Linux)."""
+        """Note its share of memory and its peak so far, where the system tells (Linux)."""
         with suppress(OSError, StopIteration):
-            lines = Path(f"/proc/{self.pid}/smaps_rollup").read_text().splitlines()
-            pss_kb = int(next(line for line in lines if line.startswith("Pss:")).split()[1])
-            self.used = replace(self.used, pss_mb=pss_kb / 1e3)
+            pss_mb = self._told("smaps_rollup", "Pss:") / 1e3
+            peak_rss_mb = self._told("status", "VmHWM:") / 1e3
+            self.used = replace(self.used, pss_mb=pss_mb, peak_rss_mb=peak_rss_mb)
+
+    def _told(self, file: str, word: str) -> int:
+        """The number of kilobytes behind a word in a file of the system about the process."""
+        lines = Path(f"/proc/{self.pid}/{file}").read_text().splitlines()
+        return int(next(line for line in lines if line.startswith(word)).split()[1])
 
     def wait(self, timeout_s: float) -> bool:
         """Whether it has ended within this time."""
