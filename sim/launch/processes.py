@@ -77,11 +77,11 @@ class Process:
     def measure(self) -> None:
         """Note its share of memory and its peak so far, where the system tells (Linux)."""
         with suppress(OSError, StopIteration):
-            pss_mb = self._told("smaps_rollup", "Pss:") / 1e3
-            peak_rss_mb = self._told("status", "VmHWM:") / 1e3
+            pss_mb = self._kilobytes("smaps_rollup", "Pss:") / 1e3
+            peak_rss_mb = self._kilobytes("status", "VmHWM:") / 1e3
             self.used = replace(self.used, pss_mb=pss_mb, peak_rss_mb=peak_rss_mb)
 
-    def _told(self, file: str, word: str) -> int:
+    def _kilobytes(self, file: str, word: str) -> int:
         """The number of kilobytes behind a word in a file of the system about the process."""
         lines = Path(f"/proc/{self.pid}/{file}").read_text().splitlines()
         return int(next(line for line in lines if line.startswith(word)).split()[1])
