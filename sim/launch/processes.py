@@ -49,7 +49,7 @@ class Process:
     """A child of this process by its id.
 
     exit: its status (negative: the signal that ended it), None while it runs. used: its resources;
-    of its share of memory the last measurement.
+    of its memory the last measurement.
     """
 
     def __init__(self, pid: int, started: "subprocess.Popen[bytes] | None" = None) -> None:

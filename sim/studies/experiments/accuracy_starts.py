@@ -11,7 +11,7 @@ from sim.scenarios.scenario import Scenario, load, with_options
 from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
-from team.estimation.consistency import chi2_interval
+from team.estimation.consistency import chi2_limit
 
 WORLDS = ("thesis", "thesis-b")
 SHOWN: Shown = (
@@ -29,7 +29,7 @@ def is_wrong(chi2: float) -> bool:
     """Whether the χ² of a first pose is beyond what 99.9 % of right poses have (3 degrees of
     freedom).
     """
-    return chi2 > 3.0 * chi2_interval(3, 0.998, 1)[1]
+    return chi2 > chi2_limit(3, 0.001)
 
 
 def tasks(options: Options) -> list[Task]:
