@@ -9,7 +9,7 @@ bound (`online_bound.py`): what the batch smoother of all that the team has meas
 by, in the same run at the same stamps. Far from known landmarks a robot errs whatever its estimator
 is, so the worst over the median is the world's figure, and the RMSE over the bound's the
 estimator's. FILE is written after each seed, and what it has is not run again. Seeds 5000 to 5999
-are for headline figures (decision 0031): tune with others. Exit status 1 if a goal of GOALS is
+are for headline figures (decision 21): tune with others. Exit status 1 if a goal of GOALS is
 missed.
 """
 

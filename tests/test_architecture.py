@@ -16,7 +16,8 @@ PAGES = sorted(
     [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")],
     key=lambda page: page.name,
 )
-DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
+NOTES = sorted((ROOT / "docs" / "notes").glob("*.md"))
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 FOLDERS = ("team", "central", "sim", "tests", "docs", "examples", "benchmarks")
 NAMED = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]+\.\w+):\s+([^`]+)`")
@@ -58,7 +59,7 @@ def wrong(text: str) -> list[str]:
     return found + [path for path in PATHS.findall(text) if not (ROOT / path).exists()]
 
 
-@pytest.mark.parametrize("page", PAGES + DECISIONS, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES + DECISIONS + NOTES, ids=lambda page: page.name)
 def test_every_file_and_name_that_a_page_names_is_there(page: Path) -> None:
     assert wrong(page.read_text()) == []
 
@@ -84,7 +85,7 @@ def anchors(page: Path) -> set[str]:
     return {each.strip().replace(" ", "-") for each in plain}
 
 
-@pytest.mark.parametrize("page", PAGES + DECISIONS, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES + DECISIONS + NOTES, ids=lambda page: page.name)
 def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
     assert dangling(page) == []
 
@@ -143,7 +144,7 @@ def unknown(line: str) -> str | None:
     return f"no option {extra[0]} in: teamslam {line}" if extra else None
 
 
-@pytest.mark.parametrize("page", PAGES + DECISIONS, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES + DECISIONS + NOTES, ids=lambda page: page.name)
 def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text()
     named = [" ".join(each.split()) for each in COMMAND.findall(text) + SPOKEN.findall(text)]

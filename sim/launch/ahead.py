@@ -2,7 +2,7 @@
 
 What a team needs takes a second and a half to import and to load; meanwhile the launch reads its
 command line and its scenario on another core. This module imports next to nothing, so that the
-template is started within the first hundredth of a second: docs/decisions/0131.
+template is started within the first hundredth of a second: docs/decisions/12.
 """
 
 import os

@@ -3,7 +3,7 @@
 `launch` starts it first. Each process of the team is forked from it, which takes milliseconds where
 imports and kernels take two seconds, and shares its memory. A forked process has the launch as its
 parent, its own session, no input and its output in its own file, and continues as if it had been
-started by its command line: docs/decisions/0076-warm-template.md.
+started by its command line: docs/decisions/12-processes-forked-from-a-template.md.
 """
 
 import gc

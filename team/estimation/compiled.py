@@ -8,7 +8,7 @@ code valid while the kernel's own file is unchanged, so that after a change of a
 would run the old code; and it writes its index before the code, so that another process could load
 the code of an older program under the same name. Here the files of the cache are therefore named by
 a digest of the kernel's byte code, of the constants that it names and of the kernels that it calls:
-docs/decisions/0029.
+docs/decisions/31.
 """
 
 import dis

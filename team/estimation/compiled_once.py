@@ -62,7 +62,7 @@ def _number_from_anywhere() -> None:
 
     The number is in the name by which a cached kernel's parts are linked, and Numba counts from
     one in each process. Parts of two processes can then be called alike and be different: one that
-    sorts integers, one that orders them (docs/decisions/0130).
+    sorts integers, one that orders them (docs/decisions/31).
     """
     FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))
 

@@ -2,7 +2,7 @@
 
 Numba optimises every function by itself and writes its machine code, of its own functions as well
 as of ours, and does both again in each kernel that contains it. Here a function gets machine code
-when its address is asked for, which nobody does of a part: docs/decisions/0136.
+when its address is asked for, which nobody does of a part: docs/decisions/31.
 """
 
 import copy

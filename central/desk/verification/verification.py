@@ -33,7 +33,7 @@ PLATFORM = (
     "version.numpy", "version.scipy", "version.numba", "version.llvmlite",
 )  # fmt: skip
 """The metadata that have to be equal for equal bits; the processor's features are not among them:
-docs/decisions/0106."""
+docs/decisions/32."""
 MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (
     ch.SUBMAP, ch.ASSOCIATION, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE,

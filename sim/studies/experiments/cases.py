@@ -1,7 +1,7 @@
 """Computes cases in parallel and stores their results on disk, with joblib's workers and memory.
 
 A case that fails, or whose process dies, loses only itself. With a scheduler the cases run on
-Dask's workers, on a cluster, too (decision 0058).
+Dask's workers, on a cluster, too (decision 37).
 """
 
 import threading

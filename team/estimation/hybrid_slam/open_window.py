@@ -27,7 +27,7 @@ from team.estimation.submap import LocalMap
 DEPLETED = 10.0
 """Effective number of particles; where fewer remain after a keyframe, their scatter is no
 estimate of the uncertainty. It happens in one of a thousand windows of `thesis`, whose submap is
-then far off and overconfident (decision 0081)."""
+then far off and overconfident (decision 20)."""
 AGAIN = 8
 """The window is computed again with this many times the particles."""
 
@@ -84,7 +84,7 @@ class OpenWindow:
 
         Only where outliers are expected or there are detections without identities. Where that
         depletes the particles, the window is computed with more of them (where landmarks have
-        identities and errors are white: decision 0081).
+        identities and errors are white: decision 20).
         """
         self._try(self._settle)
 

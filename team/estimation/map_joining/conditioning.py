@@ -5,7 +5,7 @@ that it does not contain are independent, so their product is exact; the errors 
 a robot share are corrected first by the centre's estimates of them. The product is one
 least-squares problem: the centre's own, with the prior in the place of all earlier submaps. It is
 solved at once, so that every submap is linearised where all of them agree; joined one after the
-other, the first one would be linearised at the pose of a poor prior (decision 0031).
+other, the first one would be linearised at the pose of a poor prior (decision 21).
 
 A landmark observation of a submap that everything else contradicts (a misread barcode) is left out
 of that submap, for this solution only; the next submap and the next prior judge all of them anew,

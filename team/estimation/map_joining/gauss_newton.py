@@ -38,7 +38,7 @@ LEAST_WEIGHT = 1e-6
 """Lower bound of a landmark's weight, so that each landmark stays determined."""
 STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map can do
-without: it is a tenth of what condensing moves the map by (docs/decisions/0141)."""
+without: it is a tenth of what condensing moves the map by (docs/decisions/25)."""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 

@@ -1,7 +1,7 @@
 """Dense algebra on big panels, by blocks: nearly all of it is matrix products.
 
 A panel is Lᵀ on a supernode's columns J, a row per column of L (see `sparse_layout`); R are the
-rows below J (docs/decisions/0028).
+rows below J (docs/decisions/27).
 """
 
 import math

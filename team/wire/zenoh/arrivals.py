@@ -3,7 +3,7 @@ ones.
 
 A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats.
 A receiver therefore knows of everything that it lacks, at the beginning, in between and at the end,
-for as long as the publisher lives: `docs/decisions/0036-delivery.md`.
+for as long as the publisher lives: `docs/decisions/07-delivery-by-counts.md`.
 """
 
 from dataclasses import dataclass, field

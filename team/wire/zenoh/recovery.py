@@ -119,7 +119,7 @@ class Recovery:
         first known number is requested, on a key of no channel nothing.
 
         After a link was cut, Zenoh may hand over samples on keys that are composed of parts of
-        others: docs/decisions/0121.
+        others: docs/decisions/07.
         """
         found = self._arrivals.get((key, publisher))
         if found is None:
