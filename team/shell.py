@@ -291,6 +291,8 @@ class Shell:
             rates["fresh_s"] = self._spare_time.took_s
         if self.boundary.faults:
             rates["faults"] = float(self.boundary.faults)
+        if self.bus.dropped:
+            rates["dropped_samples"] = float(self.bus.dropped)
         status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)
         self.bus.publish(Outgoing(STATUS, self._name, status))
 

@@ -89,7 +89,13 @@ class Tap(Protocol):
 
 @runtime_checkable
 class Bus(Protocol):
-    """The bus as a shell uses it."""
+    """The bus as a shell uses it.
+
+    dropped: number of received samples that were dropped, since they came without a sound
+        attachment, or under another key than the one on which they were published.
+    """
+
+    dropped: int
 
     def publish(self, out: Outgoing) -> int:
         """Publishes; returns the payload's number of bytes. Blocks, with a bound, while receivers
@@ -316,6 +322,7 @@ class MemoryBus:
 
     def __init__(self, network: MemoryNetwork) -> None:
         self.number = 0
+        self.dropped = 0
         self._network = network
         self._arrived: deque[Sample] = deque()
         self._whole: set[str] = set()

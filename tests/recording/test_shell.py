@@ -1,7 +1,6 @@
 """The recorder and the replayer as processes see them: on a bus, until the team has finished."""
 
 import math
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import decoded, encoded
+from team.wire.zenoh.attachment import Attachment, pack
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests.support import Link, examples, odometry, received, submap, wait_until
@@ -365,7 +365,7 @@ def test_a_replay_is_the_log_byte_by_byte_in_its_order(path: Path, endpoint: str
         (
             f"team/t/{one.key}",
             one.payload,
-            struct.pack("<qqq", one.stamp_ns, one.wall_ns, one.counter),
+            pack(f"team/t/{one.key}", Attachment(one.stamp_ns, one.wall_ns, one.counter)),
         )
         for one in log.samples()
     ]

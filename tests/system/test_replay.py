@@ -1,7 +1,6 @@
 """`teamslam replay`: a log's traffic again, into a program that knows nothing of us."""
 
 import json
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,13 +9,13 @@ import zenoh
 
 from team.recording.reader import open_log
 from team.wire.bus import Sample
+from team.wire.zenoh.attachment import Attachment, pack
 from team.wire.zenoh.bus import ZenohBus
 from tests.system.conftest import Launched
 from tests.system.processes import Processes, until
 
 Arrived = list[tuple[str, bytes, bytes]]
 """(key, payload, attachment) in the order of arrival."""
-ATTACHMENT = struct.Struct("<qqq")
 
 
 @contextmanager
@@ -42,9 +41,9 @@ def recorded(launched: Launched) -> Arrived:
     """What must arrive: each message of the log, in its order."""
     return [
         (
-            f"team/short/{sample.key}",
+            (key := f"team/short/{sample.key}"),
             sample.payload,
-            ATTACHMENT.pack(sample.stamp_ns, sample.wall_ns, sample.counter),
+            pack(key, Attachment(sample.stamp_ns, sample.wall_ns, sample.counter)),
         )
         for sample in open_log(launched.log).samples()
     ]

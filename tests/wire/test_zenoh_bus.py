@@ -19,6 +19,7 @@ from team.wire import messages as m
 from team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from team.wire.zenoh import bus as zenoh_bus
+from team.wire.zenoh.attachment import Attachment, pack, unpack
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.recovery import Recovery
 from team.wire.zenoh.router import router
@@ -306,7 +307,73 @@ def test_a_publication_without_its_attachment_is_dropped_and_logged(
         with zenoh.open(config) as stranger:
             stranger.put("team/t/source/alpha/odometry", encoded(odometry(0)))
         wait_until(lambda: sink.receive(0.02) == [] and bool(caplog.records))
-    assert "team/t/source/alpha/odometry: dropped" in caplog.text
+        assert sink.dropped == 1
+    assert "'team/t/source/alpha/odometry': dropped" in caplog.text
+
+
+def put_beside(bus: ZenohBus, key: str, beside: bytes) -> None:
+    """Publish a submap on a key with another attachment than the bus would give it."""
+    bus._publishers[key].put(encoded(submap(1)), attachment=beside)
+
+
+OTHER = "robot/alpha/sighting_factor"
+"""A valid key, under which a sample of `robot/alpha/submap` may arrive after a cut."""
+
+
+@pytest.mark.parametrize(
+    ("beside", "why"),
+    [
+        (pack(f"team/t/{OTHER}", Attachment(1, 2, 1)), "on another key"),
+        (pack("team/u/robot/alpha/submap", Attachment(1, 2, 1)), "on another key"),
+        (pack("team/t/robot/alpha/submap", Attachment(1, 2, 1))[:24], "an older version"),
+    ],
+    ids=["another key", "another team", "no hash"],
+)
+def test_a_sample_of_another_key_is_dropped_and_has_not_arrived(
+    endpoint: str, caplog: pytest.LogCaptureFixture, beside: bytes, why: str
+) -> None:
+    caplog.set_level("INFO")
+    key = "robot/alpha/submap"
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        flowing(source, sink, c.SUBMAP)
+        source.publish(Outgoing(c.SUBMAP, "alpha", submap(0)))
+        arrived = received(sink, 1)
+        put_beside(source, key, beside)
+
+        def requested() -> bool:
+            arrived.extend(sink.receive(0.02))
+            return "asked for" in caplog.text
+
+        wait_until(requested)
+        source._counters[key] = 2
+        source.publish(Outgoing(c.SUBMAP, "alpha", submap(2)))
+        wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or len(arrived) >= 2))
+        assert counters(arrived, key) == [0, 2]
+        assert sink.lacking() == {key: [(1, 1)]}
+        assert sink.dropped >= 1
+    assert why in caplog.text
+
+
+def test_a_sample_that_came_under_another_key_is_fetched_from_its_publisher(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first arrival of the second submap is as Zenoh delivered some after a cut."""
+    misled: list[str] = []
+
+    def unpack_misled(key: str, data: bytes) -> Attachment:
+        if unpack(key, data).counter == 1 and not misled:
+            misled.append(key)
+            return unpack(f"team/t/{OTHER}", data)
+        return unpack(key, data)
+
+    monkeypatch.setattr(zenoh_bus, "unpack", unpack_misled)
+    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
+        flowing(source, sink, c.SUBMAP)
+        for k in range(3):
+            source.publish(Outgoing(c.SUBMAP, "alpha", submap(k)))
+        assert counters(received(sink, 3), "robot/alpha/submap") == [0, 1, 2]
+        assert (misled, sink.dropped) == (["team/t/robot/alpha/submap"], 1)
+        assert sink.lacking() == {}
 
 
 def test_a_heartbeat_on_half_a_key_is_nobodys(

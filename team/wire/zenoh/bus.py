@@ -1,8 +1,8 @@
 """The bus over Zenoh: how a process of the team publishes, receives, queries and answers.
 
-Each payload has an attachment of 24 bytes, `<qqq`: team time [ns], the publisher's wall clock [ns],
-the publisher's counter of this key. `team.wire.zenoh.delivery` implements a channel's delivery;
-samples that Zenoh itself does not recover are requested (`team.wire.zenoh.recovery`).
+Each payload has an attachment: stamps, the publisher's counter of this key, and a hash of the key
+(`team.wire.zenoh.attachment`). `team.wire.zenoh.delivery` implements a channel's delivery; samples
+that Zenoh itself does not recover are requested (`team.wire.zenoh.recovery`).
 
 Samples, queries and liveliness go from Zenoh's receiving thread directly into one unbounded queue:
 there is no thread of ours, the order of arrival is preserved across subscriptions, and a slow node
@@ -10,7 +10,6 @@ never blocks the link (the team's credit bounds the queue). A bus does not recei
 """
 
 import logging
-import struct
 import threading
 import time
 from collections.abc import Collection
@@ -27,6 +26,7 @@ from team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
 from team.wire.channels import ALIVE, REPLIES, TALLY, Channel, row_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.messages import Liveliness, Message, Tally
+from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
 from team.wire.zenoh.queries import Queries, Question, Reply
 from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
@@ -35,7 +35,6 @@ from team.wire.zenoh.session import RouterAccess, client
 if TYPE_CHECKING:  # a node without keys needs none of it
     from team.keys.credentials import Credentials
 
-_ATTACHMENT = struct.Struct("<qqq")
 _ALIVE_TIMEOUT_S = 5.0
 _FLUSH = "router/flush"
 _FLUSH_S = 10.0  # that a closing bus waits for a router that reads slowly, or is stopped
@@ -44,6 +43,8 @@ MOST_WAITING = 1_000
 
 Each sample keeps the buffer alive that it arrived in: some 10 kB.
 """
+MOST_LOGGED = 100
+"""Number of dropped samples that are logged one by one; then one of so many is."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -84,6 +85,9 @@ class ZenohBus:
         self._since_ns = time.time_ns()
         self.tap: Tap | None = None
         """Receives all samples that this bus publishes and receives."""
+        self.dropped = 0
+        """Number of received samples without a sound attachment, or under another key than their
+        publisher's."""
         self._closed = threading.Event()
         self._keys = keys
         self._session = client(connect, patience_s, keys)
@@ -169,7 +173,10 @@ class ZenohBus:
                 f"{sample.key}: {len(sample.payload)} bytes, {LARGEST_PAYLOAD} at most; "
                 "split the map or send blocks instead of the joint covariance"
             )
-        attachment = _ATTACHMENT.pack(sample.stamp_ns, sample.wall_ns, sample.counter)
+        attachment = pack(
+            self._prefix + sample.key,
+            Attachment(sample.stamp_ns, sample.wall_ns, sample.counter),
+        )
         try:
             publisher = self._publishers.get(sample.key)
             if publisher is None:
@@ -271,12 +278,18 @@ class ZenohBus:
                 self._take_sample(item, samples)
 
     def _take_sample(self, item: zenoh.Sample, samples: list[Sample]) -> None:
-        if item.attachment is None or len(item.attachment) != _ATTACHMENT.size:
-            _LOG.warning("%s: dropped, no attachment of 24 bytes beside it", item.key_expr)
+        whole = str(item.key_expr)
+        try:
+            beside = unpack(whole, b"" if item.attachment is None else item.attachment.to_bytes())
+        except (
+            AttachmentError
+        ) as error:  # it has not arrived: its publisher's cache is asked for it
+            self.dropped += 1
+            if self.dropped <= MOST_LOGGED or self.dropped % MOST_LOGGED == 0:
+                _LOG.warning("%r: dropped, %s (%d so far)", whole[:80], error, self.dropped)
             return
-        key = str(item.key_expr).removeprefix(self._prefix)
-        stamp_ns, wall_ns, counter = _ATTACHMENT.unpack(item.attachment.to_bytes())
-        sample = Sample(key, item.payload.to_bytes(), stamp_ns, wall_ns, counter)
+        key = whole.removeprefix(self._prefix)
+        sample = Sample(key, item.payload.to_bytes(), *beside)
         if item.source_info is None or self._can_do_without(key):  # what is lost is not asked for
             samples.append(sample)
         else:
