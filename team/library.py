@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -34,6 +35,7 @@ from team.estimation.models import Increment, increment_of, located, scanned
 from team.estimation.models import predicted as measurement_of
 from team.estimation.submap import LocalMap
 from team.recording.reader import Log, LogError, open_log
+from team.registry import loaded
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded
@@ -74,7 +76,6 @@ __all__ = [
 
 _INCARNATION = 1
 """Of every stream here: an array has one life."""
-_BATCH_ITERATIONS, _BATCH_DECREMENT = 200, 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,30 +268,8 @@ def batch_map(
     Each robot needs an initial pose. Raises ValueError for one that has none.
     Dellaert and Kaess 2006, Square root SAM.
     """
-    from team.estimation.baselines import batch as batches  # what compares can be left out
-    from team.estimation.baselines.robot_step import RobotStep
-
-    starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
-    robots = sorted(keyframes)
-    steps = [
-        RobotStep(robot, at.increment, sensors[robot], at.ids, at.ranges, at.bearings)
-        for row in zip_longest(*(keyframes[robot] for robot in robots))
-        for robot, keyframe in zip(robots, row, strict=True)
-        if keyframe is not None
-        for at in (keyframe.calibrated(sensors[robot]),)
-    ]
-    grown = batches.extended(batches.initial_state(starts, robust_c), steps)
-    solution = batches.solved(grown, _BATCH_ITERATIONS, _BATCH_DECREMENT)
-    landmarks = batches.landmark_gaussian(solution)
-    return BatchMap(
-        landmarks=LandmarkMap(landmarks.ids, landmarks.means, landmarks.covariance),
-        trajectories={
-            robot: Trajectory(*batches.trajectory(solution, robot)) for robot in sorted(starts)
-        },
-        chi2=solution.cost,
-        dof=solution.dof,
-        converged=solution.converged(_BATCH_DECREMENT),
-    )
+    solve = loaded("sim.studies.batch_map:solved_map", "batch_map")
+    return cast("BatchMap", solve(keyframes, sensors, initial_poses, robust_c))
 
 
 def submap_in(payload: bytes) -> tuple[str, int, LocalMap]:

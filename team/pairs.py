@@ -36,10 +36,10 @@ class RuleRow(NamedTuple):
     feedback: bool = False
 
 
-_RUNNING = "team.robot.baselines.running:running_estimator"
+_RUNNING = "sim.studies.robots.running:running_estimator"
 _WHOLE = ("latest", "alone")
-_ROUNDS = "central.baselines.feedback_rule:ExchangeRule"
-_SVD = "central.baselines.svd_rule:SvdJoinRule"
+_ROUNDS = "sim.studies.rules.feedback_rule:ExchangeRule"
+_SVD = "sim.studies.rules.svd_rule:SvdJoinRule"
 _CHEAP = ("hybrid", "dead-reckoning")
 _PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")
 
@@ -61,14 +61,14 @@ RULES: Mapping[str, RuleRow] = MappingProxyType(
         "kalman": RuleRow(_ROUNDS, "own/map", feedback=True),
         "kalman-per-axis": RuleRow(_ROUNDS, "own/map", _PER_AXIS, feedback=True),
         "covariance-intersection": RuleRow(_ROUNDS, "own/map", feedback=True),
-        "latest": RuleRow("central.baselines.map_rules:LatestRule", "own/map"),
-        "alone": RuleRow("central.baselines.map_rules:AloneRule", "own/map"),
+        "latest": RuleRow("sim.studies.rules.map_rules:LatestRule", "own/map"),
+        "alone": RuleRow("sim.studies.rules.map_rules:AloneRule", "own/map"),
         "svd-join": RuleRow(_SVD, "submap"),
         "svd-join-spherical": RuleRow(_SVD, "submap"),
         "joint-fastslam": RuleRow(
-            "central.baselines.joint_fastslam_rule:JointFastSlamRule", "measurements", _CHEAP
+            "sim.studies.rules.joint_fastslam_rule:JointFastSlamRule", "measurements", _CHEAP
         ),
-        "batch": RuleRow("central.baselines.batch_rule:BatchRule", "measurements", _CHEAP),
+        "batch": RuleRow("sim.studies.rules.batch_rule:BatchRule", "measurements", _CHEAP),
     }
 )
 

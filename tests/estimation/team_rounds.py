@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from sim.studies.estimators.robot_step import RobotStep
 from team.config import Sensor
-from team.estimation.baselines.robot_step import RobotStep
 from team.estimation.geometry import compose, exponential
 from team.estimation.models import Increment
 

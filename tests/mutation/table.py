@@ -1,6 +1,6 @@
 """The product's path: for each module how many of its mutants are drawn, and who should notice.
 
-The tests are files under tests/. What other people's methods need (baselines) is not here.
+The tests are files under tests/. The comparison methods of `sim/studies` are not in it.
 """
 
 CENTRE = (

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from central.desk.evaluation.evaluation import MapResult
 from sim.studies.batch_reference.measurements import Chain
-from team.estimation.baselines.batch import EXACT_SIGMA, FLOOR_SIGMAS
+from sim.studies.estimators.batch import EXACT_SIGMA, FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Point, Pose, tangent
 from team.estimation.models import located, predicted

@@ -15,27 +15,27 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.baselines.svd_rule import tied
 from central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
 from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
-from sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
-from sim.studies.experiments.experiment import Dataset
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, expected_s
-from sim.world.config import UtiasWorld
-from team import translate
-from team.config import Sensor
-from team.estimation.baselines import svd_joining
-from team.estimation.baselines.svd_joining import (
+from sim.studies.estimators import svd_joining
+from sim.studies.estimators.svd_joining import (
     SETTINGS,
     PointPairs,
     SubmapJoining,
     mutual_sighting,
     weighted,
 )
+from sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
+from sim.studies.experiments.experiment import Dataset
+from sim.studies.experiments.task import Task
+from sim.studies.experiments.team_runs import Figures, expected_s
+from sim.studies.rules.svd_rule import tied
+from sim.world.config import UtiasWorld
+from team import translate
+from team.config import Sensor
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.map_joining import joining

@@ -3,7 +3,7 @@
 Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here the same is shown on the
 thesis' own world: the three steps of the filter one by one at the end of a stretch without
 measurements, and a start anywhere. The states are those of
-`team.estimation.baselines.localisation`; the motions and measurements are those that the robot of
+`sim.studies.estimators.localisation`; the motions and measurements are those that the robot of
 such a run receives, cut into keyframes as in every node.
 """
 
@@ -17,22 +17,22 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.baselines.team_keyframes import RobotKeyframe, TeamKeyframes
 from central.desk.drawing import BLACK, BLUE, RED, ROBOT_COLOURS, TRUTH_COLOUR, VERMILION
 from central.desk.evaluation.evaluation import evaluate
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, load, loads, with_options
 from sim.scenarios.source import streams_of
+from sim.studies.estimators import localisation
+from sim.studies.estimators.localisation import Localisation
 from sim.studies.experiments.curves import true_landmarks
 from sim.studies.experiments.drawing import figure, ruled, spread
 from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table, combined
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures
 from sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
+from sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from sim.world.config import SimulatedWorld
 from team import translate
-from team.estimation.baselines import localisation
-from team.estimation.baselines.localisation import Localisation
 from team.estimation.consistency import nees
 from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam import fastslam

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from central.baselines.team_keyframes import TeamKeyframes
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load
 from sim.scenarios.source import streams_of
+from sim.studies.rules.team_keyframes import TeamKeyframes
 from sim.world.config import SimulatedWorld
 from sim.world.odometry import measured_speeds
 from sim.world.simulator import simulated

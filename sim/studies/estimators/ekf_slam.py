@@ -1,0 +1,114 @@
+"""EKF-SLAM with known data association: one Gaussian over the pose and all landmarks.
+
+The filter of Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section
+2.6 and experiment 1. Every measurement is linearised once, at the estimate of its time, so over a
+long run the covariance becomes too small (Julier and Uhlmann 2001).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from sim.studies.estimators import ekf_kernel
+from team.config import Sensor
+from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
+from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam.fastslam_kernel import slots_of
+from team.estimation.hybrid_slam.innovation import Innovation, joint_innovation
+from team.estimation.models import Increment, variances
+from team.estimation.submap import LocalMap
+
+
+@dataclass(frozen=True)
+class EkfSlam:
+    """N(mean, covariance) of (pose, landmarks in order of first sight) in the map frame.
+
+    ids:  the landmarks in order of first sight.
+    mean: (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
+    """
+
+    ids: UInt32[np.ndarray, " L"]
+    mean: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n n"]
+
+
+def initial_state(pose: Pose) -> EkfSlam:
+    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
+
+
+def filter_step(
+    state: EkfSlam,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> EkfSlam:
+    """Move, take all measurements of known landmarks at once, then place the new ones.
+
+    ranges [m] and bearings [rad] are corrected by the calibration. A further measurement of a
+    landmark that is new in this keyframe updates it after it was placed. Raises NotACovarianceError
+    where the state's covariance is none any more, so that the measurements can not be predicted.
+    """
+    ids_after, slots, first = slots_of(state.ids, ids)
+    n = 3 + 2 * len(ids_after)
+    mean, P = np.empty(n), np.empty((n, n))
+    known = len(state.mean)
+    mean[:known] = state.mean
+    P[:known, :known] = state.covariance
+    sound = ekf_kernel.step(
+        mean,
+        P,
+        len(state.ids),
+        increment.mean,
+        increment.covariance,
+        slots,
+        first,
+        np.column_stack((ranges, bearings)),
+        variances(sensor),
+    )
+    if not sound:
+        raise NotACovarianceError("the prediction of measurements", "not positive definite")
+    return EkfSlam(ids_after, mean, P)
+
+
+def innovation(
+    state: EkfSlam,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """Of the measurements that `filter_step` would take; of landmarks that are known already."""
+    return joint_innovation(
+        landmarks=state.ids,
+        mean=state.mean,
+        covariance=state.covariance,
+        increment=increment,
+        sensor=sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+    )
+
+
+def pose_gaussian(state: EkfSlam) -> PoseGaussian:
+    """The marginal of the pose."""
+    return PoseGaussian(state.mean[:3], state.covariance[:3, :3])
+
+
+def landmark_gaussian(state: EkfSlam) -> LandmarkGaussian:
+    """The joint marginal of all landmarks."""
+    local = local_map(state)
+    return LandmarkGaussian(local.ids, local.landmarks, local.covariance[3:, 3:])
+
+
+def local_map(state: EkfSlam) -> LocalMap:
+    """The whole Gaussian with its landmarks by ascending id: a submap, if it began at pose zero."""
+    order = np.argsort(state.ids)
+    columns = (3 + 2 * order[:, None] + np.arange(2)).ravel()
+    at = np.concatenate((np.arange(3), columns))
+    return LocalMap(state.ids[order], state.mean[at], state.covariance[np.ix_(at, at)])

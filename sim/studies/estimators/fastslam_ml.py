@@ -1,0 +1,242 @@
+"""FastSLAM 1.0 whose particles each associate for themselves, by maximum likelihood.
+
+Montemerlo and Thrun 2003: each particle takes each detection for its landmark with the largest
+likelihood, or for a new one where none reaches that of one at the gate's edge. Particles have maps
+of different sizes, so there is no common state; the map and the association are those of the
+heaviest particle.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from sim.studies.estimators.nearest_neighbour import GATE
+from team.config import UNNAMED, Sensor
+from team.estimation import dense, elementary, elementwise
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
+from team.estimation.hybrid_slam.moments import mean_direction
+from team.estimation.models import Increment
+
+
+@dataclass(frozen=True)
+class FastSlamMl:
+    """M particles with C places for landmarks each, of which the first counts[m] are used.
+
+    seen: how often each was. took: the place of each detection so far, by particle.
+    """
+
+    poses: Float[np.ndarray, "M 3"]
+    logs: Float[np.ndarray, " M"]
+    means: Float[np.ndarray, "M C 2"]
+    covariances: Float[np.ndarray, "M C 2 2"]
+    seen: Int64[np.ndarray, "M C"]
+    counts: Int64[np.ndarray, " M"]
+    took: Int64[np.ndarray, "M N"]
+
+
+def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
+    """Particles with these poses and logarithms of weights, and no landmark."""
+    particles = len(poses)
+    return FastSlamMl(
+        poses=poses,
+        logs=logs,
+        means=np.zeros((particles, 16, 2)),
+        covariances=np.zeros((particles, 16, 2, 2)),
+        seen=np.zeros((particles, 16), np.int64),
+        counts=np.zeros(particles, np.int64),
+        took=np.empty((particles, 0), np.int64),
+    )
+
+
+def filter_step(
+    state: FastSlamMl,
+    increment: Increment,
+    sensor: Sensor,
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    resample_below: float,
+    generator: np.random.Generator,
+    gate: float = GATE,
+) -> FastSlamMl:
+    """Every particle moves, associates, updates its map and its weight; then they are drawn anew
+    where too few carry the weight.
+    """
+    values, vectors = np.linalg.eigh(increment.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    drawn = increment.mean + dense.product(generator.standard_normal((len(state.poses), 3)), root.T)
+    s, c = elementwise.sin_and_cos(state.poses[:, 2])
+    moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
+    poses = state.poses + np.column_stack((moved, drawn[:, 2]))
+    state = _with_room(replace(state, poses=poses), len(ranges))
+    scan = _Scan(state)
+    for r, b in zip(ranges.tolist(), bearings.tolist(), strict=True):
+        scan.take(r, b, sensor, gate)
+    return _resampled(scan.state(), resample_below, generator)
+
+
+class _Scan:
+    """One scan being taken: copies of the state's arrays, and what is taken already."""
+
+    def __init__(self, state: FastSlamMl) -> None:
+        self._state = state
+        self._logs = state.logs.copy()
+        self._means, self._covariances = state.means.copy(), state.covariances.copy()
+        self._seen, self._counts = state.seen.copy(), state.counts.copy()
+        self._free = np.ones(state.seen.shape, np.bool_)
+        self._took: list[Int64[np.ndarray, " M"]] = []
+
+    def take(self, r: float, b: float, sensor: Sensor, gate: float) -> None:
+        """One detection: in each particle the likeliest landmark that is free, or a new one."""
+        x, y, heading = self._state.poses.T
+        particles = np.arange(len(x))
+        dx, dy = self._means[..., 0] - x[:, None], self._means[..., 1] - y[:, None]
+        q = np.maximum(dx * dx + dy * dy, 1e-12)
+        range_ = np.sqrt(q)
+        H = np.stack(
+            (np.stack((dx / range_, dy / range_), -1), np.stack((-dy / q, dx / q), -1)), -2
+        )
+        R = np.diag(
+            [
+                elementary.squared(sensor.range_sigma)
+                + elementary.squared(sensor.range_sigma_per_m * r),
+                elementary.squared(sensor.bearing_sigma),
+            ]
+        )
+        S = dense.product(dense.product(H, self._covariances), H.transpose(0, 1, 3, 2)) + R
+        turned = b - elementwise.atan2(dy, dx) + heading[:, None]
+        off = np.stack((r - range_, np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi), -1)
+        determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
+        squared = (
+            S[..., 1, 1] * elementary.squared(off[..., 0])
+            - 2.0 * S[..., 0, 1] * off[..., 0] * off[..., 1]
+            + S[..., 0, 0] * elementary.squared(off[..., 1])
+        ) / determinant
+        likely = -0.5 * squared - 0.5 * elementwise.log(determinant) - elementary.log(2.0 * np.pi)
+        used = np.arange(self._means.shape[1]) < self._counts[:, None]
+        likely = np.where(used & self._free & (squared < gate), likely, -np.inf)
+        best = likely.argmax(axis=1)
+        edge = (
+            -0.5 * gate
+            - 0.5 * float(elementwise.log(np.linalg.det(R)))
+            - elementary.log(2.0 * np.pi)
+        )
+        old = likely[particles, best] > edge
+        self._logs += np.where(old, likely[particles, best], edge)
+        place = np.where(old, best, self._counts)
+        self._update(particles[old], best[old], H, S, off)
+        self._found(particles[~old], place[~old], (r, b), R)
+        self._free[particles, place] = False
+        self._seen[particles, place] += 1
+        self._took.append(place)
+
+    def _update(
+        self,
+        at: Int64[np.ndarray, " k"],
+        place: Int64[np.ndarray, " k"],
+        H: Float[np.ndarray, "M C 2 2"],
+        S: Float[np.ndarray, "M C 2 2"],
+        off: Float[np.ndarray, "M C 2"],
+    ) -> None:
+        P, J = self._covariances[at, place], H[at, place]
+        gain = dense.solve(S[at, place], dense.product(J, P)).transpose(0, 2, 1)
+        self._means[at, place] += np.einsum("kij,kj->ki", gain, off[at, place])
+        after = P - dense.product(dense.product(gain, J), P)
+        self._covariances[at, place] = 0.5 * (after + after.transpose(0, 2, 1))
+
+    def _found(
+        self,
+        at: Int64[np.ndarray, " k"],
+        place: Int64[np.ndarray, " k"],
+        measured: tuple[float, float],
+        R: Float[np.ndarray, "2 2"],
+    ) -> None:
+        r, b = measured
+        x, y, heading = self._state.poses[at].T
+        s, c = elementwise.sin_and_cos(heading + b)
+        G = np.stack((np.stack((c, -r * s), -1), np.stack((s, r * c), -1)), -2)
+        self._means[at, place] = np.column_stack((x + r * c, y + r * s))
+        self._covariances[at, place] = dense.product(dense.product(G, R), G.transpose(0, 2, 1))
+        self._counts[at] += 1
+
+    def state(self) -> FastSlamMl:
+        """The particles after the scan."""
+        took = self._state.took
+        if self._took:
+            took = np.column_stack((took, *self._took))
+        return replace(
+            self._state,
+            logs=self._logs - self._logs.max(),
+            means=self._means,
+            covariances=self._covariances,
+            seen=self._seen,
+            counts=self._counts,
+            took=took,
+        )
+
+
+def _with_room(state: FastSlamMl, more: int) -> FastSlamMl:
+    """With places for so many more landmarks in every particle."""
+    places = state.means.shape[1]
+    if int(state.counts.max()) + more <= places:
+        return state
+    wider = max(2 * places, int(state.counts.max()) + more) - places
+    return replace(
+        state,
+        means=np.pad(state.means, ((0, 0), (0, wider), (0, 0))),
+        covariances=np.pad(state.covariances, ((0, 0), (0, wider), (0, 0), (0, 0))),
+        seen=np.pad(state.seen, ((0, 0), (0, wider))),
+    )
+
+
+def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
+    weights = elementwise.exp(state.logs - state.logs.max())
+    return np.asarray(weights / weights.sum())
+
+
+def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
+    """Systematic resampling where the effective number is below this share."""
+    weights, m = _weights(state), len(state.poses)
+    if 1.0 / float(dense.product(weights, weights)) >= below * m:
+        return state
+    at = (np.arange(m) + generator.random()) / m
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), at), m - 1)
+    return replace(
+        state,
+        poses=state.poses[chosen],
+        logs=np.zeros(m),
+        means=state.means[chosen],
+        covariances=state.covariances[chosen],
+        seen=state.seen[chosen],
+        counts=state.counts[chosen],
+        took=state.took[chosen],
+    )
+
+
+def taken(state: FastSlamMl) -> Int64[np.ndarray, " N"]:
+    """The number of the landmark that each detection went to in the heaviest particle."""
+    numbers: Int64[np.ndarray, " N"] = UNNAMED + state.took[int(np.argmax(state.logs))]
+    return numbers
+
+
+def pose_gaussian(state: FastSlamMl) -> PoseGaussian:
+    """The moments of all particles."""
+    weights = _weights(state)
+    heading = float(mean_direction(state.poses[:, 2], weights))
+    mean = np.append(dense.product(weights, state.poses[:, :2]), heading)
+    off = state.poses - mean
+    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    return PoseGaussian(mean, dense.product((off * weights[:, None]).T, off))
+
+
+def landmark_gaussian(state: FastSlamMl) -> LandmarkGaussian:
+    """The map of the heaviest particle; its landmarks are independent given its path."""
+    best = int(np.argmax(state.logs))
+    count = int(state.counts[best])
+    if not count:
+        return NO_LANDMARKS
+    joint = np.zeros((2 * count, 2 * count))
+    for i in range(count):
+        joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = state.covariances[best, i]
+    ids = (UNNAMED + np.arange(count)).astype(np.uint32)
+    return LandmarkGaussian(ids, state.means[best, :count], joint)

@@ -1,0 +1,131 @@
+"""Hybrid-SLAM as the appendix of W. Xu's thesis has it, where its program differs from its text.
+
+The particles' poses and landmarks become their weighted mean after each step, as in the text
+(`hybrid_thesis`); but the weights go on from step to step (`particle_w(j) = particle_w(j)*w`, set
+back only if all are zero) and nothing is resampled, so that a few particles soon carry all the
+weight and the others' spread no longer counts. Each particle keeps its own landmark covariances:
+those of eq. 4.6 are computed and not used. A new landmark begins with 15 m and 17.8°, turned by a
+matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
+from team.config import Sensor
+from team.estimation import elementary, elementwise
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.models import Increment
+
+FIRST_RANGE_VAR = 15.0**2
+FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
+"""`r = [(15)^2 0; 0 10*pi/18^2]`: variances of a first measurement [m², rad²]."""
+
+
+@dataclass(frozen=True)
+class CodedState:
+    """The particles before they were set to their mean, and the ones after.
+
+    drawn: the last step's particles, whose pose and map are reported.
+    particles: all poses and landmarks are the mean; weights and covariances are each particle's
+        own.
+    """
+
+    drawn: Particles
+    particles: Particles
+
+
+def started(pose: Pose, particles: int) -> CodedState:
+    """A robot that knows its pose and no landmark."""
+    at = fastslam.at_poses(np.tile(pose, (particles, 1)))
+    return CodedState(at, at)
+
+
+def filter_step(
+    state: CodedState,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    generator: np.random.Generator,
+) -> CodedState:
+    """Move, weigh on top of the weights so far, update the landmarks, set all to the mean.
+
+    ranges [m] and bearings [rad] are corrected by the calibration.
+    """
+    known = len(state.particles.ids)
+    drawn, _ = fastslam.filter_step(
+        particles=state.particles,
+        increment=increment,
+        sensor=sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        proposal="fastslam1",
+        generator=generator,
+    )
+    for slot in range(known, len(drawn.ids)):
+        first = int(np.flatnonzero(ids == drawn.ids[slot])[0])
+        drawn.covariances[:, slot] = _at_first(drawn.poses, ranges[first], bearings[first])
+    pose, landmarks = pose_moments(drawn).mean, landmark_moments(drawn)
+    rows = np.searchsorted(landmarks.ids, drawn.ids)
+    count = len(drawn.poses)
+    mean = replace(
+        drawn,
+        poses=np.tile(pose, (count, 1)),
+        means=np.tile(landmarks.means[rows], (count, 1, 1)),
+    )
+    return CodedState(drawn, mean)
+
+
+def _at_first(
+    poses: Float[np.ndarray, "M 3"], range_m: float, bearing: float
+) -> Float[np.ndarray, "M 3"]:
+    """Gz r Gzᵀ of each particle as (xx, xy, yy), with Gz as it is printed."""
+    s, c = elementwise.sin_and_cos(poses[:, 2] + bearing)
+    along, across = FIRST_RANGE_VAR, elementary.squared(range_m) * FIRST_BEARING_VAR
+    return np.column_stack(
+        (c * c * along + s * s * across, c * s * (along + across), s * s * along + c * c * across)
+    )
+
+
+def pose_gaussian(state: CodedState) -> PoseGaussian:
+    """Moments of the last step's particles: all the uncertainty of a pose that is stored."""
+    return pose_moments(state.drawn)
+
+
+def landmark_gaussian(state: CodedState) -> LandmarkGaussian:
+    """Means, and the 2 × 2 blocks of eq. 4.6; landmarks are reported as independent of each
+    other.
+    """
+    found = landmark_moments(state.drawn)
+    blocks = np.kron(np.eye(len(found.ids)), np.ones((2, 2)))
+    return LandmarkGaussian(found.ids, found.means, found.covariance * blocks)
+
+
+def absorbed(
+    state: CodedState,
+    ids: UInt32[np.ndarray, " n"],
+    landmarks: Float[np.ndarray, "n 2"],
+    covariances: Float[np.ndarray, "n 2 2"],
+) -> CodedState:
+    """Every particle takes over these landmarks and covariances (`recieve_information`)."""
+    old, count = state.particles, len(state.particles.poses)
+    others = ~np.isin(old.ids, ids)
+    triangles = np.stack((covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]), axis=1)
+    after = replace(
+        old,
+        ids=np.concatenate((old.ids[others], ids)),
+        means=np.concatenate((old.means[:, others], np.tile(landmarks, (count, 1, 1))), axis=1),
+        covariances=np.concatenate(
+            (old.covariances[:, others], np.tile(triangles, (count, 1, 1))), axis=1
+        ),
+    )
+    return CodedState(replace(after, poses=state.drawn.poses), after)

@@ -1,0 +1,120 @@
+"""Multi-robot FastSLAM: a particle is a path of every robot and one map.
+
+p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, for any
+number of robots at known start poses. The particles have to cover the product of all robots'
+paths, so over-confidence comes sooner than with one robot's (`plain_fastslam`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
+from sim.studies.estimators.robot_step import RobotStep
+from team.estimation import elementary
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam.fastslam import Particles, Proposal
+
+
+@dataclass(frozen=True)
+class JointFastSlam:
+    """M particles (x¹, …, xᴿ, m, w).
+
+    poses:          (x [m], y [m], theta [rad]) of each robot in each particle, in the map frame.
+    log_weights, ids, means, covariances: as in `fastslam.Particles`, one map per particle.
+    resample_below: a step begins with a resampling if the effective sample size is below this part
+        of the particles; 1: at every step, as in algorithm 1.
+    """
+
+    robots: tuple[str, ...]
+    poses: Float[np.ndarray, "R M 3"]
+    log_weights: Float[np.ndarray, " M"]
+    ids: UInt32[np.ndarray, " L"]
+    means: Float[np.ndarray, "M L 2"]
+    covariances: Float[np.ndarray, "M L 3"]
+    proposal: Proposal
+    resample_below: float
+
+
+def initial_state(
+    poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
+) -> JointFastSlam:
+    """The poses exactly known; an uncertain one is a first turn by Increment(0, covariance)."""
+    none = fastslam.at_poses(np.zeros((particles, 3)))
+    return JointFastSlam(
+        robots=tuple(poses),
+        poses=np.stack([np.tile(pose, (particles, 1)) for pose in poses.values()]),
+        log_weights=none.log_weights,
+        ids=none.ids,
+        means=none.means,
+        covariances=none.covariances,
+        proposal=proposal,
+        resample_below=resample_below,
+    )
+
+
+def filter_step(
+    state: JointFastSlam, turns: Sequence[RobotStep], generator: np.random.Generator
+) -> JointFastSlam:
+    """One step of the team: resample if the particles are thin, then the robots' turns in order.
+
+    Each turn multiplies the weights by its own p(zʳ | …); with the 2.0 proposal a robot's pose is
+    drawn given its measurements and the map that the turns before it left. A step may be the turn
+    of one robot, so robots need not be synchronous. Draws one uniform number if it resamples and
+    M × 3 normal ones per turn. Raises ValueError for a robot that the state does not know.
+    """
+    thin = state.resample_below * len(state.log_weights)
+    if fastslam.effective_sample_size(state.log_weights) < thin:
+        parents = fastslam.systematic_parents(state.log_weights, generator.random())
+        state = replace(
+            state,
+            poses=state.poses[:, parents],
+            log_weights=np.full(len(parents), -elementary.log(float(len(parents)))),
+            means=state.means[parents],
+            covariances=state.covariances[parents],
+        )
+    for turn in turns:
+        index = state.robots.index(turn.robot)
+        after, _ = fastslam.filter_step(
+            particles=_seen_by(state, index),
+            increment=turn.increment,
+            sensor=turn.sensor,
+            ids=turn.ids,
+            ranges=turn.ranges,
+            bearings=turn.bearings,
+            proposal=state.proposal,
+            generator=generator,
+            own=turn.own if len(turn.own) else None,
+        )
+        poses = state.poses.copy()
+        poses[index] = after.poses
+        state = replace(
+            state,
+            poses=poses,
+            log_weights=after.log_weights,
+            ids=after.ids,
+            means=after.means,
+            covariances=after.covariances,
+        )
+    return state
+
+
+def pose_gaussian(state: JointFastSlam, robot: str) -> PoseGaussian:
+    """Mean and covariance of one robot's poses. Raises ValueError for a robot not in the state."""
+    return pose_moments(_seen_by(state, state.robots.index(robot)))
+
+
+def landmark_gaussian(state: JointFastSlam) -> LandmarkGaussian:
+    """The mixture of the particles' maps as one Gaussian."""
+    return landmark_moments(_seen_by(state, 0))
+
+
+def _seen_by(state: JointFastSlam, index: int) -> Particles:
+    """The particles with the poses of one robot: what single-robot FastSLAM works on."""
+    return Particles(
+        state.poses[index], state.log_weights, state.ids, state.means, state.covariances
+    )

@@ -1,0 +1,163 @@
+"""Monte Carlo localisation: a cloud of weighted poses on a map that is known exactly.
+
+p(pose | z, u, map) by prediction, weighing and resampling: Xu's thesis, section 3.5.1 (eq. 3.23 to
+3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2. The cloud may have many modes, so a start
+need not be known.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from sim.studies.estimators.plain_fastslam import pose_moments
+from team.config import Sensor
+from team.estimation import elementary
+from team.estimation.compiled import compiled
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.geometry import Pose, wrapped
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam import innovation as innovations
+from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.hybrid_slam.landmark_kernel import Triple, seen
+from team.estimation.models import Increment, variances
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Weighted poses and the map they move on.
+
+    cloud:          particles without landmarks of their own, in the map frame.
+    ids, landmarks: the map, ids strictly ascending, positions [m].
+    resample_below: a step begins with a resampling if the effective sample size is below this part
+        of the particles; Xu takes 0.5.
+    """
+
+    cloud: Particles
+    ids: UInt32[np.ndarray, " L"]
+    landmarks: Float[np.ndarray, "L 2"]
+    resample_below: float = 0.5
+
+
+def initial_state(
+    pose: Pose,
+    particles: int,
+    ids: UInt32[np.ndarray, " L"],
+    landmarks: Float[np.ndarray, "L 2"],
+) -> Localisation:
+    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
+
+
+def initial_state_anywhere(
+    lowest: Float[np.ndarray, "2"],
+    highest: Float[np.ndarray, "2"],
+    particles: int,
+    ids: UInt32[np.ndarray, " L"],
+    landmarks: Float[np.ndarray, "L 2"],
+    generator: np.random.Generator,
+) -> Localisation:
+    """Uniform over a rectangle [m] and all headings: nothing is known (Xu, figure 3.5a).
+
+    The particles must be dense enough that some of them fit the first measurements.
+    """
+    low, high = np.append(lowest, -np.pi), np.append(highest, np.pi)
+    poses = high - (high - low) * generator.random((particles, 3))
+    return Localisation(fastslam.at_poses(poses), ids, landmarks)
+
+
+def filter_step(
+    state: Localisation,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    generator: np.random.Generator,
+) -> Localisation:
+    """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
+
+    ranges [m] and bearings [rad] are corrected by the calibration; a measurement of a landmark that
+    is not on the map is left out. Draws one uniform number if it resamples and M × 3 normal ones.
+    """
+    cloud = state.cloud
+    thin = state.resample_below * len(cloud.poses)
+    if fastslam.effective_sample_size(cloud.log_weights) < thin:
+        cloud, _ = fastslam.resampled(cloud, generator)
+    cloud = fastslam.propagated(cloud, increment, generator)
+    mapped = np.isin(ids, state.ids)
+    log_weights = _weighed(
+        cloud.log_weights,
+        cloud.poses,
+        state.landmarks,
+        np.searchsorted(state.ids, ids[mapped]),
+        np.column_stack((ranges[mapped], bearings[mapped])),
+        variances(sensor),
+    )
+    log_weights, _ = fastslam.normalised(log_weights)
+    return replace(state, cloud=replace(cloud, log_weights=log_weights))
+
+
+def innovation(
+    state: Localisation,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """The innovation of the measurements that `filter_step` would take, where the map is exact.
+
+    A cloud of several modes predicts a broad mixture, whose innovation is as uninformative as its
+    Gaussian.
+    """
+    read = np.isin(state.ids, ids)
+    count, known = len(state.cloud.poses), int(read.sum())
+    on_map = replace(
+        state.cloud,
+        ids=state.ids[read],
+        means=np.tile(state.landmarks[read], (count, 1, 1)),
+        covariances=np.zeros((count, known, 3)),
+    )
+    return innovations.innovation(on_map, increment, sensor, ids, ranges, bearings)
+
+
+def pose_gaussian(state: Localisation) -> PoseGaussian:
+    """Mean and covariance of the cloud; for a cloud with several modes they are uninformative."""
+    return pose_moments(state.cloud)
+
+
+def landmark_gaussian(state: Localisation) -> LandmarkGaussian:
+    """The known map, with covariance zero."""
+    n = 2 * len(state.ids)
+    return LandmarkGaussian(state.ids, state.landmarks, np.zeros((n, n)))
+
+
+@compiled
+def _weighed(
+    log_weights: Float[np.ndarray, " M"],
+    poses: Float[np.ndarray, "M 3"],
+    landmarks: Float[np.ndarray, "L 2"],
+    slots: Int64[np.ndarray, " n"],
+    measurements: Float[np.ndarray, "n 2"],
+    sensor: Triple,
+) -> Float[np.ndarray, " M"]:
+    """The weights after the measurements: log w + Σ log N(z; h(pose, landmark), R).
+
+    R is that of the predicted range.
+    """
+    weighed = log_weights.copy()
+    bearing_sigma = math.sqrt(sensor[2])
+    for i in range(len(poses)):
+        pose = (poses[i, 0], poses[i, 1], poses[i, 2])
+        for k in range(len(slots)):
+            distance, ex, ey = seen(pose, landmarks[slots[k]])
+            range_sigma = math.sqrt(sensor[0] + sensor[1] * distance * distance)
+            of_range = (measurements[k, 0] - distance) / range_sigma
+            turn = wrapped(measurements[k, 1] + pose[2] - elementary.atan2(ey, ex))
+            of_bearing = turn / bearing_sigma
+            weighed[i] -= 0.5 * (of_range * of_range + of_bearing * of_bearing)
+            weighed[i] -= elementary.log(2.0 * math.pi * range_sigma * bearing_sigma)
+    return weighed

@@ -1,0 +1,136 @@
+"""EKF-SLAM over the whole drive that takes each detection for the nearest landmark.
+
+Smith, Self and Cheeseman 1990 with individual compatibility and nearest neighbour (Neira and Tardós
+2001, section II): the best pair of a scan first, each detection and each landmark once, what lies
+beyond the gate is a new landmark. A wrong pair is never taken back.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt32
+
+from sim.studies.estimators import ekf_slam
+from sim.studies.estimators.ekf_slam import EkfSlam
+from team.config import UNNAMED, Sensor
+from team.estimation import dense, elementary, elementwise
+from team.estimation.association.matching import best_pairs_first, squared_distances
+from team.estimation.association.scans import NOBODY
+from team.estimation.geometry import Pose
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.models import Increment
+
+GATE = 13.8
+"""χ² of two degrees of freedom that one in a thousand right pairs exceeds."""
+
+
+@dataclass(frozen=True)
+class NearestNeighbour:
+    """The filter, and the number of the landmark that each detection so far went to, in order."""
+
+    slam: EkfSlam
+    took: tuple[Int64[np.ndarray, " _"], ...] = ()
+
+
+def initial_state(pose: Pose) -> NearestNeighbour:
+    """The pose exactly known."""
+    return NearestNeighbour(ekf_slam.initial_state(pose))
+
+
+def filter_step(
+    state: NearestNeighbour,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    gate: float = GATE,
+) -> NearestNeighbour:
+    """Move, associate the detections (ids from UNNAMED on), and take all measurements at once."""
+    unnamed = np.flatnonzero(ids >= UNNAMED)
+    if not len(unnamed):
+        slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)
+        return replace(state, slam=slam)
+    slam, given = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, gate)
+    slam = ekf_slam.filter_step(slam, Increment.identity(), sensor, given, ranges, bearings)
+    return NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
+
+
+def innovation(
+    state: NearestNeighbour,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> Innovation:
+    """Of the measurements that `filter_step` would take, of the landmarks that it would take them
+    for: ids from UNNAMED on name the rows of a scan, not landmarks.
+    """
+    if (ids >= UNNAMED).any():
+        _, ids = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, GATE)
+    return ekf_slam.innovation(state.slam, increment, sensor, ids, ranges, bearings)
+
+
+def _moved_and_named(
+    slam: EkfSlam,
+    increment: Increment,
+    sensor: Sensor,
+    ids: UInt32[np.ndarray, " n"],
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+    gate: float,
+) -> tuple[EkfSlam, UInt32[np.ndarray, " n"]]:
+    """The filter after the motion, and the measurements' landmarks."""
+    slam = ekf_slam.filter_step(slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
+    unnamed = np.flatnonzero(ids >= UNNAMED)
+    given = ids.copy()
+    given[unnamed] = _associated(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
+    return slam, given
+
+
+def _associated(
+    slam: EkfSlam,
+    sensor: Sensor,
+    gate: float,
+    ranges: Float[np.ndarray, " n"],
+    bearings: Float[np.ndarray, " n"],
+) -> UInt32[np.ndarray, " n"]:
+    """The number of each detection's landmark; new ones go on from the last."""
+    known = np.flatnonzero(slam.ids >= UNNAMED)
+    predicted, spread = predictions(slam, known)
+    R = np.zeros((len(ranges), 2, 2))
+    R[:, 0, 0] = elementary.squared(sensor.range_sigma) + elementary.squared(
+        sensor.range_sigma_per_m * ranges
+    )
+    R[:, 1, 1] = elementary.squared(sensor.bearing_sigma)
+    off = np.column_stack((ranges, bearings))[:, None] - predicted[None]
+    off[..., 1] = np.remainder(off[..., 1] + np.pi, 2.0 * np.pi) - np.pi
+    squared, logs = squared_distances(off, spread[None] + R[:, None])
+    found = best_pairs_first(squared, squared + logs, gate)
+    numbers = np.zeros(len(ranges), np.uint32)
+    numbers[found != NOBODY] = slam.ids[known[found[found != NOBODY]]]
+    new = np.flatnonzero(found == NOBODY)
+    numbers[new] = (UNNAMED + len(known) + np.arange(len(new))).astype(np.uint32)
+    return numbers
+
+
+def predictions(
+    slam: EkfSlam, which: Int64[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2 2"]]:
+    """(range, bearing) of these landmarks and H P Hᵀ, without the sensor's noise."""
+    at = 3 + 2 * which[:, None] + np.arange(2)
+    dx, dy = (slam.mean[at] - slam.mean[:2]).T
+    r = np.maximum(elementwise.hypot(dx, dy), 1e-6)
+    H = np.zeros((len(which), 2, 5))
+    H[:, 0, 0], H[:, 0, 1] = -dx / r, -dy / r
+    H[:, 1, 0], H[:, 1, 1], H[:, 1, 2] = (
+        dy / elementary.squared(r),
+        -dx / elementary.squared(r),
+        -1.0,
+    )
+    H[:, :, 3:] = -H[:, :, :2]
+    columns = np.concatenate((np.tile(np.arange(3), (len(which), 1)), at), axis=1)
+    P = slam.covariance[columns[:, :, None], columns[:, None, :]]
+    bearing = elementwise.atan2(dy, dx) - slam.mean[2]
+    return np.column_stack((r, bearing)), dense.product(dense.product(H, P), H.transpose(0, 2, 1))

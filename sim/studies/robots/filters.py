@@ -1,0 +1,262 @@
+"""The estimators that have one state over a whole stream, by name."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sim.studies.estimators import (
+    dead_reckoning,
+    ekf_slam,
+    hybrid_thesis,
+    hybrid_thesis_coded,
+    localisation,
+    nearest_neighbour,
+    plain_fastslam,
+)
+from sim.studies.estimators.hybrid_thesis_coded import CodedState
+from sim.studies.estimators.localisation import Localisation
+from sim.studies.estimators.plain_fastslam import PlainFastSlam
+from sim.studies.robots.filter import IN_POSE, Filter, FilterStep, InitialState, Judged, Step
+from sim.studies.robots.likelihood import with_association
+from team import translate
+from team.config import Estimator, RobotConfig, Sensor
+from team.estimation import dense
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.geometry import tangent
+from team.estimation.hybrid_slam.fastslam import Particles, Proposal
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from team.estimation.models import Increment
+from team.robot.estimator import InitialPose, KnownMap
+
+
+def _random(filter_step: Callable[..., Any]) -> FilterStep:
+    """The step of an estimator that draws random numbers."""
+
+    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+        increment, *scan, _ = step
+        return filter_step(state, increment, config.sensor, *scan, generator)
+
+    return step
+
+
+def _exact(
+    initial_state: Callable[..., Any], filter_step: Callable[..., Any]
+) -> tuple[InitialState, FilterStep]:
+    """Start and step of an estimator that draws none."""
+
+    def start(
+        config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+    ) -> Any:
+        return _with_start(initial_state, filter_step, initial)
+
+    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
+        increment, *scan, _ = step
+        return filter_step(state, increment, config.sensor, *scan)
+
+    return start, step
+
+
+def _thesis_initial_state(
+    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+) -> hybrid_thesis.ThesisState:
+    """The thesis knows the start exactly."""
+    return hybrid_thesis.started(np.zeros(3) if initial.pose is None else initial.pose)
+
+
+def _thesis_step(
+    state: hybrid_thesis.ThesisState,
+    config: RobotConfig,
+    step: Step,
+    generator: np.random.Generator,
+) -> hybrid_thesis.ThesisState:
+    increment, ids, ranges, bearings, _ = step
+    particles = config.front_end.particles
+    return hybrid_thesis.filter_step(
+        state=state,
+        increment=increment,
+        sensor=config.sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        particles=particles,
+        generator=generator,
+    )
+
+
+def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
+    """The innovation against the particles of a state."""
+    return lambda state, *measurements: innovation(particles(state), *measurements)
+
+
+def _without_claims(judged: Callable[..., Innovation]) -> Judged:
+    """The innovation of an estimator that takes no claims."""
+    return lambda state, *measurements: judged(state, *measurements[:-1])
+
+
+def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
+    joint = np.zeros((2 * len(state.ids), 2 * len(state.ids)))
+    for i, block in enumerate(state.covariances):
+        joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+    return LandmarkGaussian(state.ids, state.landmarks, joint)
+
+
+def _thesis_absorbed(
+    state: hybrid_thesis.ThesisState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
+) -> hybrid_thesis.ThesisState:
+    return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
+
+
+def _coded_initial_state(
+    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+) -> CodedState:
+    """The start is known exactly, as in the thesis."""
+    pose = np.zeros(3) if initial.pose is None else initial.pose
+    return hybrid_thesis_coded.started(pose, config.front_end.particles)
+
+
+def _coded_absorbed(
+    state: CodedState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
+) -> CodedState:
+    return hybrid_thesis_coded.absorbed(state, ids, means, translate.blocks_of(covariance))
+
+
+S = TypeVar("S")
+
+
+def _with_start(
+    initial_state: Callable[[np.ndarray], S],
+    filter_step: Callable[..., S],
+    initial: InitialPose,
+    *generator: np.random.Generator,
+) -> S:
+    """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
+
+    The noise is turned into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
+    """
+    at = np.zeros(3) if initial.pose is None else initial.pose
+    state = initial_state(at)
+    if initial.covariance is None:
+        return state
+    G = tangent(at[2])
+    own = dense.product(dense.product(G.T, initial.covariance), G)
+    nothing = np.empty(0)
+    still = Increment(np.zeros(3), 0.5 * (own + own.T))
+    return filter_step(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
+
+
+def _plain_step(
+    state: PlainFastSlam, config: RobotConfig, step: Step, generator: np.random.Generator
+) -> PlainFastSlam:
+    increment, ids, ranges, bearings, own = step
+    return plain_fastslam.filter_step(
+        state=state,
+        increment=increment,
+        sensor=config.sensor,
+        ids=ids,
+        ranges=ranges,
+        bearings=bearings,
+        generator=generator,
+        own=own,
+    )
+
+
+def _plain(proposal: Proposal) -> Filter:
+    """FastSLAM over the whole stream, whatever the front end's own proposal is."""
+
+    def initial_state(
+        config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+    ) -> PlainFastSlam:
+        front = config.front_end
+
+        def at(pose: np.ndarray) -> PlainFastSlam:
+            return plain_fastslam.initial_state(
+                pose, front.particles, proposal, front.resample_below
+            )
+
+        return _with_start(at, plain_fastslam.filter_step, initial, generator)
+
+    return Filter(
+        initial_state,
+        _plain_step,
+        plain_fastslam.pose_gaussian,
+        plain_fastslam.landmark_gaussian,
+        _of_particles(lambda state: state.particles),
+        particles=lambda state: state.particles,
+        claims=True,
+    )
+
+
+def _localisation_initial_state(
+    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
+) -> Localisation:
+    """At an unknown initial pose anywhere from where the sensor may see a landmark of the known
+    map.
+
+    That is the map's box widened by the sensor's reach, at most by half the box's longer side.
+    """
+    front = config.front_end
+    landmarks = known.landmarks
+    if initial.pose is None and len(landmarks):
+        lowest, highest = landmarks.min(axis=0), landmarks.max(axis=0)
+        reach = min(config.sensor.max_range, 0.5 * float((highest - lowest).max()))
+        state = localisation.initial_state_anywhere(
+            lowest - reach, highest + reach, front.particles, *known, generator
+        )
+        return replace(state, resample_below=front.resample_below)
+
+    def at(pose: np.ndarray) -> Localisation:
+        state = localisation.initial_state(pose, front.particles, *known)
+        return replace(state, resample_below=front.resample_below)
+
+    return _with_start(at, localisation.filter_step, initial, generator)
+
+
+FILTERS: Mapping[Estimator, Filter] = {
+    "dead-reckoning": Filter(
+        *_exact(dead_reckoning.initial_state, dead_reckoning.filter_step),
+        dead_reckoning.pose_gaussian,
+        dead_reckoning.landmark_gaussian,
+        lambda *measurements: NOTHING,
+        used=IN_POSE,
+        looks=False,
+        maps=False,
+    ),
+    "localisation": Filter(
+        _localisation_initial_state,
+        _random(localisation.filter_step),
+        localisation.pose_gaussian,
+        lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
+        _without_claims(localisation.innovation),
+        used=IN_POSE,
+        maps=False,
+    ),
+    "ekf-slam": Filter(
+        *_exact(nearest_neighbour.initial_state, nearest_neighbour.filter_step),
+        lambda state: ekf_slam.pose_gaussian(state.slam),
+        lambda state: ekf_slam.landmark_gaussian(state.slam),
+        _without_claims(nearest_neighbour.innovation),
+        took=lambda state: np.concatenate((np.empty(0, np.int64), *state.took)),
+    ),
+    "fastslam1": with_association(_plain("fastslam1")),
+    "fastslam2": _plain("fastslam2"),
+    "hybrid-thesis": Filter(
+        _thesis_initial_state,
+        _thesis_step,
+        lambda state: PoseGaussian(state.pose, state.pose_covariance),
+        _thesis_landmarks,
+        _of_particles(lambda state: hybrid_thesis.reset(state, state.ids, 1)),
+        _thesis_absorbed,
+        joint=False,
+    ),
+    "hybrid-thesis-coded": Filter(
+        _coded_initial_state,
+        _random(hybrid_thesis_coded.filter_step),
+        hybrid_thesis_coded.pose_gaussian,
+        hybrid_thesis_coded.landmark_gaussian,
+        _of_particles(lambda state: state.particles),
+        _coded_absorbed,
+        joint=False,
+    ),
+}

@@ -1,0 +1,259 @@
+"""An estimator that has one state from the start of a stream to its end."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from sim.studies.robots.filter import Step
+from sim.studies.robots.filters import FILTERS
+from team.config import UNNAMED, RobotConfig
+from team.estimation.gaussian import (
+    LandmarkGaussian,
+    NotACovarianceError,
+    PoseGaussian,
+)
+from team.estimation.geometry import Pose, inverse
+from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from team.estimation.hybrid_slam.reduction import KeyframeScan
+from team.estimation.models import Increment
+from team.estimation.mount import moved_by
+from team.estimation.odometry import OdometryInterval
+from team.estimation.randomness import generator
+from team.estimation.scans import Scan, unclaimed
+from team.estimation.submap import Became
+from team.pairs import FEEDBACK
+from team.rejection import Rejection
+from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, thinned
+
+POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
+"""Added to a running pose's covariance [m², m², rad²], which may be singular: an exactly known
+start, a motion without lateral noise, fewer than four particles that differ."""
+
+
+class RunningEstimator:
+    """The state after every keyframe so far; its map is published once per window, or at every
+    keyframe.
+
+    It makes no submaps, so it can not be resumed: a restarted robot takes its stream from the
+    beginning, and publishes the same messages again.
+    sequence: number of keyframes so far.
+    associates: whether it takes scans without identities; it reports their outcomes at the end.
+    """
+
+    def __init__(
+        self, config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
+    ) -> None:
+        self._config = config
+        self._filter = FILTERS[config.estimator]
+        self.associates = self._filter.took is not None and config.fusion == "alone"
+        self._taken: list[slice] = []
+        self._looks: list[KeyframeScan] = []
+        maps_at_keyframes = config.fusion in FEEDBACK
+        self._map_every_ns = 0 if maps_at_keyframes else round(config.front_end.window_s * 1e9)
+        self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
+        self._generator = generator(config.seed, config.id, incarnation, 0)
+        self._map_ns: int | None = None
+        self._innovation = NOTHING
+        self._unsaid = NOTHING
+        self._mount = np.array(config.sensor.mount)
+        start = _of_sensor(initial, self._mount) if config.sensor.is_mounted else initial
+        self._state: Any = self._filter.initial_state(config, start, known, self._generator)
+        self.sequence = 0
+        self.unsolved = 0
+        self.last_keyframe_ns: int | None = None
+
+    @property
+    def used(self) -> str:
+        """The disposition of a measurement that it takes."""
+        return self._filter.used
+
+    @property
+    def joint(self) -> bool:
+        """Whether its map has a joint covariance."""
+        return self._filter.joint
+
+    @property
+    def innovation(self) -> Innovation:
+        """The innovation of all keyframes so far."""
+        return self._innovation.plus(self._unsaid)
+
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
+        """Takes a scan (ids, ranges, bearings); returns the reason if it is rejected."""
+        if not self._filter.looks:
+            return Rejection.NO_LANDMARKS
+        unnamed = bool((scan.ids >= UNNAMED).any())
+        if scan.own.size and not self._filter.claims and not unnamed:
+            return Rejection.CLAIMS
+        return self._segmenter.observe(stamp_ns, *scan)
+
+    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
+        """Takes one odometry interval and runs the keyframes that lie in it."""
+        stamp_ns, begin_ns = interval.end_ns, interval.end_ns - interval.duration_ns
+        if self._segmenter.now_ns is None:
+            self._segmenter.begin(begin_ns)
+            self._map_ns = begin_ns
+        before = self.sequence
+        for keyframe in self._segmenter.drive(interval, measured=measured):
+            self._take(keyframe)
+        if not self._filter.looks:
+            _, rest = self._segmenter.cut(stamp_ns)
+            nothing = np.empty(0)
+            self._advance(stamp_ns, rest, np.empty(0, np.uint32), nothing, nothing, unclaimed(0))
+        return self._driven(before, last=False)
+
+    def _driven(self, before: int, *, last: bool) -> Estimates:
+        """The results since `before` keyframes; the map if it is due, or was not published at the
+        end.
+        """
+        now_ns = self.last_keyframe_ns
+        if now_ns is None or self._map_ns is None:
+            return Estimates()
+        pose_ns = now_ns if self.sequence > before else None
+        fresh = self.sequence > before or (last and now_ns != self._map_ns)
+        if not fresh or not (last or now_ns - self._map_ns >= self._map_every_ns):
+            return Estimates(pose_ns=pose_ns)
+        self._map_ns = now_ns
+        judged, self._unsaid = self._unsaid, NOTHING
+        self._innovation = self._innovation.plus(judged)
+        map_ns = now_ns if self._filter.maps else None
+        innovation = (judged, now_ns) if judged.dof else None
+        return Estimates(
+            pose_ns=pose_ns, map_ns=map_ns, cloud=self._cloud(map_ns), judged=innovation
+        )
+
+    def _cloud(self, map_ns: int | None) -> Callable[[], Cloud] | None:
+        """Returns the particles, where there are any and a map is published."""
+        if map_ns is None or self._filter.particles is None:
+            return None
+        return partial(thinned, self._filter.particles(self._state), np.zeros(3))
+
+    def _take(self, keyframe: Keyframe) -> None:
+        """Takes a keyframe: its scans without identities one by one, then all observations with
+        names.
+        """
+        for look in keyframe.looks:
+            self._looks.append(look)
+            seen = look.ids, look.ranges, look.bearings, look.own
+            first = self._took()
+            self._advance(look.at_ns, look.motion or Increment.identity(), *seen)
+            self._taken.append(slice(first, self._took()))
+        seen = keyframe.ids, keyframe.ranges, keyframe.bearings, keyframe.own
+        motion = keyframe.increment if keyframe.rest is None else keyframe.rest
+        if not keyframe.looks or len(keyframe.ids) or motion.mean.any():
+            self._advance(keyframe.stamp_ns, motion, *seen)
+
+    def _became(self) -> Became | None:
+        """The landmark of each detection without an identity so far."""
+        if not self._looks or self._filter.took is None:
+            return None
+        numbers = self._filter.took(self._state)
+        of_look = [
+            numbers[taken] if len(numbers[taken]) == len(look.ids) else np.zeros(len(look.ids))
+            for look, taken in zip(self._looks, self._taken, strict=True)
+        ]
+        landmarks = np.concatenate(of_look).astype(np.int64)
+        return Became(
+            stamps=np.array([look.stamp_ns for look in self._looks], np.int64),
+            counts=np.array([len(look.ids) for look in self._looks], np.int64),
+            rows=np.concatenate([look.ids for look in self._looks]).astype(np.int64) - UNNAMED,
+            landmarks=landmarks,
+            clutter=np.zeros(len(landmarks), np.bool_),
+        )
+
+    def _took(self) -> int:
+        """How many detections the filter has a landmark for; a scan that led nowhere adds none."""
+        return 0 if self._filter.took is None else len(self._filter.took(self._state))
+
+    def _advance(
+        self,
+        stamp_ns: int,
+        increment: Increment,
+        ids: np.ndarray,
+        ranges: np.ndarray,
+        bearings: np.ndarray,
+        own: np.ndarray,
+    ) -> None:
+        step = increment, ids, ranges, bearings, own
+        after = self._after(step)
+        if after is None:  # what was seen leads nowhere: the motion alone
+            self.unsolved += bool(len(ids))
+            after = self._after((increment, ids[:0], ranges[:0], bearings[:0], own[:0]))
+        if after is not None:
+            self._state, judged = after
+            self._unsaid = self._unsaid.plus(judged)
+        self.sequence += 1
+        self.last_keyframe_ns = stamp_ns
+
+    def _after(self, step: Step) -> tuple[Any, Innovation] | None:
+        """The state after a step, and how well its measurements were predicted; None where there is
+        no state.
+
+        A state without a finite pose is none.
+        """
+        increment, *scan = step
+        judged = NOTHING
+        with np.errstate(all="ignore"):
+            with suppress(NotACovarianceError):  # then it is not known how well
+                judged = self._filter.innovation(self._state, increment, self._config.sensor, *scan)
+            try:
+                state = self._filter.filter_step(self._state, self._config, step, self._generator)
+                pose = self._filter.pose(state)
+            except (NotACovarianceError, np.linalg.LinAlgError):
+                return None
+        finite = np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()
+        return (state, judged) if finite else None
+
+    def finish(self) -> tuple[Estimates, int]:
+        """Ends the stream: returns the last keyframe and map, and the number of scans that no
+        odometry covered.
+        """
+        uncovered = self._segmenter.uncovered
+        before = self.sequence
+        if self._segmenter.now_ns is not None:
+            for keyframe in self._segmenter.cut(self._segmenter.now_ns)[0]:
+                self._take(keyframe)
+        driven = self._driven(before, last=True)
+        return msgspec.structs.replace(driven, became=self._became()), uncovered
+
+    def own_pose(self) -> PoseGaussian:
+        """The pose at the last keyframe."""
+        pose = self._filter.pose(self._state)
+        if self._config.sensor.is_mounted:
+            pose = moved_by(pose, inverse(self._mount))
+        return PoseGaussian(pose.mean, pose.covariance + POSE_FLOOR)
+
+    def own_map(self) -> LandmarkGaussian:
+        """The landmarks so far."""
+        return self._filter.landmarks(self._state)
+
+
+def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
+    """Where the sensor begins: the filter's states are of the sensor."""
+    covariance = np.zeros((3, 3)) if initial.covariance is None else initial.covariance
+    if initial.pose is None:
+        return initial
+    found = moved_by(PoseGaussian(initial.pose, covariance), mount)
+    return InitialPose(found.mean, None if initial.covariance is None else found.covariance)
+
+
+class AbsorbingEstimator(RunningEstimator):
+    """An estimator whose landmarks are replaced by the fused ones, under a rule with feedback."""
+
+    def absorb(self, landmarks: LandmarkGaussian) -> None:
+        """Replace the landmarks by the fused ones."""
+        assert self._filter.absorbed is not None
+        self._state = self._filter.absorbed(self._state, *landmarks)
+
+
+def running_estimator(
+    config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
+) -> RunningEstimator:
+    """The estimator that the configuration names."""
+    absorbs = FILTERS[config.estimator].absorbed is not None
+    made = AbsorbingEstimator if absorbs else RunningEstimator
+    return made(config, incarnation, initial, known)

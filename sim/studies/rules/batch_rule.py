@@ -1,0 +1,169 @@
+"""The rule `batch`: the batch MAP over all robots' raw measurements, solved again as they
+arrive.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from central.config import CentralConfig
+from sim.studies.estimators import batch
+from sim.studies.estimators.batch import Batch
+from sim.studies.estimators.robot_step import RobotStep
+from sim.studies.rules.measurement_rules import MapContent, MeasurementRule
+from sim.studies.rules.team_keyframes import RobotKeyframe
+from team import translate
+from team.config import RobotConfig
+from team.estimation.gaussian import Matrix, PoseGaussian
+from team.estimation.geometry import Pose, inverse
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.mount import moved_by
+from team.estimation.sparse_cholesky import sparse
+from team.wire import channels as ch
+from team.wire.bus import Outgoing
+
+RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
+"""Most iterations of a broadcast's map, which starts from the last solution, and the Newton step in
+σ that ends them.
+"""
+FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
+"""The same for the final map, which has a warning if the iterations do not suffice."""
+
+
+class BatchRule(MeasurementRule):
+    """Every pose of every robot at its keyframes and all landmarks, solved anew at each broadcast.
+
+    Each robot's newest pose is published with the map, and the whole paths with the final map.
+    Sensor errors that persist, and biases, are taken as white noise, with a warning.
+    """
+
+    _batch: Batch
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
+        super().__init__(config, digest, robots)
+        self._waiting: list[RobotStep] = []
+        self._newest: dict[str, RobotKeyframe] = {}
+        self._stamps: dict[str, list[int]] = defaultdict(list)
+        self._findings: list[str] = []
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """The number of poses, and the joint cost of the last map."""
+        if not self.models:
+            return {}
+        figures = {"poses": float(len(self._batch.poses))}
+        if self._batch.dof > 0:
+            figures["joint_cost_per_dof"] = self._batch.cost / self._batch.dof
+        return figures
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The errors that are taken as white though they persist, and whether the final map has
+        converged.
+        """
+        return tuple(self._findings)
+
+    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
+        self._batch = batch.initial_state(starts, self.config.robust_c)
+        self._findings += taken_as_white(self.models)
+
+    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
+        self._waiting += turns
+        for each in step:
+            self._newest[each.robot] = each
+            self._stamps[each.robot].append(each.stamp_ns)
+        return []
+
+    def _content(self, *, final: bool) -> MapContent:
+        self._grow()
+        if final:
+            self._batch = self._solved(self._batch.renewed, FINAL_ITERATIONS, FINAL_DECREMENT)
+            if not self._batch.converged(FINAL_DECREMENT):
+                self._findings.append(
+                    f"the batch has not converged in {FINAL_ITERATIONS} iterations: the next step "
+                    f"goes {self._batch.newton_decrement:.2g} sigma, {FINAL_DECREMENT:g} allowed"
+                )
+        else:
+            self._batch = self._solved(self._batch, RUNNING_ITERATIONS, RUNNING_DECREMENT)
+        landmarks = batch.landmark_gaussian(self._batch)
+        outgoing = (*self._poses(), *(self._paths() if final else ()))
+        return MapContent(landmarks, self._batch.cost, self._batch.dof, outgoing)
+
+    def _grow(self) -> None:
+        """Add the waiting steps; without their measurements, or not at all, where there is no
+        solution.
+        """
+        turns, self._waiting = self._waiting, []
+        blind = [turn.blind for turn in turns]
+        for some in (turns, blind):
+            with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+                grown = batch.extended(self._batch, some)
+                once = batch.solved(grown, 1, RUNNING_DECREMENT)
+                if np.isfinite(once.poses).all() and np.isfinite(once.posterior.panels).all():
+                    self._batch = grown
+                    return
+            self._findings.append(
+                f"measurements of {len(turns)} steps up to {self.now_ns * 1e-9:.1f} s refused: "
+                "with them the map has no solution"
+            )
+
+    def _solved(self, grown: Batch, iterations: int, decrement: float) -> Batch:
+        """The solution; where there is none, the estimate before it."""
+        with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+            solution = batch.solved(grown, iterations, decrement)
+            if np.isfinite(solution.poses).all() and np.isfinite(solution.posterior.panels).all():
+                return solution
+        self._findings.append("the batch has no full solution")
+        return grown
+
+    def _poses(self) -> list[Outgoing]:
+        """The newest pose of each robot that has moved since the last map."""
+        outgoing = [
+            self.pose(each, batch.pose_gaussian(self._batch, robot))
+            for robot, each in sorted(self._newest.items())
+            if self.pose_is_due(each)
+        ]
+        self._newest = {}
+        return outgoing
+
+    def _paths(self) -> list[Outgoing]:
+        outgoing = []
+        for robot, stamps in sorted(self._stamps.items()):
+            poses, covariances = batch.trajectory(self._batch, robot)
+            stamps = stamps[: len(poses) - 1]
+            if not stamps:
+                continue
+            incarnation = self.members[robot].incarnation
+            sensor = self.models[robot].sensor
+            if sensor.is_mounted:
+                away = inverse(np.array(sensor.mount))
+                moved = [
+                    moved_by(PoseGaussian(*each), away)
+                    for each in zip(poses, covariances, strict=True)
+                ]
+                poses = np.array([each.mean for each in moved])
+                covariances = np.array([each.covariance for each in moved])
+            message = translate.trajectory_message(
+                stamps[-1], robot, incarnation, self.digest, stamps, poses[1:], covariances[1:]
+            )
+            outgoing.append(Outgoing(ch.TRAJECTORY, robot, message))
+        return outgoing
+
+
+def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
+    """The errors that are configured to persist, each with the robots that have the same."""
+    declared = defaultdict(list)
+    for name, config in sorted(robots.items()):
+        sensor, biases = config.sensor, config.front_end.biases
+        shares = {"range_white": sensor.range_white, "bearing_white": sensor.bearing_white}
+        lasting = [f"{each} = {share:g}" for each, share in shares.items() if share < 1.0]
+        if lasting or biases:
+            words = [*lasting, *([f"biases {', '.join(biases)}"] if biases else [])]
+            declared["; ".join(words)].append(name)
+    return [
+        f"{', '.join(names)}: errors that persist ({words}) are taken as white, "
+        "so the covariance is too small"
+        for words, names in declared.items()
+    ]

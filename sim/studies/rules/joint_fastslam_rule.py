@@ -1,0 +1,90 @@
+"""The rule `joint-fastslam`: multi-robot FastSLAM at the centre (Ma & Ma, section IV-D)."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from central.config import CentralConfig
+from sim.studies.estimators import joint_fastslam
+from sim.studies.estimators.joint_fastslam import JointFastSlam
+from sim.studies.estimators.robot_step import RobotStep
+from sim.studies.rules.measurement_rules import MapContent, MeasurementRule
+from sim.studies.rules.team_keyframes import RobotKeyframe
+from team.config import RobotConfig
+from team.estimation import dense
+from team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
+from team.estimation.geometry import Pose, tangent
+from team.estimation.models import Increment
+from team.estimation.randomness import generator
+from team.wire.bus import Outgoing
+
+RESAMPLE_BELOW = 1.0
+"""Resamples at every step, as algorithm 1 does."""
+POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
+"""Added to a pose's covariance [m², m², rad²], which is singular where fewer than four particles
+differ.
+"""
+
+
+class JointFastSlamRule(MeasurementRule):
+    """One particle filter over all robots' paths and one map.
+
+    The particles are those of FastSLAM 1.0, `particles` of them.
+    """
+
+    _state: JointFastSlam
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
+        super().__init__(config, digest, robots)
+        self._generator = generator(0, "team", 0, 0)
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """The number of particles."""
+        return {"particles": float(self.config.particles)}
+
+    def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
+        first = self.models[min(self.models)]
+        self._generator = generator(first.seed, "team", 0, 0)
+        poses = {name: pose for name, (pose, _) in starts.items()}
+        particles = self.config.particles
+        self._state = joint_fastslam.initial_state(poses, particles, "fastslam1", RESAMPLE_BELOW)
+        turns = [
+            _uncertain(name, pose, covariance, self.models[name])
+            for name, (pose, covariance) in starts.items()
+            if covariance is not None
+        ]
+        if turns:
+            self._state = joint_fastslam.filter_step(self._state, turns, self._generator)
+
+    def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
+        blind = [turn.blind for turn in turns]
+        for some in (turns, blind):  # at the last the particles stay where they are
+            with suppress(NotACovarianceError, np.linalg.LinAlgError), np.errstate(all="ignore"):
+                after = joint_fastslam.filter_step(self._state, some, self._generator)
+                if np.isfinite(after.poses).all() and np.isfinite(after.log_weights).all():
+                    self._state = after
+                    break
+            self.warnings.append("a step is refused: with it the particles have no weights")
+        return [
+            self.pose(each, self._pose_gaussian(each.robot))
+            for each in step
+            if self.pose_is_due(each)
+        ]
+
+    def _pose_gaussian(self, robot: str) -> PoseGaussian:
+        mean, covariance = joint_fastslam.pose_gaussian(self._state, robot)
+        return PoseGaussian(mean, covariance + POSE_FLOOR)
+
+    def _content(self, *, final: bool) -> MapContent:
+        return MapContent(joint_fastslam.landmark_gaussian(self._state))
+
+
+def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> RobotStep:
+    """An initial pose with this covariance in (x, y, θ): a motion by nothing with its noise."""
+    G = tangent(pose[2])
+    own = dense.product(dense.product(G.T, covariance), G)
+    nothing = np.empty(0)
+    start = Increment(np.zeros(3), 0.5 * (own + own.T))
+    return RobotStep(robot, start, config.sensor, np.empty(0, np.uint32), nothing, nothing)

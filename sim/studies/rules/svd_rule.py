@@ -1,0 +1,231 @@
+"""Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
+
+Every robot's submaps make one map by least squares in the frame of its own initial pose (section
+4.1). A robot's map is then moved into the frame of the others' by a singular value decomposition
+over the common landmarks, and the landmarks are joined (section 4.3). The initial pose of the first
+robot fixes the frame; those of the others have no influence.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from central.config import CentralConfig
+from central.fused import fused_message, version_entry
+from central.rule import FusionRule, Tail
+from central.submap_intake import SubmapInputs, SubmapIntake
+from sim.studies.estimators import svd_joining
+from sim.studies.estimators.svd_joining import (
+    NO_PAIRS,
+    PointPairs,
+    SubmapJoining,
+    TooFewPointsError,
+    Weighting,
+)
+from team import translate
+from team.estimation import dense, elementwise
+from team.estimation.contribution import Stream, named
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from team.estimation.geometry import Pose
+from team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from team.estimation.plausible import start_beyond, submap_beyond
+from team.estimation.submap import LocalMap
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+from team.wire.digest import digest_of
+
+NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """The submaps of a stream so far: their number, their map, and the digest of its inputs.
+
+    refused: the submap at which the chain has ended and why, if there is one.
+    """
+
+    count: int
+    state: SubmapJoining
+    digest: bytes
+    refused: str = ""
+
+
+class SvdJoinRule(FusionRule[SubmapInputs]):
+    """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
+
+    A later incarnation of a robot is a stream of its own, in a frame of its own. A running map
+    contains everything that has arrived; a later one may place any of it elsewhere.
+    """
+
+    intake = SubmapIntake
+
+    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
+        super().__init__(config, digest, robots)
+        self._weighting: Weighting = "full" if config.fusion == "svd-join" else "identity"
+        self._joined: dict[Stream, _Joined] = {}
+
+    def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
+        """The map of these submaps: a function of them and of the initial poses alone."""
+        channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
+        return [Outgoing(channel, "", self._fused(inputs, final=tail == "final"))]
+
+    def _fused(self, inputs: SubmapInputs, *, final: bool) -> m.FusedMap:
+        chains = {stream: chain for stream, chain in inputs.submaps.items() if chain}
+        if not chains:
+            return fused_message(
+                self.config,
+                self.config_digest,
+                NO_LANDMARKS,
+                (),
+                stamp_ns=0,
+                final=final,
+                frame="",
+            )
+        initial = {stream: self._believed(inputs.starts[stream]) for stream in chains}
+        joined = {s: self._extended(s, chains[s], initial[s], final) for s in chains}
+        states = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
+        first = min(states or chains, key=lambda s: (initial[s] is None, s))
+        maps = {s: svd_joining.landmark_gaussian(state) for s, state in states.items()}
+        with np.errstate(all="ignore"):
+            fused, reasons = tied(first, maps, full=self._weighting == "full")
+        refused = tuple(x.refused for _, x in sorted(joined.items()) if x.refused)
+        self.landmarks = len(fused.ids)
+        return fused_message(
+            self.config,
+            digest_of(self.config_digest, *(joined[s].digest for s in sorted(joined))),
+            fused,
+            tuple(version_entry(stream, joined[stream].count - 1) for stream in sorted(joined)),
+            stamp_ns=max(chain[-1].stamp_ns for chain in chains.values()),
+            final=final,
+            frame=f"{first[0]}/{first[1]}",
+            reasons=(*reasons, *refused),
+        )
+
+    def _believed(self, message: m.InitialPose) -> Pose | None:
+        """The initial pose of a stream, if it is known and within the bounds."""
+        start = translate.start_of(message)
+        if start is None or start_beyond(start, self.config.bounds) is not None:
+            return None
+        return start.pose
+
+    def _extended(
+        self, stream: Stream, chain: Sequence[m.Submap], initial_pose: Pose | None, final: bool
+    ) -> _Joined:
+        """The map of a stream's chain, from the longest one that was made before.
+
+        Running maps continue from the last solution with each submap; the final one is solved until
+        it converges, including a search for other minima.
+        """
+        begin = svd_joining.initial_state(
+            {stream[0]: np.zeros(3) if initial_pose is None else initial_pose}, self._weighting
+        )
+        before = self._joined.get(stream)
+        if before is None or before.count > len(chain):
+            before = _Joined(0, begin, self.config_digest)
+        state, digest, refused = before.state, before.digest, before.refused
+        for submap in chain[before.count :]:
+            digest = digest_of(digest, encoded(submap))
+            if not refused:
+                local = translate.local_map_of(submap).without_nodes.without_biases
+                why = submap_beyond(local, self.config.bounds)
+                after = _joined_with(state, stream[0], local) if why is None else None
+                if after is None:
+                    words = why or "with it the map has no solution"
+                    refused = f"submap {submap.sequence} of {named(stream)} refused: {words}"
+                else:
+                    state = after
+        self._joined[stream] = _Joined(len(chain), state, digest, refused)
+        solution = _solution(state) if final else state
+        return _Joined(len(chain), solution, digest, refused)
+
+
+def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
+    """The map with one more submap; None where it has no solution or no covariance."""
+    try:
+        with np.errstate(all="ignore"):
+            after = svd_joining.filter_step(state, robot, local)
+            landmarks = svd_joining.landmark_gaussian(after)
+    except UNSOLVABLE:
+        return None
+    finite = np.isfinite(landmarks.means).all() and np.isfinite(landmarks.covariance).all()
+    return after if finite else None
+
+
+def _solution(state: SubmapJoining) -> SubmapJoining:
+    """The full solution; where there is none, the state before it."""
+    try:
+        with np.errstate(all="ignore"):
+            return svd_joining.solved(state)
+    except UNSOLVABLE:
+        return state
+
+
+def tied(
+    first: Stream,
+    maps: Mapping[Stream, LandmarkGaussian],
+    *,
+    full: bool,
+    sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
+) -> tuple[LandmarkGaussian, tuple[str, ...]]:
+    """Greedily aligns the map that has the most landmarks in common with those that are aligned.
+
+    sightings: by two streams in their order, the robots' own positions in both maps where they
+    measured each other (`mutual_sighting`); they are aligned like common landmarks, but not with
+    `full`. A map with too few common points is left out, with the reason.
+    """
+    fused = maps.get(first, NO_LANDMARKS)
+    frames = {first: np.zeros(3)}
+    waiting = {stream: maps[stream] for stream in sorted(maps) if stream != first}
+    unsolvable: list[Stream] = []
+    while waiting:
+        seen = {s: _seen(s, frames, sightings) for s in waiting}
+        shared = {
+            s: len(np.intersect1d(fused.ids, x.ids)) + len(seen[s].in_a) for s, x in waiting.items()
+        }
+        stream = max(waiting, key=lambda s: shared[s])
+        try:
+            exchange = (
+                svd_joining.exchanged_fully(fused, waiting[stream])
+                if full
+                else svd_joining.exchanged(fused, waiting[stream], seen[stream])
+            )
+        except TooFewPointsError:
+            break
+        except UNSOLVABLE:
+            unsolvable.append(stream)
+            del waiting[stream]
+            continue
+        fused = exchange.landmarks
+        frames[stream] = exchange.a_from_b.mean
+        del waiting[stream]
+    reasons = [
+        f"{named(stream)} not joined: its common landmarks give no place" for stream in unsolvable
+    ]
+    for stream, alone in waiting.items():
+        count = len(np.intersect1d(fused.ids, alone.ids))
+        plural = "" if count == 1 else "s"
+        needed = f"{count} shared landmark{plural}, {svd_joining.NEEDED} needed"
+        reasons.append(f"{named(stream)} not joined: {needed}")
+    return fused, tuple(reasons)
+
+
+def _seen(
+    stream: Stream,
+    frames: Mapping[Stream, Pose],
+    sightings: Mapping[tuple[Stream, Stream], PointPairs],
+) -> PointPairs:
+    """The points of a stream with all those in the map, in the map's frame and in its own."""
+    found = [NO_PAIRS]
+    for other, frame in frames.items():
+        pairs = sightings.get((min(stream, other), max(stream, other)))
+        if pairs is not None:
+            theirs, own = pairs if other < stream else (pairs.in_b, pairs.in_a)
+            s, c = elementwise.sin_and_cos(frame[2])
+            found.append(
+                PointPairs(dense.product(theirs, np.array([[c, s], [-s, c]])) + frame[:2], own)
+            )
+    return PointPairs(*(np.concatenate(each) for each in zip(*found, strict=True)))

@@ -1,0 +1,317 @@
+"""The batch MAP: its derivatives, the dense solution that it must equal, and its honesty."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.studies.estimators import batch, batch_factors
+from sim.studies.estimators.batch_factors import Measurements, Motions, Starts
+from team.config import Sensor
+from team.estimation.consistency import chi2_interval, nees, state_error
+from team.estimation.geometry import (
+    adjoint,
+    between,
+    compose,
+    exponential,
+    inverse,
+    logarithm,
+    tangent,
+)
+from team.estimation.models import landmark_jacobian, noise, pose_jacobian, predicted
+from tests.estimation.team_rounds import LANDMARKS, STARTS, team_run, wrap
+
+KNOWN = {robot: (pose, None) for robot, pose in STARTS.items()}
+UNSURE = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]])
+RISING = Sensor(range_sigma=0.1, range_sigma_per_m=0.05, bearing_sigma=0.02)
+numbers = st.floats(-3.0, 3.0)
+poses = st.tuples(numbers, numbers, numbers).map(np.array)
+STEP = 1e-6
+
+
+def turns_of(rounds):
+    return [turn for turns in rounds for turn in turns]
+
+
+def converged(start, turns):
+    found = batch.solved(batch.extended(start, turns), 100, 1e-9)
+    assert found.converged(1e-9)
+    return found
+
+
+def along(function, size):
+    """∂f/∂x at 0 by central differences, a column per number of x."""
+    columns = [(function(STEP * e) - function(-STEP * e)) / (2.0 * STEP) for e in np.eye(size)]
+    return np.column_stack(columns)
+
+
+def moved(pose, xi):
+    return compose(pose, exponential(xi))
+
+
+ONE, BOTH = np.zeros(1, np.int64), np.array([1])
+
+
+@settings(deadline=None, max_examples=50)
+@given(poses, poses)
+def test_the_functions_of_rows_are_those_of_single_poses(a, b):
+    rows = np.array([a, b, 1e-5 * a])
+    other = rows[[1, 0, 0]]
+    for many, one in (
+        (batch_factors.composed(rows, other), compose),
+        (batch_factors.relative_poses(rows, other), between),
+    ):
+        expected = [one(*each) for each in zip(rows, other, strict=True)]
+        np.testing.assert_allclose(many, expected, atol=1e-12)
+    for many, one in (
+        (batch_factors.exponentials(rows), exponential),
+        (batch_factors.logarithms(rows), logarithm),
+    ):
+        np.testing.assert_allclose(many, [one(row) for row in rows], rtol=1e-9, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=50)
+@given(poses, poses, st.tuples(*[st.floats(-0.5, 0.5)] * 3).map(np.array))
+def test_the_derivatives_of_starts_and_odometry_are_those_of_their_residuals(a, mean, xi):
+    b = compose(compose(a, mean), exponential(xi))
+    starts = Starts(ONE, a[None], np.eye(3)[None])
+    near = moved(a, xi)
+
+    def told(delta):
+        return batch_factors.start_residuals(starts, moved(near, delta)[None])[0][0]
+
+    residual, J = batch_factors.start_residuals(starts, near[None])
+    np.testing.assert_allclose(residual[0], xi, atol=1e-9)
+    np.testing.assert_allclose(J[0], along(told, 3), atol=1e-6)
+
+    motions = Motions(ONE, BOTH, mean[None], np.eye(3)[None])
+
+    def driven(delta):
+        ends = np.array([moved(a, delta[:3]), moved(b, delta[3:])])
+        return batch_factors.motion_residuals(motions, ends).residual[0]
+
+    linear = batch_factors.motion_residuals(motions, np.array([a, b]))
+    np.testing.assert_allclose(linear.residual[0], xi, atol=1e-9)
+    of_both = np.column_stack([linear.first[0], linear.second[0]])
+    np.testing.assert_allclose(of_both, along(driven, 6), atol=1e-5)
+
+
+@settings(deadline=None, max_examples=50)
+@given(poses, st.floats(0.5, 9.0), st.floats(-3.1, 3.1), st.floats(-0.5, 0.5))
+def test_the_derivatives_of_measurements_are_those_of_their_residuals(pose, distance, bearing, off):
+    direction = pose[2] + bearing
+    point = pose[:2] + distance * np.array([np.cos(direction), np.sin(direction)])
+    read = Measurements(
+        ONE, ONE, np.array([distance - off]), np.array([wrap(bearing - off)]), np.ones((1, 3))
+    )
+
+    def seen(delta):
+        at, landmark = moved(pose, delta[:3])[None], (point + delta[3:])[None]
+        return batch_factors.measurement_residuals(read, at, landmark).residual[0]
+
+    linear = batch_factors.measurement_residuals(read, pose[None], point[None])
+    np.testing.assert_allclose(linear.residual[0], [off, off], atol=1e-9)
+    of_both = np.column_stack([linear.first[0], linear.second[0]])
+    np.testing.assert_allclose(of_both, along(seen, 5), atol=1e-6)
+
+
+@pytest.mark.parametrize("robust_c", [None, 1.0])
+def test_the_gradient_is_the_slope_of_the_cost(robust_c):
+    rounds, _ = team_run(3, steps=4)
+    start = batch.initial_state({"r1": (STARTS["r1"], UNSURE), "r2": KNOWN["r2"]}, robust_c)
+    here = batch.extended(start, turns_of(rounds))
+    _, gradient = here.normal_equations
+    split = 3 * len(here.poses)
+
+    def cost(delta):
+        turned = [
+            moved(*each) for each in zip(here.poses, delta[:split].reshape(-1, 3), strict=True)
+        ]
+        shifted = here.landmarks + delta[split:].reshape(-1, 2)
+        other = replace(here, poses=np.array(turned), landmarks=shifted)
+        return np.array([here.cost_of(other)])
+
+    slope = along(cost, len(gradient))[0]
+    np.testing.assert_allclose(2.0 * gradient, slope, rtol=1e-4, atol=1e-2)
+
+
+def right_jacobian(xi):
+    """Σ (−ad)ᵏ/(k + 1)!, by its series."""
+    forward, left, turn = xi
+    ad = np.array([[0.0, -turn, left], [turn, 0.0, -forward], [0.0, 0.0, 0.0]])
+    total, term = np.zeros((3, 3)), np.eye(3)
+    for k in range(30):
+        total = total + term
+        term = -term @ ad / (k + 2)
+    return total
+
+
+def dense_solution(starts, turns):
+    """Gauss-Newton on dense matrices, factor by factor: values, their covariance, nodes by name."""
+    x, column, size = {}, {}, 0
+    for robot, (pose, _) in starts.items():
+        x[robot, 0], column[robot, 0], size = pose, size, size + 3
+    count = dict.fromkeys(starts, 0)
+    factors = [("start", robot) for robot in starts]
+    for turn in turns:
+        robot, k = turn.robot, count[turn.robot]
+        count[robot] += 1
+        x[robot, k + 1] = compose(x[robot, k], turn.increment.mean)
+        column[robot, k + 1], size = size, size + 3
+        factors.append(("motion", (robot, k), (robot, k + 1), turn.increment))
+        for id_, r, b in zip(turn.ids.tolist(), turn.ranges, turn.bearings, strict=True):
+            if id_ not in x:
+                x[id_], column[id_], size = LANDMARKS[id_], size, size + 2
+            factors.append(("reading", (robot, k + 1), id_, r, b, turn.sensor))
+    for _ in range(30):
+        A, g = np.zeros((size, size)), np.zeros(size)
+        for kind, *rest in factors:
+            J = np.zeros((2 if kind == "reading" else 3, size))
+            if kind == "start":
+                node = (rest[0], 0)
+                pose, covariance = starts[rest[0]]
+                G = tangent(pose[2])
+                P = np.eye(3) * 1e-10 if covariance is None else G.T @ covariance @ G
+                r = logarithm(between(pose, x[node]))
+                J[:, column[node] : column[node] + 3] = np.linalg.inv(right_jacobian(r))
+            elif kind == "motion":
+                a, b, increment = rest
+                P = increment.covariance + np.diag(batch.FLOOR_SIGMAS) ** 2
+                h = between(x[a], x[b])
+                r = logarithm(between(increment.mean, h))
+                of_b = np.linalg.inv(right_jacobian(r))
+                J[:, column[a] : column[a] + 3] = -of_b @ adjoint(inverse(h))
+                J[:, column[b] : column[b] + 3] = of_b
+            else:
+                node, id_, distance, bearing, sensor = rest
+                d, beta = predicted(x[node], x[id_])
+                P = np.diag(noise(sensor, d))
+                r = np.array([d - distance, wrap(beta - bearing)])
+                J[:, column[node] : column[node] + 3] = pose_jacobian(d, beta)
+                of_landmark = landmark_jacobian(d, x[node][2] + beta)
+                J[:, column[id_] : column[id_] + 2] = of_landmark
+            W = np.linalg.inv(P)
+            A, g = A + J.T @ W @ J, g + J.T @ W @ r
+        step = -np.linalg.solve(A, g)
+        for node, value in x.items():
+            at, delta = column[node], step[column[node] : column[node] + len(value)]
+            x[node] = value + delta if len(value) == 2 else moved(value, step[at : at + 3])
+    return x, np.linalg.inv(A), column
+
+
+@pytest.mark.parametrize("sensor", [None, RISING], ids=["their sensors", "noise with the range"])
+def test_it_is_the_dense_gauss_newton(sensor):
+    rounds, _ = team_run(5, steps=4)
+    turns = turns_of(rounds)
+    if sensor is not None:
+        turns = [turn._replace(sensor=sensor) for turn in turns]
+    starts = {"r1": (STARTS["r1"], UNSURE), "r2": KNOWN["r2"]}
+    x, P, column = dense_solution(starts, turns)
+    found = converged(batch.initial_state(starts, None), turns)
+    landmarks = batch.landmark_gaussian(found)
+    ids = landmarks.ids.tolist()
+    at = np.array([column[id_] + axis for id_ in ids for axis in range(2)])
+    sigma = np.sqrt(np.diag(P)[at])
+    expected = np.concatenate([x[id_] for id_ in ids])
+    assert np.abs((landmarks.means.ravel() - expected) / sigma).max() < 1e-9
+    scale = np.outer(sigma, sigma)
+    assert np.abs((landmarks.covariance - P[np.ix_(at, at)]) / scale).max() < 1e-9
+    for robot in starts:
+        means, covariances = batch.trajectory(found, robot)
+        assert len(means) == 5
+        for k, (mean, covariance) in enumerate(zip(means, covariances, strict=True)):
+            own = column[robot, k] + np.arange(3)
+            G = tangent(mean[2])
+            dense = G @ P[np.ix_(own, own)] @ G.T
+            np.testing.assert_allclose(mean, x[robot, k], atol=1e-9)
+            np.testing.assert_allclose(covariance, dense, rtol=1e-6, atol=1e-9 * dense.max())
+        newest = batch.pose_gaussian(found, robot)
+        np.testing.assert_array_equal(newest.mean, means[-1])
+        np.testing.assert_allclose(newest.covariance, covariances[-1], rtol=1e-9)
+
+
+def test_how_it_has_grown_does_not_matter():
+    rounds, _ = team_run(7, steps=9)
+    whole = converged(batch.initial_state(KNOWN, None), turns_of(rounds))
+    grown = batch.initial_state(KNOWN, None)
+    for k in range(0, 9, 3):
+        grown = batch.extended(grown, turns_of(rounds[k : k + 3]))
+        grown = batch.solved(grown, 2, 1e-2)
+    grown = converged(grown, [])
+    for one, other in zip(
+        batch.landmark_gaussian(whole), batch.landmark_gaussian(grown), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9)
+
+
+def test_before_any_turn_it_is_the_start_poses():
+    alone = converged(batch.initial_state({"r1": (STARTS["r1"], UNSURE)}, None), [])
+    mean, covariance = batch.pose_gaussian(alone, "r1")
+    np.testing.assert_allclose(mean, STARTS["r1"], atol=1e-12)
+    np.testing.assert_allclose(covariance, UNSURE, rtol=1e-9)
+    assert len(batch.landmark_gaussian(alone).ids) == 0
+    assert alone.dof == 0
+
+
+def test_a_robot_without_a_start_is_refused():
+    rounds, _ = team_run(1, steps=1)
+    with pytest.raises(ValueError, match="r2 has no start"):
+        batch.extended(batch.initial_state({"r1": KNOWN["r1"]}, None), rounds[0])
+
+
+def test_too_few_iterations_are_told_by_the_decrement():
+    rounds, _ = team_run(2)
+    whole = batch.extended(batch.initial_state(KNOWN, None), turns_of(rounds))
+    assert not batch.solved(whole, 1, 1e-6).converged(1e-6)
+    assert batch.solved(whole, 50, 1e-6).converged(1e-6)
+
+
+@pytest.mark.parametrize("robust", [True, False], ids=["Cauchy", "mutant: plain squares"])
+def test_a_robust_batch_leaves_outliers_out(robust):
+    rounds, _ = team_run(11, steps=12)
+    turns = turns_of(rounds)
+    victim = turns[9]
+    ranges = victim.ranges.copy()
+    ranges[0] += 20.0
+    spoilt = [*turns[:9], victim._replace(ranges=ranges), *turns[10:]]
+    clean = batch.landmark_gaussian(converged(batch.initial_state(KNOWN, None), turns))
+    found = batch.solved(
+        batch.extended(batch.initial_state(KNOWN, 2.0 if robust else None), spoilt), 200, 1e-6
+    )
+    assert found.converged(1e-6)
+    off = (batch.landmark_gaussian(found).means - clean.means).ravel()
+    sigmas = float(np.abs(off / np.sqrt(np.diag(clean.covariance))).max())
+    assert (sigmas < 1.0) == robust, sigmas
+
+
+def told_twice(turn):
+    return turn._replace(
+        **{name: np.tile(getattr(turn, name), 2) for name in ("ids", "ranges", "bearings")}
+    )
+
+
+@pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
+def test_it_is_consistent_and_a_measurement_used_twice_is_found(twice):
+    runs, total, dof = 200, 0.0, 0
+    for seed in range(runs):
+        rounds, truth = team_run(seed, steps=6)
+        turns = [told_twice(turn) if twice else turn for turn in turns_of(rounds)]
+        found = batch.solved(batch.extended(batch.initial_state(KNOWN, None), turns), 20, 1e-4)
+        ids, means, covariance = batch.landmark_gaussian(found)
+        total += nees((means - LANDMARKS[ids]).ravel(), covariance)
+        mean, P = batch.pose_gaussian(found, "r2")
+        total += nees(state_error(mean, truth["r2"]), P)
+        dof += 2 * len(ids) + 3
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert (low <= total / dof <= high) == (not twice), total / dof
+
+
+def test_the_same_measurements_give_the_same_bits():
+    rounds, _ = team_run(4)
+    one, two = (
+        batch.landmark_gaussian(converged(batch.initial_state(KNOWN, 1.0), turns_of(rounds)))
+        for _ in range(2)
+    )
+    assert [each.tobytes() for each in one] == [each.tobytes() for each in two]

@@ -1,0 +1,112 @@
+"""Dead reckoning is the composition of its increments, and its Gaussian is true on SE(2)."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.studies.estimators import dead_reckoning
+from team.config import MotionModel, MotionNoise, Sensor
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.geometry import between, compose, exponential, logarithm
+from team.estimation.models import Increment, increment_of
+
+MOTION = MotionModel(
+    "turn-then-drive", forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=np.deg2rad(3.0))
+)
+SENSOR = Sensor()
+NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+START = np.array([3.0, -2.0, 2.5])
+noise = st.floats(-0.3, 0.3)
+component = st.floats(-2.0, 2.0)
+increments = st.builds(
+    lambda mean, root: Increment(np.array(mean), np.array(root) @ np.array(root).T),
+    st.tuples(component, component, component),
+    st.lists(st.tuples(noise, noise, noise), min_size=3, max_size=3),
+)
+
+
+def reckoned(steps, start=START, measurements=NOTHING):
+    state = dead_reckoning.initial_state(start)
+    for step in steps:
+        state = dead_reckoning.filter_step(state, step, SENSOR, *measurements)
+    return state
+
+
+def drive(seed, steps=20):
+    """Told increments of a robot, and where they truly led it."""
+    rng = np.random.default_rng(seed)
+    told = [increment_of(MOTION, 1.0, 0.98, rng.uniform(-0.15, 0.15)) for _ in range(steps)]
+    truth = START
+    for step in told:
+        xi = rng.multivariate_normal(np.zeros(3), step.covariance, method="svd")
+        truth = compose(compose(truth, step.mean), exponential(xi))
+    return told, truth
+
+
+def mean_nees(covariance_of, runs=200):
+    """The mean over runs of ξᵀ C⁻¹ ξ / 3 with truth = mean ∘ Exp(ξ)."""
+    total = 0.0
+    for seed in range(runs):
+        told, truth = drive(seed)
+        error = logarithm(between(reckoned(told).pose.mean, truth))
+        total += nees(error, covariance_of(told))
+    return total / (3 * runs)
+
+
+def test_its_covariance_is_true_and_one_that_is_only_added_up_is_not():
+    low, high = chi2_interval(3, 0.999, 200)
+    assert low < mean_nees(lambda told: reckoned(told).pose.covariance) < high
+    assert not low < mean_nees(added_up) < high
+
+
+def added_up(told):
+    """The covariance of a robot that never turns; a little more, since so it is singular."""
+    covariance = sum(step.covariance for step in told)
+    return covariance + 1e-9 * np.diag(np.diag(covariance))
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(increments, min_size=2, max_size=6))
+def test_steps_one_by_one_are_the_step_composed_of_them(steps):
+    composed = steps[0]
+    for step in steps[1:]:
+        composed = composed.then(step)
+    apart, at_once = reckoned(steps), reckoned([composed])
+    shift = between(apart.pose.mean, at_once.pose.mean)
+    np.testing.assert_allclose(shift, 0.0, atol=1e-12)
+    np.testing.assert_allclose(apart.pose.covariance, at_once.pose.covariance, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=50)
+@given(increments, increments)
+def test_the_gaussian_in_x_y_theta_is_the_first_order_image_of_the_one_on_se2(first, second):
+    state = reckoned([first, second])
+    mean, P = dead_reckoning.pose_gaussian(state)
+
+    def pose(xi):
+        return compose(state.pose.mean, exponential(xi))
+
+    h = 1e-6
+    moved = [(pose(h * e) - pose(-h * e)) for e in np.eye(3)]
+    columns = [np.array([d[0], d[1], np.sin(d[2])]) / (2.0 * h) for d in moved]
+    J = np.stack(columns, axis=1)
+    np.testing.assert_array_equal(mean, state.pose.mean)
+    np.testing.assert_allclose(P, J @ state.pose.covariance @ J.T, atol=1e-8)
+    np.testing.assert_array_equal(P, P.T)
+
+
+def test_an_uncertain_start_is_a_first_step_that_stands_still():
+    spread = np.diag([0.3, 0.2, 0.1]) ** 2
+    state = reckoned([Increment(np.zeros(3), spread)])
+    np.testing.assert_allclose(state.pose.mean, START)
+    np.testing.assert_allclose(state.pose.covariance, spread)
+
+
+def test_measurements_change_nothing_and_no_landmark_is_known():
+    told, _ = drive(0)
+    seen = (np.array([4], np.uint32), np.array([5.0]), np.array([0.1]))
+    blind, seeing = reckoned(told), reckoned(told, measurements=seen)
+    assert blind.pose.mean.tobytes() == seeing.pose.mean.tobytes()
+    assert blind.pose.covariance.tobytes() == seeing.pose.covariance.tobytes()
+    ids, means, covariance = dead_reckoning.landmark_gaussian(seeing)
+    assert (ids.shape, means.shape, covariance.shape) == ((0,), (0, 2), (0, 0))

@@ -1,0 +1,260 @@
+"""Monte Carlo localisation against a grid, a Kalman filter, FastSLAM on known landmarks, truth."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.studies.estimators import localisation
+from team.config import Sensor
+from team.estimation.consistency import chi2_interval, nees, state_error
+from team.estimation.geometry import compose, exponential, transformed
+from team.estimation.hybrid_slam import fastslam
+from team.estimation.hybrid_slam import innovation as innovations
+from team.estimation.models import Increment
+from tests.estimation.estimator_runs import keyframes_of, run, world
+
+IDS = np.array([2, 5, 9], np.uint32)
+LANDMARKS = np.array([[9.0, 2.0], [-4.0, 7.0], [1.0, -8.0]])
+SENSOR = Sensor(range_sigma=0.8, range_sigma_per_m=0.02, bearing_sigma=0.15)
+MOTION = Increment(np.array([1.0, 0.1, 0.2]), np.diag([0.1, 0.05, 0.05]) ** 2)
+STANDING = Increment.identity()
+NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+
+
+def wrap(angle):
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def sights(pose, landmarks=LANDMARKS):
+    d = landmarks - pose[:2]
+    return np.hypot(*d.T), wrap(np.arctan2(d[:, 1], d[:, 0]) - pose[2])
+
+
+def log_likelihood(poses, seen, ranges, bearings, sensor=SENSOR):
+    """Σ log p(z | pose) of each of many poses, by broadcasting."""
+    d = LANDMARKS[seen] - poses[:, None, :2]
+    r = np.hypot(d[..., 0], d[..., 1])
+    sigma = np.hypot(sensor.range_sigma, sensor.range_sigma_per_m * r)
+    turn = wrap(np.arctan2(d[..., 1], d[..., 0]) - poses[:, 2:] - bearings)
+    terms = ((r - ranges) / sigma) ** 2 + (turn / sensor.bearing_sigma) ** 2
+    return (-0.5 * terms - np.log(sigma)).sum(axis=1)
+
+
+def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
+    exact = Increment(MOTION.mean, np.zeros((3, 3)))
+    truth = np.array([0.5, -1.0, 0.4])
+    r1, b1 = sights(truth)
+    r2, b2 = sights(compose(truth, MOTION.mean))
+    r1, b2 = r1 + np.array([0.5, -0.3, 0.4]), b2 + np.array([0.1, -0.05, 0.02])
+    x, y, heading = (
+        np.linspace(-5.0, 5.0, 81),
+        np.linspace(-5.0, 5.0, 81),
+        np.linspace(-np.pi, np.pi, 180, endpoint=False),
+    )
+    grid = np.stack(np.meshgrid(x, y, heading, indexing="ij"), axis=-1).reshape(-1, 3)
+    c, s = np.cos(grid[:, 2]), np.sin(grid[:, 2])
+    dx, dy, turn = MOTION.mean
+    later = grid + np.column_stack((c * dx - s * dy, s * dx + c * dy, np.full(len(grid), turn)))
+    log_weight = log_likelihood(grid, [0, 1], r1[:2], b1[:2])
+    log_weight += log_likelihood(later, [2], r2[2:], b2[2:])
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    mean = weight @ later
+    P = (later - mean).T @ ((later - mean) * weight[:, None])
+
+    random = np.random.default_rng(0)
+    low, high = np.array([-5.0, -5.0]), np.array([5.0, 5.0])
+    state = localisation.initial_state_anywhere(low, high, 200_000, IDS, LANDMARKS, random)
+    state = dataclasses.replace(state, resample_below=0.0)
+    state = localisation.filter_step(state, STANDING, SENSOR, IDS[:2], r1[:2], b1[:2], random)
+    state = localisation.filter_step(state, exact, SENSOR, IDS[2:], r2[2:], b2[2:], random)
+    found, spread = localisation.pose_gaussian(state)
+    sigma = np.sqrt(np.diag(P))
+    effective = fastslam.effective_sample_size(state.cloud.log_weights)
+    assert effective > 300.0
+    assert np.abs((found - mean) / sigma).max() < 4.0 / np.sqrt(effective)
+    assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 6.0 / np.sqrt(effective)
+
+
+def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
+    truth, random = np.array([0.5, -1.0, 0.4]), np.random.default_rng(1)
+    state = localisation.initial_state(truth, 500, IDS, LANDMARKS)
+    particles = fastslam.Particles(
+        state.cloud.poses,
+        state.cloud.log_weights,
+        IDS,
+        np.tile(LANDMARKS, (500, 1, 1)),
+        np.zeros((500, 3, 3)),
+    )
+    other = np.random.default_rng(1)
+    for k in range(6):
+        truth = compose(truth, MOTION.mean)
+        ranges, bearings = sights(truth)
+        keyframe = (IDS[k % 3 :], ranges[k % 3 :] + 0.2, bearings[k % 3 :] - 0.05)
+        judged = innovations.innovation(particles, MOTION, SENSOR, *keyframe)
+        assert judged.dof == 2 * len(keyframe[0])
+        assert localisation.innovation(state, MOTION, SENSOR, *keyframe).squared == pytest.approx(
+            judged.squared, rel=1e-9
+        )
+        state = localisation.filter_step(state, MOTION, SENSOR, *keyframe, random)
+        particles, _ = fastslam.propagated_and_updated(
+            particles, MOTION, SENSOR, *keyframe, "fastslam1", 0.5, other
+        )
+    np.testing.assert_allclose(state.cloud.log_weights, particles.log_weights, atol=1e-9)
+    np.testing.assert_array_equal(state.cloud.poses, particles.poses)
+    assert len(np.unique(particles.log_weights)) > 400
+
+
+def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter():
+    far = 10.0 * LANDMARKS
+    sensor = Sensor(range_sigma=0.2, bearing_sigma=0.003)
+    random = np.random.default_rng(2)
+    start = np.diag([0.1, 0.1, 0.005]) ** 2
+    state = localisation.initial_state(np.zeros(3), 20_000, IDS, far)
+    state = localisation.filter_step(state, Increment(np.zeros(3), start), sensor, *NOTHING, random)
+    motion = Increment(np.array([1.0, 0.0, 0.1]), np.diag([0.1, 0.05, 0.004]) ** 2)
+    truth, mean, P = np.array([0.1, -0.05, 0.003]), np.zeros(3), start
+    for k in range(3):
+        truth = compose(truth, motion.mean)
+        z = np.array(sights(truth, far)) + np.array([[0.2], [0.003]]) * [1.0, -0.5, 0.3 * k]
+        state = localisation.filter_step(state, motion, sensor, IDS, z[0], z[1], random)
+        c, s = np.cos(mean[2]), np.sin(mean[2])
+        F = np.array([[1.0, 0.0, -s], [0.0, 1.0, c], [0.0, 0.0, 1.0]])
+        mean = compose(mean, motion.mean)
+        c, s = np.cos(mean[2]), np.sin(mean[2])
+        G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        P = F @ P @ F.T + G @ motion.covariance @ G.T
+        d = far - mean[:2]
+        r = np.hypot(*d.T)
+        H = np.zeros((6, 3))
+        H[:3, :2] = -d / r[:, None]
+        H[3:, 0], H[3:, 1], H[3:, 2] = d[:, 1] / r**2, -d[:, 0] / r**2, -1.0
+        R = np.diag([0.2**2] * 3 + [0.003**2] * 3)
+        innovation = np.concatenate((z[0] - r, wrap(z[1] - np.array(sights(mean, far))[1])))
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+        mean, P = mean + K @ innovation, P - K @ H @ P
+    found, spread = localisation.pose_gaussian(state)
+    sigma = np.sqrt(np.diag(P))
+    assert np.abs((found - mean) / sigma).max() < 0.1
+    assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 0.1
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0), st.floats(-3.0, 3.0)))
+def test_turning_and_moving_the_frame_moves_the_cloud_with_it(start):
+    shift, truth = np.array(start), np.array([1.0, 0.3, 0.2])
+    moved = np.array([transformed(shift, point) for point in LANDMARKS])
+    clouds = []
+    for pose, landmarks in ((np.zeros(3), LANDMARKS), (shift, moved)):
+        random = np.random.default_rng(7)
+        state = localisation.initial_state(pose, 40, IDS, landmarks)
+        for _ in range(2):
+            state = localisation.filter_step(state, MOTION, SENSOR, IDS, *sights(truth), random)
+        clouds.append(state.cloud)
+    here, there = clouds
+    np.testing.assert_allclose(here.log_weights, there.log_weights, atol=1e-8)
+    expected = np.array([compose(shift, pose) for pose in here.poses])
+    np.testing.assert_allclose(there.poses[:, :2], expected[:, :2], atol=1e-9)
+    np.testing.assert_allclose(wrap(there.poses[:, 2] - expected[:, 2]), 0.0, atol=1e-9)
+
+
+def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
+    state = localisation.initial_state(np.zeros(3), 50, IDS, LANDMARKS)
+    ranges, bearings = sights(np.array([1.0, 0.0, 0.2]))
+    known = (IDS, ranges, bearings)
+    more = (
+        np.array([1, *IDS, 12], np.uint32),
+        np.array([3.0, *ranges, 4.0]),
+        np.array([0.5, *bearings, 0.6]),
+    )
+    one, other = (
+        localisation.filter_step(state, MOTION, SENSOR, *keyframe, np.random.default_rng(0))
+        for keyframe in (known, more)
+    )
+    assert one.cloud.poses.tobytes() == other.cloud.poses.tobytes()
+    assert one.cloud.log_weights.tobytes() == other.cloud.log_weights.tobytes()
+
+
+def test_without_measurements_the_cloud_spreads_and_stays_equally_weighted():
+    state = localisation.initial_state(np.zeros(3), 2000, IDS, LANDMARKS)
+    random = np.random.default_rng(3)
+    for _ in range(4):
+        state = localisation.filter_step(state, MOTION, SENSOR, *NOTHING, random)
+    np.testing.assert_array_equal(state.cloud.log_weights, np.full(2000, -np.log(2000)))
+    spread = localisation.pose_gaussian(state).covariance
+    np.testing.assert_allclose(spread[2, 2], 4 * 0.05**2, rtol=0.15)
+
+
+@functools.cache
+def short_run(seed, repeat):
+    """NEES of the pose after eight steps and their NIS, each measurement told `repeat` times."""
+    random, judged = np.random.default_rng(seed), innovations.NOTHING
+    truth, state = np.zeros(3), localisation.initial_state(np.zeros(3), 1000, IDS, LANDMARKS)
+    for _ in range(8):
+        xi = np.array([0.1, 0.05, 0.05]) * random.standard_normal(3)
+        truth = compose(compose(truth, MOTION.mean), exponential(xi))
+        ranges, bearings = sights(truth)
+        sigma = np.hypot(0.8, 0.02 * ranges)
+        ranges = ranges + sigma * random.standard_normal(3)
+        bearings = wrap(bearings + 0.15 * random.standard_normal(3))
+        keyframe = [np.repeat(part, repeat) for part in (IDS, ranges, bearings)]
+        judged = judged.plus(localisation.innovation(state, MOTION, SENSOR, *keyframe))
+        state = localisation.filter_step(state, MOTION, SENSOR, *keyframe, random)
+    pose = localisation.pose_gaussian(state)
+    return nees(state_error(pose.mean, truth), pose.covariance), 3, *judged
+
+
+@pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
+def test_it_is_consistent_and_one_that_counts_measurements_twice_is_not(column):
+    for repeat in (1, 2):
+        runs = np.array([short_run(seed, repeat) for seed in range(200)])
+        dof = runs[:, column + 1].sum()
+        low, high = chi2_interval(int(dof), 0.999, 1)
+        assert (low < runs[:, column].sum() / dof < high) == (repeat == 1)
+
+
+@pytest.mark.parametrize("name", ["thesis", "thesis-b"])
+def test_in_the_thesis_world_it_finds_itself_from_an_unknown_start(name):
+    robots, streams = world(name, 1)
+    config, stream = robots[0], streams.streams[0]
+    random = np.random.default_rng(4)
+    state = localisation.initial_state_anywhere(
+        np.zeros(2), np.full(2, 100.0), 20_000, streams.landmark_ids, streams.landmarks, random
+    )
+    lost = localisation.pose_gaussian(state)
+    assert min(np.diag(lost.covariance)[:2]) > 25.0**2
+    keyframes = keyframes_of(config, stream)[:150]
+    pose = localisation.pose_gaussian(
+        run(state, localisation.filter_step, keyframes, config, random)
+    )
+    error = state_error(pose.mean, stream.truth[150])
+    assert np.hypot(*error[:2]) < 2.0
+    assert nees(error, pose.covariance) < 25.0
+
+
+def test_the_same_inputs_give_the_same_bytes_and_stay_untouched():
+    random = np.random.default_rng(5)
+    state = localisation.initial_state_anywhere(
+        np.array([-1.0, -2.0]), np.array([3.0, 2.0]), 30, IDS, LANDMARKS, random
+    )
+    low, high = state.cloud.poses.min(axis=0), state.cloud.poses.max(axis=0)
+    assert (low >= [-1.0, -2.0, -np.pi]).all()
+    assert (high <= [3.0, 2.0, np.pi]).all()
+    kept = state.cloud.poses.copy(), state.cloud.log_weights.copy()
+    keyframe = (IDS, *sights(np.zeros(3)))
+    once, twice = (
+        localisation.filter_step(state, MOTION, SENSOR, *keyframe, np.random.default_rng(6))
+        for _ in range(2)
+    )
+    assert once.cloud.poses.tobytes() == twice.cloud.poses.tobytes()
+    assert once.cloud.log_weights.tobytes() == twice.cloud.log_weights.tobytes()
+    np.testing.assert_array_equal(state.cloud.poses, kept[0])
+    np.testing.assert_array_equal(state.cloud.log_weights, kept[1])
+    ids, means, covariance = localisation.landmark_gaussian(once)
+    np.testing.assert_array_equal(means, LANDMARKS)
+    assert not covariance.any()
+    assert ids is IDS

@@ -1,0 +1,156 @@
+"""The rule `batch`: what GTSAM finds on the same measurements, and what it does not know is
+said.
+"""
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.scenarios.scenario import load, with_options
+from sim.studies.batch_reference.reference import batch_map
+from sim.studies.rules import batch_rule
+from sim.studies.rules.batch_rule import taken_as_white
+from team import translate
+from team.config import FrontEnd, RobotConfig, Sensor
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.digest import configured
+from tests.sim.reruns import messages, team_samples
+from tests.teams import config, of, published, stream
+
+
+def team_run(world, fusion, estimator, steps):
+    """A run in memory; few particles, which the measurements do not know of."""
+    scenario = with_options(load(world), fusion=fusion, estimator=estimator)
+    robots = tuple(
+        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, particles=50))
+        for r in scenario.robots
+    )
+    shorter = msgspec.structs.replace(scenario.world, steps=steps)
+    return team_samples(msgspec.structs.replace(scenario, world=shorter, robots=robots))
+
+
+@pytest.mark.parametrize(("world", "steps"), [("thesis", 150), ("thesis-b", 150)])
+def test_it_is_the_batch_map_of_gtsam_on_the_same_measurements(world, steps):
+    pytest.importorskip("gtsam", reason="pip install '.[batch-reference]'")
+    limit = batch_map(team_run(world, "join", "hybrid", steps))
+    samples = team_run(world, "batch", "dead-reckoning", steps)
+    (final,) = messages(samples, ch.FINAL_MAP)
+    ids, means = translate.landmarks_of(final)
+    covariance = translate.landmark_covariance_of(final)
+    sigma = np.sqrt(np.diag(limit.covariance))
+    np.testing.assert_array_equal(ids, limit.ids)
+    assert np.abs((means - limit.means).ravel() / sigma).max() < 1e-4
+    assert np.abs((covariance - limit.covariance) / np.outer(sigma, sigma)).max() < 1e-4
+    assert final.chi2 == pytest.approx(limit.cost, rel=1e-8)
+    for robot, path in limit.paths.items():
+        (said,) = messages(samples, ch.TRAJECTORY, robot)
+        stamps, poses = translate.trajectory_of(said)
+        np.testing.assert_array_equal(stamps, path.stamps_ns[1:])
+        np.testing.assert_allclose(poses, path.poses[1:], atol=1e-5)
+
+
+def robots(**options):
+    return {name: config(name, **options) for name in ("r1", "r2")}
+
+
+MEASUREMENTS = {"r1": published(stream("r1", 9)), "r2": published(stream("r2", 7, y=1.0))}
+
+
+def heard(configs, **options):
+    """A team's measurements at the centre, one after the other."""
+    node = CentralNode(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
+    out = []
+    for name, told in configs.items():
+        out += node.handle(configured(ch.robot_node(name), 0, 0, told), 0)
+        for measurement in MEASUREMENTS[name]:
+            out += node.handle(measurement, 0)
+        out += node.handle(
+            m.Done(
+                stamp_ns=0,
+                robot=name,
+                incarnation=1,
+                measurements=len(MEASUREMENTS[name]),
+                steps=0,
+                submaps=0,
+                ledger=(),
+            ),
+            0,
+        )
+    ends = tuple(
+        m.StreamEnd(robot=name, incarnation=1, measurements=len(each))
+        for name, each in MEASUREMENTS.items()
+    )
+    return node, out + node.handle(m.End(stamp_ns=0, streams=ends), 0)
+
+
+def pose_times(out, name):
+    return [o.message.stamp_ns // 10**9 for o in out if o.key == ch.CENTRAL_POSE.key(name)]
+
+
+def test_each_map_comes_with_the_newest_pose_of_every_robot_that_has_moved():
+    _, out = heard(robots())
+    assert {name: pose_times(out, name) for name in MEASUREMENTS} == {"r1": [4, 8, 9], "r2": [4, 7]}
+    _, out = heard(robots(pose_s=5.0))
+    assert pose_times(out, "r1") == [4, 9]
+
+
+def test_the_final_map_comes_with_whole_paths():
+    node, out = heard(robots())
+    paths = {path.robot: path for path in of(out, ch.TRAJECTORY)}
+    for name, measurements in MEASUREMENTS.items():
+        stamps, poses = translate.trajectory_of(paths[name])
+        assert (len(stamps), stamps[-1]) == (9 if name == "r1" else 7, measurements[-1].stamp_ns)
+        assert paths[name].digest == node.final.digest
+    *_, last = (o.message for o in out if o.key == ch.CENTRAL_POSE.key("r1"))
+    _, poses = translate.trajectory_of(paths["r1"])
+    np.testing.assert_array_equal(poses[-1], floats(last.pose, "pose"))
+
+
+def test_the_map_has_the_joint_cost():
+    node, _ = heard(robots())
+    every = [measurement for measurements in MEASUREMENTS.values() for measurement in measurements]
+    read = sum(len(x.ids) // 4 for x in every if isinstance(x, m.Observations))
+    assert node.final.dof == 2 * read - 2 * len(translate.landmarks_of(node.final)[0])
+    assert 0.5 < node.final.chi2 / node.final.dof < 1.5
+    assert node.status().figures["joint_cost_per_dof"] == node.final.chi2 / node.final.dof
+
+
+def test_a_final_map_that_has_not_converged_says_so(monkeypatch):
+    node, _ = heard(robots())
+    assert node.final.reasons == node.status().warnings == ()
+    monkeypatch.setattr(batch_rule, "FINAL_ITERATIONS", 1)
+    monkeypatch.setattr(batch_rule, "RUNNING_ITERATIONS", 1)
+    node, _ = heard(robots())
+    (said,) = node.final.reasons
+    assert said.startswith("the batch has not converged in 1 iterations")
+    assert node.status().warnings == (said,)
+
+
+def test_errors_that_persist_are_taken_as_white_and_that_is_said_once():
+    lasting = Sensor(range_sigma=0.1, bearing_sigma=0.02, range_white=0.5)
+    node, _ = heard(robots(sensor=lasting))
+    said = (
+        "r1, r2: errors that persist (range_white = 0.5) are taken as white, "
+        "so the covariance is too small",
+    )
+    assert node.final.reasons == node.status().warnings == said
+    biased = RobotConfig("r3", sensor=lasting, front_end=FrontEnd(biases=("bearing",)))
+    assert taken_as_white({"r3": biased, "r4": RobotConfig("r4")}) == [
+        "r3: errors that persist (range_white = 0.5; biases bearing) are taken as white, "
+        "so the covariance is too small"
+    ]
+
+
+def test_a_robust_scale_is_that_of_the_configuration():
+    plain, robust = (heard(robots(), **options)[0].final for options in ({}, {"robust_c": 1.0}))
+    assert plain.chi2 != robust.chi2
+    assert robust.reasons == ()
+
+
+def test_before_the_starts_there_is_nothing_to_tell():
+    node = CentralNode(CentralConfig(fusion="batch"), ["r1"])
+    assert "poses" not in node.status().figures

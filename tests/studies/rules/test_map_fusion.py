@@ -1,0 +1,168 @@
+"""Fusion of whole maps: by hand in one dimension, and what each rule may and may not do."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.studies.rules.map_fusion import (
+    covariance_intersection,
+    kalman,
+    kalman_per_axis,
+)
+from team.estimation.gaussian import LandmarkGaussian
+from tests.estimation.submap_world import correlated
+
+RULES = [kalman, kalman_per_axis, covariance_intersection]
+
+
+def one(x, variance, id_=1):
+    """A map of one landmark with this x; y is 0 with variance 1."""
+    return LandmarkGaussian(
+        np.array([id_], np.uint32), np.array([[x, 0.0]]), np.diag([variance, 1.0])
+    )
+
+
+def random_map(ids, seed, sigma=1.0):
+    rng = np.random.default_rng(seed)
+    n = 2 * len(ids)
+    return LandmarkGaussian(
+        np.array(ids, np.uint32), rng.normal(size=(len(ids), 2)), correlated(np.full(n, sigma), rng)
+    )
+
+
+@pytest.mark.parametrize("rule", [kalman, kalman_per_axis])
+def test_two_measurements_of_one_coordinate_are_weighted_by_their_precision(rule):
+    fused = rule([one(2.0, 4.0), one(7.0, 1.0)])
+    assert fused.means[0, 0] == pytest.approx(2.0 + 4.0 / 5.0 * 5.0)
+    assert fused.covariance[0, 0] == pytest.approx(4.0 / 5.0)
+
+
+def test_the_intersection_of_two_scalars_is_the_better_one():
+    maps = [
+        LandmarkGaussian(np.array([1], np.uint32), np.array([[x, x]]), v * np.eye(2))
+        for x, v in ((2.0, 4.0), (7.0, 1.0))
+    ]
+    for criterion in ("trace", "det"):
+        fused = covariance_intersection(maps, criterion)
+        np.testing.assert_allclose(fused.means, [[7.0, 7.0]], atol=1e-9)
+        np.testing.assert_allclose(fused.covariance, np.eye(2), atol=1e-9)
+
+
+def test_the_intersection_of_crossed_ellipses_meets_in_the_middle():
+    a = LandmarkGaussian(np.array([1], np.uint32), np.array([[1.0, 0.0]]), np.diag([1.0, 4.0]))
+    b = LandmarkGaussian(np.array([1], np.uint32), np.array([[0.0, 1.0]]), np.diag([4.0, 1.0]))
+    fused = covariance_intersection([a, b], "trace")
+    np.testing.assert_allclose(fused.covariance, 1.6 * np.eye(2), atol=1e-6)
+    np.testing.assert_allclose(fused.means, [[0.8, 0.8]], atol=1e-6)
+
+
+def test_kalman_fusion_of_equal_maps_halves_the_covariance():
+    a = random_map([1, 4, 6], 1)
+    fused = kalman([a, a])
+    np.testing.assert_allclose(fused.covariance, 0.5 * a.covariance, atol=1e-12)
+    np.testing.assert_allclose(fused.means, a.means, atol=1e-12)
+
+
+def test_intersection_of_equal_maps_changes_nothing():
+    a = random_map([1, 4, 6], 1)
+    fused = covariance_intersection([a, a])
+    np.testing.assert_allclose(fused.covariance, a.covariance, atol=1e-9)
+    np.testing.assert_allclose(fused.means, a.means, atol=1e-9)
+
+
+def test_kalman_equals_the_sum_of_the_information_of_maps_that_overlap():
+    a, b, c = random_map([1, 2, 5], 2), random_map([2, 3, 5], 3, 0.5), random_map([3, 4], 4)
+    information, vector = np.zeros((10, 10)), np.zeros(10)
+    for each in (a, b, c):
+        place = np.concatenate([2 * (id_ - 1) + np.arange(2) for id_ in each.ids.astype(int)])
+        own = np.linalg.inv(each.covariance)
+        information[np.ix_(place, place)] += own
+        vector[place] += own @ each.means.ravel()
+    fused = kalman([a, b, c])
+    covariance = np.linalg.inv(information)
+    np.testing.assert_array_equal(fused.ids, [1, 2, 3, 4, 5])
+    np.testing.assert_allclose(fused.covariance, covariance, atol=1e-10)
+    np.testing.assert_allclose(fused.means.ravel(), covariance @ vector, atol=1e-10)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32))
+def test_the_intersection_holds_for_inputs_that_share_their_error(seed):
+    """For any joint error with these marginals, the claimed covariance is at least the true one."""
+    rng = np.random.default_rng(seed)
+    n = 4
+    joint = correlated(rng.uniform(0.5, 2.0, 2 * n), rng)
+    shared = rng.normal(size=(2 * n, 2))
+    joint += shared @ shared.T
+    P_a, P_b = joint[:n, :n], joint[n:, n:]
+    ids = np.array([1, 2], np.uint32)
+    x = rng.normal(size=2 * n)
+
+    def fused_mean(errors):
+        return covariance_intersection(
+            [
+                LandmarkGaussian(ids, errors[:n].reshape(-1, 2), P_a),
+                LandmarkGaussian(ids, errors[n:].reshape(-1, 2), P_b),
+            ]
+        )
+
+    claimed = fused_mean(x).covariance
+    weights = np.array([fused_mean(unit).means.ravel() for unit in np.eye(2 * n)]).T
+    true = weights @ joint @ weights.T
+    assert np.linalg.eigvalsh(claimed - true)[0] > -1e-8
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32))
+def test_the_intersection_is_no_better_than_both_inputs_together_allow(seed):
+    a, b = random_map([1, 2], seed), random_map([1, 2], seed + 1)
+    fused = covariance_intersection([a, b])
+    information = np.linalg.inv(fused.covariance)
+    both = np.linalg.inv(a.covariance) + np.linalg.inv(b.covariance)
+    assert np.linalg.eigvalsh(both - information)[0] > -1e-8
+    sizes = [np.linalg.slogdet(each.covariance)[1] for each in (fused, a, b)]
+    assert sizes[0] <= min(sizes[1:]) + 1e-9
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_maps_without_common_landmarks_stand_side_by_side(rule):
+    fused = rule([one(2.0, 4.0, id_=9), one(7.0, 1.0, id_=3)])
+    np.testing.assert_array_equal(fused.ids, [3, 9])
+    np.testing.assert_allclose(fused.means[:, 0], [7.0, 2.0])
+    np.testing.assert_allclose(fused.covariance, np.diag([1.0, 1.0, 4.0, 1.0]))
+
+
+@pytest.mark.parametrize("rule", [kalman, covariance_intersection])
+def test_a_landmark_of_one_map_alone_follows_the_common_ones(rule):
+    spread = np.array([[1.0, 0.8], [0.8, 1.0]])
+    tied = LandmarkGaussian(
+        np.array([1, 2], np.uint32), np.zeros((2, 2)), np.kron(spread, np.eye(2))
+    )
+    sure = LandmarkGaussian(np.array([1], np.uint32), np.array([[1.0, 0.0]]), 1e-6 * np.eye(2))
+    for order in ([tied, sure], [sure, tied]):
+        fused = rule(order)
+        np.testing.assert_allclose(fused.means, [[1.0, 0.0], [0.8, 0.0]], atol=1e-4)
+        assert fused.covariance[2, 2] == pytest.approx(1.0 - 0.64, abs=1e-4)
+
+
+def test_the_per_axis_rule_drops_every_correlation():
+    fused = kalman_per_axis([random_map([1, 2], 5), random_map([2, 3], 6)])
+    np.testing.assert_array_equal(fused.covariance, np.diag(np.diag(fused.covariance)))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_one_map_stays_itself_and_none_is_the_empty_map(rule):
+    a = random_map([1, 2], 7)
+    assert rule([a]) is a
+    assert len(rule([]).ids) == 0
+
+
+def test_a_fused_map_absorbed_and_sent_again_is_counted_again_by_kalman_only():
+    a = random_map([1, 2], 8)
+    counted, intersected = a, a
+    for _ in range(10):
+        counted = kalman([counted, counted])
+        intersected = covariance_intersection([intersected, intersected])
+    np.testing.assert_allclose(counted.covariance, a.covariance / 1024.0, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(intersected.covariance, a.covariance, rtol=1e-6, atol=1e-9)

@@ -1,0 +1,211 @@
+"""Whole maps without feedback: fused once as they are, or left alone."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.studies.rules.map_fusion import kalman
+from team import translate
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.gaussian import LandmarkGaussian
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.codec import encoded
+from tests.support import packed, spd
+from tests.teams import of
+
+END = m.End(
+    stamp_ns=0,
+    streams=(
+        m.StreamEnd(robot="r1", incarnation=1, measurements=9),
+        m.StreamEnd(robot="r2", incarnation=1, measurements=9),
+    ),
+)
+ALIVE = [m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True) for name in ("r1", "r2")]
+
+
+def start(robot, *, known=True):
+    return m.InitialPose(
+        stamp_ns=0,
+        robot=robot,
+        incarnation=1,
+        number=0,
+        pose=from_floats(np.zeros(3)) if known else b"",
+        covariance=b"",
+    )
+
+
+def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
+    n = 2 * len(ids)
+    content = packed(spd(n)) if joint else from_floats([2.0, 0.5, 1.0] * len(ids))
+    means = from_floats(at + np.arange(n))
+    stamp_ns = sequence * 10**9
+    return m.MapEstimate(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        incarnation=1,
+        sequence=sequence,
+        exchange=0,
+        joint=joint,
+        ids=from_ids(ids),
+        means=means,
+        covariance=content,
+    )
+
+
+def done(robot, last_map):
+    return m.Done(
+        stamp_ns=9,
+        robot=robot,
+        incarnation=1,
+        measurements=9,
+        steps=3,
+        submaps=0,
+        ledger=(),
+        last_map=last_map,
+    )
+
+
+def value(message):
+    return LandmarkGaussian(
+        *translate.landmarks_of(message), translate.landmark_covariance_of(message)
+    )
+
+
+def heard(rule, messages, robots=("r1", "r2"), **options):
+    node, out = CentralNode(CentralConfig(fusion=rule, **options), robots), []
+    for message in messages:
+        out += node.handle(message, 0)
+    return node, out
+
+
+LAST = [estimate("r1", 4, at=1.0), estimate("r2", 6, (2, 3), at=5.0)]
+TEAM = [
+    *(start(x) for x in ("r1", "r2")),
+    *ALIVE,
+    estimate("r1", 2),
+    estimate("r2", 3, (3,)),
+    *LAST,
+    done("r1", 4),
+    done("r2", 6),
+    END,
+]
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.permutations(range(len(TEAM))))
+def test_the_final_map_is_kalmans_of_the_last_maps_in_whatever_order_they_come(order):
+    node, _ = heard("latest", [TEAM[i] for i in order])
+    expected = kalman([value(x) for x in LAST])
+    np.testing.assert_array_equal(translate.landmarks_of(node.final)[0], expected.ids)
+    np.testing.assert_array_equal(translate.landmarks_of(node.final)[1], expected.means)
+    covariance = translate.landmark_covariance_of(node.final)
+    np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12)
+    assert node.final.members == (
+        m.VersionEntry(robot="r1", incarnation=1, sequence=4),
+        m.VersionEntry(robot="r2", incarnation=1, sequence=6),
+    )
+    assert encoded(node.final) == encoded(heard("latest", TEAM)[0].final)
+
+
+@pytest.mark.parametrize("rule", ["latest", "alone"])
+def test_the_last_map_that_a_robot_speaks_of_is_waited_for(rule):
+    node, _ = heard(rule, [x for x in TEAM if x not in LAST])
+    assert not node.finished
+    for message in LAST:
+        node.handle(message, 0)
+    assert node.finished
+
+
+@pytest.mark.parametrize("rule", ["latest", "alone"])
+def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
+    messages = [x for x in TEAM if x != LAST[1] and x != done("r2", 6)]
+    node, _ = heard(rule, messages)
+    assert not node.finished
+    node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False), 0)
+    assert not node.finished
+    node.handle(
+        m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="it fell into the water"), 0
+    )
+    assert (node.final.lost, node.final.provisional) == (("r2",), True)
+    assert node.final.members[1] == m.VersionEntry(robot="r2", incarnation=1, sequence=3)
+
+
+def test_a_map_in_a_frame_of_its_own_is_left_out_and_named():
+    free = [start("r2", known=False) if x == start("r2") else x for x in TEAM]
+    node, _ = heard("latest", free)
+    assert node.final.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
+    assert node.final.means == LAST[0].means
+    assert node.final.reasons == ("r2: its start pose is not known",)
+
+
+def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
+    maps = [estimate("r1", k) for k in range(1, 8)]
+    again = [
+        maps[-1],
+        m.Progress(
+            stamp_ns=60 * 10**9,
+            node="robot/r1",
+            robot="r1",
+            incarnation=1,
+            measurements=5,
+            submaps=0,
+        ),
+    ]
+    _, out = heard("latest", [start("r1"), *maps, *again], broadcast_s=3.0)
+    said = [x.stamp_ns // 10**9 for x in of(out, ch.FUSED_MAP)]
+    assert said == [1, 4, 7]
+    assert not any(x.final for x in of(out, ch.FUSED_MAP))
+
+
+@pytest.mark.parametrize("joint", [True, False])
+def test_alone_the_map_of_one_robot_is_the_final_one(joint):
+    last = estimate("r1", 5, at=2.0, joint=joint)
+    end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=9),))
+    messages = [start("r1"), estimate("r1", 4), last, done("r1", 5), end]
+    node, _ = heard("alone", messages, robots=["r1"])
+    assert (node.final.means, node.final.covariance) == (last.means, last.covariance)
+    assert (node.final.joint, node.final.reasons) == (joint, ())
+
+
+def test_alone_several_robots_have_no_common_map_and_it_says_so():
+    node, out = heard("alone", TEAM)
+    assert node.final.ids == b""
+    assert node.final.reasons == ("no fusion: each robot has its own map",)
+    assert [x.robot for x in node.final.members] == ["r1", "r2"]
+    assert not of(out, ch.FUSED_MAP)
+
+
+def test_alone_robots_without_maps_end_with_an_empty_one():
+    node, _ = heard("alone", [*ALIVE, done("r1", -1), done("r2", -1), END])
+    assert node.final.reasons == ("no fusion, and this estimator makes no map",)
+
+
+def drawn_maps(seed):
+    """Two robots' independent maps of overlapping landmarks, their errors drawn from them."""
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(-9.0, 9.0, (5, 2))
+    maps = []
+    for seen in ([0, 1, 2, 3], [1, 2, 3, 4]):
+        A = 0.1 * (np.eye(8) + 0.5 * rng.standard_normal((8, 8)))
+        means = truth[seen] + (A @ rng.standard_normal(8)).reshape(-1, 2)
+        maps.append(LandmarkGaussian(np.array(seen, np.uint32), means, A @ A.T))
+    return truth, maps
+
+
+def test_maps_that_are_fused_once_are_consistent_and_one_that_is_fused_again_is_not():
+    once, again, dof = 0.0, 0.0, 0
+    for seed in range(200):
+        truth, maps = drawn_maps(seed)
+        fused = kalman(maps)
+        twice = kalman([fused, maps[0]])  # the mutant: what a robot that absorbed it sends again
+        once += nees((fused.means - truth).ravel(), fused.covariance)
+        again += nees((twice.means - truth).ravel(), twice.covariance)
+        dof += truth.size
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert low < once / dof < high
+    assert not low < again / dof < high

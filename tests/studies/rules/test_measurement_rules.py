@@ -1,0 +1,205 @@
+"""Rules on raw measurements: a function of the streams alone, whatever comes when."""
+
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from central.config import CentralConfig
+from central.node import CentralNode
+from sim.studies.estimators import joint_fastslam
+from sim.studies.estimators.robot_step import RobotStep
+from sim.studies.rules.joint_fastslam_rule import RESAMPLE_BELOW
+from team import translate
+from team.estimation.models import increment_of
+from team.estimation.randomness import generator
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded
+from team.wire.digest import configured
+from tests.teams import config, of, published, stream
+
+PARTICLES = 20
+RULES = ["joint-fastslam", "batch"]
+STREAMS = {"r1": stream("r1", 9), "r2": stream("r2", 7, y=1.0)}
+CONFIGS = {name: config(name) for name in STREAMS}
+MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
+LAST_WORDS = [
+    m.Done(
+        stamp_ns=0, robot=name, incarnation=1, measurements=len(each), steps=0, submaps=0, ledger=()
+    )
+    for name, each in MEASUREMENTS.items()
+]
+
+
+def announced(name):
+    return configured(ch.robot_node(name), 0, 0, CONFIGS[name])
+
+
+def end(measurements=MEASUREMENTS):
+    return m.End(
+        stamp_ns=0,
+        streams=tuple(
+            m.StreamEnd(robot=n, incarnation=r[-1].incarnation, measurements=len(r))
+            for n, r in measurements.items()
+        ),
+    )
+
+
+def heard(fusion, messages, robots=("r1", "r2")):
+    node = CentralNode(CentralConfig(fusion=fusion, particles=PARTICLES, broadcast_s=4.0), robots)
+    out: list[Outgoing] = []
+    for message in messages:
+        out += node.handle(message, 0)
+    return node, out
+
+
+def everything(measurements=MEASUREMENTS):
+    every = [x for name in measurements for x in (announced(name), *measurements[name])]
+    return [*every, *LAST_WORDS, end(measurements)]
+
+
+def said(out):
+    return [(o.key, encoded(o.message)) for o in out]
+
+
+@cache
+def expected(fusion):
+    return said(heard(fusion, everything())[1])
+
+
+@pytest.mark.parametrize("fusion", RULES)
+@settings(deadline=None, max_examples=15)
+@given(st.permutations(range(len(everything()))), st.lists(st.integers(0, 20), max_size=5))
+def test_any_order_of_arrival_and_duplicates_give_the_same_messages(fusion, order, again):
+    messages = everything()
+    _, out = heard(fusion, [messages[i] for i in [*order[:-1], *again, order[-1]]])
+    assert sorted(said(out)) == sorted(expected(fusion))
+    assert [x for x in said(out) if "robot" not in x[0]][-1] == expected(fusion)[-1]
+
+
+def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_keyframes():
+    state = joint_fastslam.initial_state(
+        {name: np.array([0.0, y, 0.0]) for name, y in (("r1", 0.0), ("r2", 1.0))},
+        PARTICLES,
+        "fastslam1",
+        RESAMPLE_BELOW,
+    )
+    drawn = generator(1, "team", 0, 0)
+    poses = {name: [] for name in STREAMS}
+    for k in range(9):
+        turns = []
+        for name, each in STREAMS.items():
+            told = each.intervals
+            if k >= len(told.end_ns):
+                continue
+            rows = each.landmark_detections.rows(k)
+            seen = (each.landmark_detections.ids, each.landmark_detections.ranges)
+            step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
+            increment = increment_of(CONFIGS[name].motion, *map(float, step))
+            looks = (*(x[rows] for x in seen), each.landmark_detections.bearings[rows])
+            turns.append(RobotStep(name, increment, CONFIGS[name].sensor, *looks))
+        state = joint_fastslam.filter_step(state, turns, drawn)
+        for turn in turns:
+            poses[turn.robot].append(joint_fastslam.pose_gaussian(state, turn.robot).mean)
+    node, out = heard("joint-fastslam", everything())
+    ids, means = translate.landmarks_of(node.final)
+    expected = joint_fastslam.landmark_gaussian(state)
+    np.testing.assert_array_equal(ids, expected.ids)
+    np.testing.assert_array_equal(means, expected.means)
+    covariance = translate.landmark_covariance_of(node.final)
+    np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12)
+    for name in STREAMS:
+        mine = [floats(o.message.pose, "pose") for o in out if o.key == ch.CENTRAL_POSE.key(name)]
+        np.testing.assert_array_equal(mine, poses[name])
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_maps_name_the_last_measurement_of_each_robot_in_them(fusion):
+    node, out = heard(fusion, everything())
+    assert len(of(out, ch.FUSED_MAP)) == 2
+    assert [x.sequence for x in node.final.members] == [len(r) - 1 for r in MEASUREMENTS.values()]
+    digests = {x.digest for x in (*of(out, ch.FUSED_MAP), node.final)}
+    assert len(digests) == 3
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
+    messages = everything()
+    for last in (
+        announced("r2"),
+        MEASUREMENTS["r2"][0],
+        MEASUREMENTS["r1"][5],
+        LAST_WORDS[0],
+        end(),
+    ):
+        node, out = heard(fusion, (x for x in messages if x != last))
+        assert not node.finished
+        out += node.handle(last, 0)
+        assert node.finished
+        assert sorted(said(out)) == sorted(expected(fusion))
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_missing_measurements_are_asked_for(fusion):
+    node, _ = heard(fusion, (x for x in everything() if x not in MEASUREMENTS["r1"][4:6]))
+    assert node.requests() == [
+        m.MeasurementsRequest(
+            stamp_ns=node.status().stamp_ns, robot="r1", incarnation=1, first=4, last=5
+        )
+    ]
+    for measurement in MEASUREMENTS["r1"][4:6]:
+        node.handle(measurement, 0)
+    assert node.finished
+    assert node.requests() == []
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
+    free = {"r1": MEASUREMENTS["r1"], "r2": published(stream("r2", 7, y=1.0, known=False))}
+    node, out = heard(fusion, everything(free))
+    assert node.final.reasons == ("r2: its start pose is not known",)
+    assert [x.robot for x in node.final.members] == ["r1"]
+    assert not [o for o in out if o.key == ch.CENTRAL_POSE.key("r2")]
+    both = {name: published(stream(name, 7, known=False)) for name in STREAMS}
+    node, _ = heard(fusion, everything(both))
+    assert node.final.frame == "r1/1"
+    assert node.final.reasons == ("r2: its start pose is not known",)
+
+
+@pytest.mark.parametrize("fusion", RULES)
+def test_a_stream_that_begins_anew_ends_there(fusion):
+    later = [msgspec.structs.replace(x, incarnation=2) for x in MEASUREMENTS["r2"]]
+    later[0] = m.InitialPose(
+        stamp_ns=later[0].stamp_ns, robot="r2", incarnation=2, number=0, pose=b"", covariance=b""
+    )
+    whole = {"r1": MEASUREMENTS["r1"], "r2": [*MEASUREMENTS["r2"][:8], *later]}
+    ends = m.End(
+        stamp_ns=0,
+        streams=(
+            m.StreamEnd(robot="r1", incarnation=1, measurements=len(MEASUREMENTS["r1"])),
+            m.StreamEnd(robot="r2", incarnation=2, measurements=len(later)),
+        ),
+    )
+    messages = [x for x in everything(whole) if not isinstance(x, m.End | m.Done)]
+    dones = [
+        LAST_WORDS[0],
+        m.Done(
+            stamp_ns=0,
+            robot="r2",
+            incarnation=2,
+            measurements=len(later),
+            steps=0,
+            submaps=0,
+            ledger=(),
+        ),
+    ]
+    node, _ = heard(fusion, [*messages, *dones, ends])
+    assert node.finished
+    assert node.final.reasons == ("r2: its stream began anew",)
+    assert node.final.members[1].sequence < 8

@@ -1,0 +1,170 @@
+"""The batch MAP: its factors mean what they say, its optimum is one, its covariance is right."""
+
+import sys
+from dataclasses import replace
+
+import gtsam
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from central.desk.evaluation.errors import Path
+from sim.scenarios.scenario import Scenario
+from sim.studies.batch_reference.graph import factor_graph, values_of
+from sim.studies.batch_reference.measurements import (
+    BatchReferenceError,
+    Chain,
+    Scan,
+    anchored,
+    chains_of,
+)
+from sim.studies.batch_reference.reference import BatchReference, batch_map
+from sim.studies.estimators.batch import FLOOR_SIGMAS
+from team.config import MotionModel, MotionNoise, RobotConfig
+from team.estimation.geometry import between, compose, exponential, tangent
+from team.estimation.models import increment_of
+from team.wire import channels as ch
+from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
+
+small = st.floats(-0.3, 0.3)
+
+
+def chain_of_one(motion: MotionModel) -> Chain:
+    increment = increment_of(motion, 1.0, 1.0, 0.4)
+    nothing = Scan(np.empty(0, np.uint32), np.empty(0), np.empty(0))
+    return Chain(
+        config=RobotConfig("r1", motion),
+        incarnation=1,
+        start=np.zeros(3),
+        start_covariance=None,
+        stamps_ns=np.array([0, 10**9]),
+        increments=(increment,),
+        scans=(nothing,),
+    )
+
+
+@settings(deadline=None, max_examples=30)
+@given(forward=small, left=st.floats(-0.01, 0.01), turn=small)
+def test_the_odometry_factor_is_the_increments_gaussian(
+    forward: float, left: float, turn: float
+) -> None:
+    noise = MotionNoise(per_s=0.1)
+    chain = chain_of_one(MotionModel("velocity", forward=noise, turn=noise, lateral=noise))
+    increment = chain.increments[0]
+    xi = np.array([forward, left, turn])
+    poses = np.array([[1.0, 2.0, 0.5], compose(np.array([1.0, 2.0, 0.5]), increment.mean)])
+    poses[1] = compose(poses[1], exponential(xi))
+    graph = factor_graph(gtsam, [replace(chain, start=poses[0])], [poses], {}, None)
+    values = values_of(gtsam, [poses], {})
+    P = increment.covariance + np.diag(FLOOR_SIGMAS) ** 2
+    assert 2.0 * graph.error(values) == pytest.approx(xi @ np.linalg.solve(P, xi), rel=1e-6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(heading=st.floats(-3.0, 3.0))
+def test_the_tangent_of_a_pose_is_the_derivative_of_a_perturbation(heading: float) -> None:
+    pose, step = np.array([1.0, -2.0, heading]), 1e-6
+    columns = [
+        (compose(pose, exponential(step * e)) - compose(pose, exponential(-step * e))) / (2 * step)
+        for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(tangent(heading), np.array(columns).T, atol=1e-8)
+
+
+def test_a_chain_has_the_measurements_in_order_each_once() -> None:
+    log, of = world_log(scenario()), scenario()
+    chain = chains_of([*reversed(log), *log], of)[0]
+    stream = streams(of).streams[0]
+    seen = stream.landmark_detections
+    assert np.array_equal(chain.stamps_ns[1:], seen.stamps_ns)
+    assert np.array_equal(np.concatenate([s.ranges for s in chain.scans]), seen.ranges)
+    assert len(chain.increments) == len(chain.scans) == 20
+
+
+def test_every_filling_holds_the_anchors() -> None:
+    of = scenario()
+    chain = chains_of(world_log(of), of)[0]
+    stream = streams(of).streams[0]
+    assert stream.truth is not None
+    anchors = Path(chain.stamps_ns[::5], stream.truth[::5])
+    fillings = anchored(chain, anchors)
+    for poses in fillings:
+        for pose, anchor in zip(poses[::5], stream.truth[::5], strict=True):
+            np.testing.assert_allclose(between(anchor, pose), 0.0, atol=1e-9)
+    onward, back, _ = fillings
+    odometry = chain.dead_reckoned
+    for i in range(20):
+        moved = between(odometry[i], odometry[i + 1])
+        if i % 5 != 4:
+            np.testing.assert_allclose(between(onward[i], onward[i + 1]), moved, atol=1e-9)
+        if i % 5 != 0:
+            np.testing.assert_allclose(between(back[i], back[i + 1]), moved, atol=1e-9)
+
+
+def test_the_optimum_does_not_depend_on_how_far_off_the_start_is() -> None:
+    near, far = batch_map(joined_log(scenario(), 0.0)), batch_map(joined_log(scenario(), 0.5))
+    assert far.cost <= far.initial_cost
+    assert far.cost == pytest.approx(near.cost, rel=1e-6)
+    np.testing.assert_allclose(far.means, near.means, atol=1e-5)
+
+
+def test_the_limit_of_a_log_is_the_same_every_time() -> None:
+    log = joined_log(scenario(robots=2), 0.1)
+    first, second = batch_map(log), batch_map(log)
+    assert first.means.tobytes() == second.means.tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def nees_of(of: Scenario, *, twice: bool) -> BatchReference:
+    world = msgspec.structs.replace(of.world, steps=8)
+    log = joined_log(msgspec.structs.replace(of, world=world), 0.02)
+    return batch_map(counted_twice(log) if twice else log)
+
+
+@pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
+def test_the_map_is_consistent_and_a_measurement_used_twice_is_found(twice: bool) -> None:
+    """The mutant is found among a quarter of the runs."""
+    seeds = range(100, 150 if twice else 300)
+    runs = [nees_of(scenario(seed), twice=twice) for seed in seeds]
+    errors = [run.errors for run in runs if run.errors is not None]
+    dof = sum(2 * e.count for e in errors)
+    total = sum(e.nees_per_dof * 2 * e.count for e in errors)
+    inside = chi2.ppf(0.0005, dof) <= total <= chi2.ppf(0.9995, dof)
+    assert inside == (not twice), f"NEES/dof {total / dof:.3f} over {dof}"
+
+
+def test_a_robot_that_the_join_left_out_is_named() -> None:
+    of = scenario(robots=2)
+    log = [s for s in joined_log(of, 0.1) if s.key != ch.TRAJECTORY.key("r2")]
+    limit = batch_map(log)
+    assert list(limit.paths) == ["r1"]
+    assert limit.left_out == ("r2: it is not in the joined map",)
+
+
+def test_an_unknown_start_is_found_where_the_map_lies() -> None:
+    of = scenario(robots=2)
+    lost = msgspec.structs.replace(
+        of, world=msgspec.structs.replace(of.world, unknown_starts=("r2",))
+    )
+    limit = batch_map(joined_log(lost, 0.02))
+    assert limit.position_rmse_m["r2"] < 0.3
+
+
+def test_a_log_without_trajectories_says_what_to_run() -> None:
+    log = [s for s in joined_log(scenario(), 0.1) if s.key != ch.TRAJECTORY.key("r1")]
+    with pytest.raises(BatchReferenceError, match="--fusion join"):
+        batch_map(log)
+
+
+def test_a_run_that_did_not_end_has_no_limit() -> None:
+    with pytest.raises(BatchReferenceError, match="record a run to its end"):
+        batch_map(world_log(scenario()))
+
+
+def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(BatchReferenceError, match=r"pip install '?gtsam"):
+        batch_map([])

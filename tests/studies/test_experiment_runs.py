@@ -1,0 +1,231 @@
+"""Runs of experiments: in processes of their own, kept as they come, none lost by another's end."""
+
+import json
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+from joblib.externals.loky.process_executor import _ExecutorManagerThread
+
+from sim.datasets.tables import DatasetError
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.studies.experiments import xu_localisation
+from sim.studies.experiments.cases import FOLDER, Cases, Done, SchedulerError
+from sim.studies.experiments.catalogue import ENTRIES, Entry
+from sim.studies.experiments.experiment import Options, Outcome, Results
+from sim.studies.experiments.output import write
+from sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
+from sim.studies.experiments.task import ROOTS, Task
+from sim.studies.experiments.team_runs import team_run, team_task
+from sim.world.config import SimulatedWorld
+from team.sources import sources_of
+
+WORK = "json:loads"
+"""A function that a process imports at once."""
+
+
+def counted(rmse: float) -> Task:
+    return Task(WORK, {"s": json.dumps({"rmse": rmse})}, f"run {rmse}")
+
+
+def process_result_item_texts() -> list[str]:
+    """Texts in the function of the pool's thread that starts workers anew."""
+    code = _ExecutorManagerThread.process_result_item.__code__
+    return [each for each in code.co_consts if isinstance(each, str)]
+
+
+def short(steps: int) -> Scenario:
+    scenario = load("thesis")
+    assert isinstance(scenario.world, SimulatedWorld)
+    world = msgspec.structs.replace(scenario.world, steps=steps)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+@pytest.mark.parametrize("estimator", ["localisation", "ekf-slam"])
+def test_a_team_that_fuses_nothing_has_the_figures_of_its_robots(estimator: str) -> None:
+    scenario = with_options(short(20), estimator=estimator, fusion="alone")
+    figures = team_run(msgspec.to_builtins(scenario), batch=False)
+    assert figures["final_map_sha256"] is not None, "it came to its end"
+    assert figures["each_once"]
+    assert 0.1 < figures["online_pose_nees"] < 5.0
+    unmapped = estimator == "localisation"
+    assert [figures[name] is None for name in ("rmse", "nees", "in_band")] == [unmapped] * 3
+
+
+class Mean:
+    """An experiment of three runs."""
+
+    def __init__(self, *tasks: Task) -> None:
+        self._tasks = list(tasks)
+
+    def tasks(self, _: Options) -> list[Task]:
+        return self._tasks
+
+    def outcome(self, _: Options, results: Results) -> Outcome:
+        return Outcome("means", {"means": [r["rmse"] for r in results.of_all(self._tasks)]})
+
+
+def plan(*tasks: Task) -> Plan:
+    entry = Entry("means", "", "Means.")
+    return Plan(entry, Options((1,)), Mean(*tasks), tasks)
+
+
+@contextmanager
+def silent(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]:
+    yield lambda _: None
+
+
+def test_a_run_in_a_worker_gives_the_bits_of_a_run_here(tmp_path: Path) -> None:
+    task = team_task(short(24))
+    (done,) = Cases(tmp_path).run([task], 1)
+    here = team_run(**task.parameters)
+    assert done.result is not None
+    assert done.result["final_map_sha256"] == here["final_map_sha256"]
+    assert done.result["rmse"] == here["rmse"]
+
+
+def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path: Path) -> None:
+    wrong = Task(WORK, {"no_such": 1}, "wrong")
+    dead = Task("os:_exit", {"status": 3}, "dead")
+    good = [counted(1.0), counted(5.0)]
+    (concluded,) = computed([plan(wrong, dead, *good)], tmp_path, 1, silent)
+    assert concluded.outcome.figures["means"] == [1.0, 5.0]
+    assert "TypeError" in concluded.failed["wrong"]
+    assert concluded.failed["dead"].startswith("its process died: ")
+    assert "EXIT(3)" in concluded.failed["dead"]
+    assert "Traceback" in (tmp_path / FAILURES).read_text()
+
+
+def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path: Path) -> None:
+    computed([plan(counted(1.0), Task("os:_exit", {"status": 3}, "dead"))], tmp_path, 1, silent)
+    asked: list[Task] = []
+
+    @contextmanager
+    def watched(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]:
+        asked.extend(tasks)
+        assert kept == 1
+        yield lambda _: None
+
+    again = plan(counted(1.0), counted(2.0), Task("os:_exit", {"status": 3}, "dead"))
+    (concluded,) = computed([again], tmp_path, 2, watched)
+    assert {task.label for task in asked} == {"run 2.0", "dead"}
+    assert concluded.outcome.figures["means"] == [1.0, 2.0]
+
+
+def test_a_result_of_another_program_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (done,) = Cases(tmp_path).run([counted(1.0)], 1)
+    assert done.result == {"rmse": 1.0}
+    assert Cases(tmp_path).found(counted(1.0)) == {"rmse": 1.0}
+    assert Cases(tmp_path).found(counted(2.0)) is None
+    monkeypatch.setattr("sim.studies.experiments.task.program_of", lambda _: "0" * 16)
+    assert Cases(tmp_path).found(counted(1.0)) is None
+
+
+def test_a_result_that_was_cut_off_is_computed_again(tmp_path: Path) -> None:
+    list(Cases(tmp_path).run([counted(1.0), counted(2.0)], 1))
+    for kept in (tmp_path / FOLDER).rglob("output.pkl"):
+        kept.write_bytes(kept.read_bytes()[:-9])
+    (concluded,) = computed([plan(counted(1.0), counted(2.0))], tmp_path, 1, silent)
+    assert concluded.outcome.figures["means"] == [1.0, 2.0]
+
+
+def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> None:
+    assert counted(1.0).name == counted(1.0).name
+    assert counted(1.0).name != counted(2.0).name
+    there, here = (Task(WORK, {"a": 1}, "", local={"path": path}) for path in ("/there", "/here"))
+    assert there.name == here.name
+
+
+def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
+    sources = sources_of("sim.studies.experiments.team_runs", ROOTS)
+    wanted = {
+        "team.estimation.hybrid_slam.fastslam_kernel",
+        "central.join_rule",
+        "sim.studies.rules.svd_rule",  # found by the name that a table gives
+        "sim.studies.batch_reference.graph",
+        "sim",
+    }
+    assert wanted <= sources.keys()
+    assert "sim.studies.experiments.output" not in sources
+    assert not {name for name in sources if name.partition(".")[0] == "numpy"}
+
+
+def test_leaving_early_ends_the_long_run_too(tmp_path: Path) -> None:
+    begun = time.monotonic()
+    slow = Task("subprocess:run", {"args": ["sleep", "300"]}, "slow")
+    runs = Cases(tmp_path).run([counted(1.0), slow], 2)
+    assert next(runs).task == counted(1.0)
+    runs.close()  # type: ignore[attr-defined] # a generator
+    assert time.monotonic() - begun < 200.0
+
+
+def test_leaving_while_a_case_is_handed_over_leaves_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = _ExecutorManagerThread.is_shutting_down
+
+    def later(self: _ExecutorManagerThread) -> bool:
+        time.sleep(0.3)  # until the main thread has left, with the next case in the pool's queue
+        return bool(asked(self))
+
+    monkeypatch.setattr(_ExecutorManagerThread, "is_shutting_down", later)
+    runs = Cases(tmp_path).run([counted(float(each)) for each in range(6)], 2)
+    next(runs)
+    runs.close()  # type: ignore[attr-defined] # a generator
+
+
+def test_that_an_idle_worker_ends_as_it_gets_a_case_is_no_error(tmp_path: Path) -> None:
+    runs = Cases(tmp_path).run([counted(1.0), counted(2.0)], 2)
+    next(runs)
+    (said,) = (
+        each
+        for each in process_result_item_texts()
+        if each.startswith("A worker stopped while some jobs")
+    )
+    warnings.warn(said, UserWarning, stacklevel=1)  # an error here, as in the pool's thread
+    assert len(list(runs)) == 1
+
+
+def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SchedulerError, match="--scheduler"):
+        list(Cases(tmp_path).run([counted(1.0)], 1, "tcp://127.0.0.1:1"))
+
+
+def test_a_data_set_is_known_by_its_content(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "Barcodes.dat").write_text("1 5\n")
+    a, b = dataset(tmp_path / "a"), dataset(tmp_path / "b")
+    assert (a.name, b.name) == ("a", "b")
+    assert a.sha256 == b.sha256
+    (tmp_path / "b" / "Barcodes.dat").write_text("1 6\n")
+    assert dataset(tmp_path / "b").sha256 != a.sha256
+    with pytest.raises(DatasetError, match="no such file"):
+        dataset(tmp_path / "c")
+
+
+def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(
+    tmp_path: Path,
+) -> None:
+    entry = next(each for each in ENTRIES if each.name == "xu-3.5")
+    options = Options((1, 2), quick=True)
+    tasks = tuple(xu_localisation.tasks(options)[:3])
+    experiment = planned(entry, options).experiment
+    whole = Plan(entry, options, experiment, tasks)
+    begun = Plan(entry, options, experiment, tasks[:1])
+    computed([begun], tmp_path / "resumed", 1, silent)
+    (resumed,) = computed([whole], tmp_path / "resumed", 2, silent)
+    (at_once,) = computed([whole], tmp_path / "at once", 1, silent)
+    pages = []
+    for name, concluded in (("resumed", resumed), ("at once", at_once)):
+        folder = tmp_path / name
+        pages.append(write([concluded], folder, "index", {}).read_bytes())
+        assert (folder / "xu-3.5.json").exists()
+    assert pages[0] == pages[1]
+    assert sum(count for _, count, _ in resumed.kinds) == len(tasks)

@@ -1,0 +1,146 @@
+"""A map is asked by its cost whether it lies in the truth's minimum."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from central.desk.evaluation.errors import Path
+from central.desk.evaluation.evaluation import evaluate
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.source import streams_of
+from sim.studies.experiments.plain_cost import PlainCost
+from sim.studies.experiments.true_minimum import final_fold, judged, true_minimum
+from team.estimation.map_joining.gauss_newton import Island, JoinSettings
+from team.estimation.map_joining.minima import minimum, searched
+from tests.estimation.sighting_world import joined_with, meeting, mirrored
+from tests.estimation.submap_world import Team, team
+from tests.studies.test_experiment_runs import short
+
+OPTIONS = JoinSettings()
+
+
+def world(
+    seed: int, submaps: int = 8, **more: Any
+) -> tuple[Team, Island, dict[int, np.ndarray], dict[str, Path]]:
+    made = team(seed, submaps=submaps, **more)
+    island = minimum(joined_with(made.submaps, made.starts, (), OPTIONS, 1000).main).island
+    stamps = 1000 * np.arange(1, submaps + 1)
+    paths = {robot: Path(stamps, poses) for robot, poses in made.paths.items()}
+    return made, island, dict(enumerate(made.landmarks)), paths
+
+
+def test_a_map_of_sound_submaps_is_in_the_minimum_of_the_truth() -> None:
+    rises = []
+    for seed in range(8):
+        _, island, landmarks, paths = world(seed)
+        found = judged(island, landmarks, paths)
+        assert not found.wrong
+        assert not found.excluded
+        assert found.dof == 2 * len(island.graph.landmarks) + 6
+        rises.append(found.rise / found.dof)
+    assert 0.6 < np.mean(rises) < 1.5, "the likelihood ratio is χ² of what is held"
+
+
+def test_a_map_that_is_folded_wrongly_is_another_minimum() -> None:
+    wrong = 0
+    sparse = {"size": 60.0, "reach": 15.0, "sigmas": (0.3, 0.15, 1.0)}
+    for seed in range(8):
+        _, solved, landmarks, paths = world(seed, submaps=20, robots=1, landmarks=3, **sparse)
+        island = searched([solved]).best.island
+        free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
+        anywhere = np.random.default_rng(seed).uniform(-30.0, 30.0, len(free))
+        lost = minimum(replace(island, state=np.where(free, anywhere, island.state)))
+        found = judged(lost.island, landmarks, paths)
+        assert found.wrong == (lost.cost > minimum(island).cost + 1.0)
+        wrong += found.wrong
+    assert wrong >= 2, "the state anywhere is often lost"
+
+
+@pytest.mark.parametrize(("bearing_sigma", "lower"), [(30.0, False), (0.02, True)])
+def test_the_other_one_of_two_places_is_wrong(bearing_sigma: float, lower: bool) -> None:
+    """Where both are as likely, and where the measurements exclude it."""
+    island, across = mirrored(bearing_sigma, OPTIONS)
+    stamps = np.array([1000, 2000, 3000, 4000, 5000])
+    poses = {
+        robot: np.array([[x + k * np.cos(a), y + k * np.sin(a), a] for k in range(1, 6)])
+        for robot, (x, y, a) in {"r0": (0.0, 0.0, 0.0), "r1": (0.0, 3.0, 0.2)}.items()
+    }
+    paths = {robot: Path(stamps, way) for robot, way in poses.items()}
+    assert not judged(minimum(island).island, {}, paths).wrong
+    found = judged(minimum(across).island, {}, paths)
+    assert found.other_minimum
+    assert (found.lower > 1.0) == lower
+
+
+def test_submaps_that_deny_the_truth_are_found() -> None:
+    _, island, landmarks, paths = world(3)
+    moved = {id_: place + np.array([2.0, 0.0]) * (id_ == 1) for id_, place in landmarks.items()}
+    found = judged(island, moved, paths)
+    assert found.excluded
+    assert not found.wrong
+
+
+def test_a_run_is_asked_for_its_own_final_map() -> None:
+    scenario = short(120)
+    samples = list(run_team(scenario, streams_of(scenario)))
+    fold = final_fold(samples)
+    assert fold.main.cost == pytest.approx(final_map(samples).chi2, rel=1e-6)
+    found = true_minimum(samples, evaluate(samples))
+    assert found is not None
+    assert not found.wrong
+    assert not found.excluded
+
+
+def test_the_judge_owes_nothing_to_what_it_judges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that finds nothing, a solver that goes nowhere, a cost that is always low."""
+    _, island, landmarks, paths = world(1)
+    _, wrong, _, _ = world(1)
+    sound = judged(island, landmarks, paths)
+    turned = wrong.state.copy()
+    first = wrong.graph.offset[wrong.graph.streams["r1", 0][1]]
+    turned[first + 2] += 0.2
+    wrong = replace(wrong, state=turned)
+    for place in ("gauss_newton.settled", "minima.settled"):
+        monkeypatch.setattr(f"team.estimation.map_joining.{place}", lambda island: (island, 1, 0.0))
+    for place in ("gauss_newton.final_cost", "minima.final_cost"):
+        monkeypatch.setattr(f"team.estimation.map_joining.{place}", lambda island: 0.0)
+    monkeypatch.setattr(
+        "team.estimation.map_joining.minima.is_another_minimum", lambda one, best: False
+    )
+    assert judged(island, landmarks, paths) == sound
+    assert judged(wrong, landmarks, paths).wrong
+
+
+def test_a_map_that_is_not_at_rest_is_wrong() -> None:
+    """As it is, not as the team's solver would mend it before it is judged."""
+    _, island, landmarks, paths = world(2)
+    off = island.state.copy()
+    at = island.graph.offset[next(iter(island.graph.landmarks.values()))]
+    step = 1e-4
+    while replace(island, state=off).cost < island.cost + 3.0:
+        off[at] += step
+    found = judged(replace(island, state=off), landmarks, paths)
+    assert found.wrong
+    assert found.lower == pytest.approx(3.0, abs=0.1)
+
+
+def test_the_judge_s_cost_is_the_map_joining_s() -> None:
+    """Two programs, one cost: with inter-robot measurements, pose nodes, an uncertain start."""
+    met = meeting(3)
+    starts = [replace(each, covariance=np.diag([0.04, 0.04, 0.01])) for each in met.starts]
+    island = joined_with(met.submaps, starts, met.sightings, OPTIONS).main
+    rng = np.random.default_rng(0)
+    fixed = np.zeros(len(island.state), dtype=np.bool_)
+    cost = PlainCost(island.graph, 1.0, fixed)
+    assert len(island.graph.sightings) > 4
+    for _ in range(3):
+        state = island.state + 0.3 * rng.normal(size=len(island.state))
+        assert cost.of(state) == pytest.approx(replace(island, state=state).cost, rel=1e-9)
+        J, h = cost.jacobian(state), 1e-6
+        gradient = 2.0 * J.T @ cost.residuals(state)
+        for k in rng.choice(len(state), 5, replace=False):
+            moved = h * np.eye(len(state))[k]
+            slope = (cost.of(state + moved) - cost.of(state - moved)) / (2.0 * h)
+            assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)
