@@ -300,7 +300,12 @@ def _keep_earlier(log: Path) -> None:
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
-        set_aside(log)
+        from team.recording.part_files import part_of, parts_of
+
+        parts = parts_of(log)
+        aside = set_aside(log)
+        for number, part in enumerate(parts[1:], 2):
+            part.rename(part_of(aside, number))
 
 
 KERNELS_TO_ESTIMATE = 5
@@ -371,9 +376,11 @@ def _conclude(
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
     from central.desk.verification.recorded import recorded
+    from team.recording.parts import join
     from team.recording.reader import LogError, open_log
 
     console = Console()
+    join(outcome.log)  # here, since nobody ends this process for taking long
     typer.echo("the run is over: scoring it", err=True)
     steps = Steps()
     steps.begin("scoring the run")

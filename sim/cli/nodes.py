@@ -310,14 +310,26 @@ def record(
     output: Annotated[Path, typer.Option("--output", "-o", help="The MCAP file to write.")],
     connect: Connect = LOOPBACK,
     keys: Keys = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="An existing log is of this run, however old: continue it; if it is finished, end "
+            "with 0.",
+        ),
+    ] = False,
+    join_parts: Annotated[
+        bool, typer.Option("--join/--no-join", help="Join the parts of the log at the end.")
+    ] = True,
 ) -> None:
     """The recorder: every message of the team to one MCAP file, until the team has left.
 
     Started again while the team runs, it writes a further part and requests what it has missed; at
-    the end the parts are joined.
+    the end the parts are joined. Started again after the end, it completes an interrupted joining.
     """
     from sim.scenarios.scenario import dumps
-    from team.recording.parts import check_continues, join, next_part
+    from team.recording.part_files import parts_of
+    from team.recording.parts import check_continues, next_part
     from team.recording.provenance import provenance
     from team.recording.reader import LogError
     from team.recording.shell import record as record_until_end
@@ -335,10 +347,13 @@ def record(
     if again and not output.is_file():
         refuse_existing(output)
     try:
-        if again:
-            check_continues(output, resolved.team, metadata)
+        is_over = again and not check_continues(output, resolved.team, metadata, same_run=resume)
     except LogError as error:
         fail(str(error), WRONG_USE)
+    if is_over:
+        typer.echo(f"{output} was finished by an earlier recorder", err=True)
+        _fail_if_provisional(_joined(output) if join_parts else parts_of(output))
+        return
     expected = [robot_node(r.id) for r in resolved.robots]
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
@@ -367,12 +382,29 @@ def record(
             )
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:
-            parts = join(output)
-            if len(parts) > 1:
-                names = " ".join(str(part) for part in parts)
-                whole = output.with_stem(f"{output.stem}.whole")
-                command = f"teamslam log merge {names} --output {whole}"
-                _LOG.warning("no room to join the parts of the log; elsewhere: %s", command)
+            parts = _joined(output) if join_parts else parts_of(output)
+    _fail_if_provisional(parts)
+
+
+def _joined(log: Path) -> list[Path]:
+    """Join the parts of a log; name those that remain, with the remedy."""
+    from team.recording.parts import join
+
+    parts = join(log)
+    if len(parts) > 1:
+        whole = log.with_stem(f"{log.stem}.whole")
+        _LOG.warning(
+            "no room to join the parts of the log: all commands read %s as one log; to have one "
+            "file elsewhere: teamslam log repair %s --output %s",
+            " ".join(str(part) for part in parts),
+            log,
+            whole,
+        )
+    return parts
+
+
+def _fail_if_provisional(parts: Sequence[Path]) -> None:
+    """End with 1 where the final map lacks robots."""
     lost = _lost_in(parts)
     if lost:
         fail(f"the final map is provisional: {', '.join(lost)} lost, and not wholly in it", FAILED)

@@ -187,13 +187,16 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
         typer.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
 
 
-def set_aside(file: Path) -> None:
-    """Rename a file that is to be written anew, with the first number that is free."""
+def set_aside(file: Path) -> Path:
+    """Rename a file that is to be written anew, with the first number that is free; its new
+    path.
+    """
     number = 1
     while (aside := file.with_name(f"{file.name}.{number}")).exists():
         number += 1
     file.rename(aside)
     typer.echo(f"{file} was there already: it is now {aside}", err=True)
+    return aside
 
 
 def one_line(text: str) -> str:

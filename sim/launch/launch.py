@@ -194,7 +194,10 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
         for r in plan.scenario.robots
     ]
     return [
-        ("recorder", ["record", *common, "--output", str(plan.log)]),
+        (
+            "recorder",
+            ["record", *common, "--output", str(plan.log), "--resume", "--no-join"],
+        ),
         *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),
         *(
             [("central", ["central", *common, *plan.stores("central")])]

@@ -162,11 +162,13 @@ DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
 
 
 def _of_file(log: Log) -> list[Finding]:
-    if not log.complete:
-        return [Finding(FILE, UNFINISHED)]
-    with log.path.open("rb") as file:
-        damage = index_damage(file)
-    return [] if damage is None else [Finding(FILE, damage)]
+    found = [] if log.complete else [Finding(FILE, UNFINISHED)]
+    for each in log.files:
+        if each.complete:
+            with each.path.open("rb") as file:
+                damage = index_damage(file)
+            found += [] if damage is None else [Finding(FILE, damage)]
+    return found
 
 
 def _evidence(log: Log) -> _Evidence:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from io import BytesIO
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
@@ -30,9 +31,15 @@ def declared(log: Log) -> dict[str, Declared]:
     """The declaration of each key, the last one where there are several; damaged parts are left
     out.
     """
-    schemas: dict[int, tuple[str, bytes]] = {0: ("", b"")}
     found: dict[str, Declared] = {}
-    for frame in _declarations(log):
+    for each in log.files:
+        _declared_in(each.path, log.team, found)
+    return found
+
+
+def _declared_in(path: Path, team: str, found: dict[str, Declared]) -> None:
+    schemas: dict[int, tuple[str, bytes]] = {0: ("", b"")}
+    for frame in _declarations(path):
         stream = ReadDataStream(BytesIO(frame.body))
         try:
             if frame.opcode == Opcode.SCHEMA:
@@ -40,12 +47,11 @@ def declared(log: Log) -> dict[str, Declared]:
                 schemas[schema.id] = (schema.name, schema.data)
             else:
                 channel = Channel.read(stream)
-                key = channel.topic.removeprefix(f"team/{log.team}/")
+                key = channel.topic.removeprefix(f"team/{team}/")
                 named = schemas.get(channel.schema_id, ("", b""))
                 found[key] = Declared(key, channel.message_encoding, *named)
         except MALFORMED:
             continue
-    return found
 
 
 def misdeclared(of: Declared) -> str | None:
@@ -77,12 +83,12 @@ def _fields(text: bytes, kind: type[Message]) -> list[Any]:
     return fields if isinstance(fields, list) else []
 
 
-def _declarations(log: Log) -> Iterator[Frame]:
+def _declarations(path: Path) -> Iterator[Frame]:
     """The schema and channel records, in chunks or in the index behind them."""
     opcodes = (Opcode.SCHEMA, Opcode.CHANNEL)
-    with log.path.open("rb") as file:
+    with path.open("rb") as file:
         try:
-            for frame in frames(file, log.path):
+            for frame in frames(file, path):
                 if frame.opcode in opcodes:
                     yield frame
                 elif frame.opcode == Opcode.CHUNK:

@@ -1,8 +1,7 @@
-"""Reads the samples of a log, also of one whose recorder was killed."""
+"""Reads the samples of a log, also of one in several parts or whose recorder was killed."""
 
-import os
 import struct
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -14,12 +13,11 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel as LogChannel
-from mcap.records import Metadata
-from mcap.writer import MCAP0_MAGIC
 
-from team.recording.recorder import METADATA, Count
+from team.recording.opening import LogFile, open_file
+from team.recording.part_files import parts_of, readable
+from team.recording.recorder import Count
 from team.recording.records import (
-    FOOTER_SIZE,
     LARGEST_CHUNK,
     MALFORMED,
     REPAIR,
@@ -45,16 +43,18 @@ _OF_MESSAGE = int(Opcode.MESSAGE)
 
 @dataclass(frozen=True)
 class Log:
-    """A log on disk. `complete` is False when its recorder did not finish it.
+    """A log on disk. `complete` is False when the recorder of its last part did not finish it.
 
-    `metadata` is its provenance, `team` the team's name. An incomplete log is read up to its last
-    whole chunk. `reading` is told by every pass over the log which share of it is read.
+    `metadata` is its provenance, `team` the team's name. `files`: its parts, one after another. An
+    incomplete file is read up to its last whole chunk. `reading` is told by every pass over the log
+    which share of it is read.
     """
 
     path: Path
     team: str
     complete: bool
     metadata: dict[str, str] = field(repr=False)
+    files: tuple[LogFile, ...] = field(repr=False)
     reading: Callable[[float], None] = field(default=lambda _: None, repr=False, compare=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
@@ -87,27 +87,37 @@ class Log:
     ) -> Iterator[list[Sample] | DamagedChunkError]:
         """The samples chunk by chunk; in the place of a damaged chunk, its error."""
         names = None if channels is None else {channel.name for channel in channels}
-        size = max(self.path.stat().st_size, 1)
-        with self.path.open("rb") as file:
+        sizes = [each.path.stat().st_size for each in self.files]
+        before, whole = 0, max(sum(sizes), 1)
+        for each, size in zip(self.files, sizes, strict=True):
+            yield from self._chunks_of(each, names, before, whole)
+            before += size
+
+    def _chunks_of(
+        self, part: LogFile, names: set[str] | None, before: int, whole: int
+    ) -> Iterator[list[Sample] | DamagedChunkError]:
+        with part.path.open("rb") as file:
             # The index repeats the channels: a chunk that introduced one may be damaged.
-            keys = self._indexed(file, names) if self.complete else {}
-            for frame in frames(file, self.path):
+            keys = self._indexed(file, part.path, names) if part.complete else {}
+            for frame in frames(file, part.path):
                 if frame.opcode == Opcode.CHUNK:
-                    self.reading(frame.offset / size)
+                    self.reading((before + frame.offset) / whole)
                     try:
                         yield self.samples_in(frame, keys, names)
                     except (*MALFORMED, ValueError, zstandard.ZstdError) as error:
                         what = f"damaged chunk at offset {frame.offset}: {error}"
-                        yield DamagedChunkError(self.path, what, REPAIR)
+                        yield DamagedChunkError(part.path, what, REPAIR)
                 elif frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     return
-        if self.complete:
-            raise LogError(self.path, "ends before its own index", REPAIR)
+        if part.complete:
+            raise LogError(part.path, "ends before its own index", REPAIR)
 
-    def _indexed(self, file: IO[bytes], names: set[str] | None) -> dict[int, str | None]:
+    def _indexed(
+        self, file: IO[bytes], path: Path, names: set[str] | None
+    ) -> dict[int, str | None]:
         keys: dict[int, str | None] = {}
         with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels themselves
-            for frame in index(file, self.path):
+            for frame in index(file, path):
                 if frame.opcode == Opcode.CHANNEL:
                     self._introduce(frame.body, names, keys)
         return keys
@@ -154,50 +164,25 @@ def log_file(path: Path) -> Path:
 
 
 def open_log(path: str | Path) -> Log:
-    """The log at `path`, or in the run's folder there; raises `LogError` when there is none."""
+    """The log at `path`, or in the run's folder there; raises `LogError` when there is none.
+
+    Its parts are read as one log.
+    """
     path = log_file(Path(path))
+    opened = [file for part in parts_of(path)[1:] if (file := readable(part)) is not None]
     try:
-        with path.open("rb") as file:
-            return _opened(file, path)
-    except FileNotFoundError:
-        what = "give the path of a log that was recorded, or of the folder of its run"
-        raise LogError(path, "not found", what) from None
-    except OSError as error:
-        raise LogError(path, str(error.strerror), "give the path of a readable file") from error
+        opened.insert(0, open_file(path))
+    except LogError:
+        is_empty = path.is_file() and path.stat().st_size == 0  # its recorder died at once
+        if not (opened and is_empty):
+            raise
+    return log_of(opened)
 
 
-def _opened(file: IO[bytes], path: Path) -> Log:
-    size = os.fstat(file.fileno()).st_size
-    if size == 0:
-        raise LogError(path, "empty file", "its recorder was stopped before it began")
-    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise LogError(path, "not an MCAP file", "give a log that `teamslam record` wrote")
-    complete = False
-    if size > FOOTER_SIZE + 2 * len(MCAP0_MAGIC):
-        file.seek(-FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
-        tail = file.read()
-        complete = tail[0] == Opcode.FOOTER and tail.endswith(MCAP0_MAGIC)
-    metadata = _metadata(file, path)
-    return Log(path, metadata.pop("team", ""), complete, metadata)
-
-
-def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
-    for frame in frames(file, path):
-        if frame.opcode == Opcode.METADATA:
-            try:
-                record = Metadata.read(ReadDataStream(BytesIO(frame.body)))
-            except MALFORMED as error:
-                raise LogError(path, f"damaged metadata: {error}", "nothing can be read") from None
-            if record.name == METADATA:
-                return dict(record.metadata)
-        elif frame.opcode != Opcode.HEADER:
-            break
-    raise LogError(
-        path,
-        "an MCAP file of another program, or cut off at its very beginning",
-        f"a log of ours begins with metadata {METADATA!r}; `teamslam import` makes a data set of a "
-        "ROS 2 bag",
-    )
+def log_of(files: Sequence[LogFile]) -> Log:
+    """The log of these files, one after another."""
+    first, last = files[0], files[-1]
+    return Log(first.path, first.team, last.complete, first.metadata, tuple(files))
 
 
 def _stamp_in(payload: bytes) -> int:

@@ -1,15 +1,21 @@
 """A recorder that is started again, or had no room: the parts of its log are one in the end."""
 
+import os
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from team.recording.check import holes
+from sim.cli.main import app
+from sim.scenarios.scenario import dumps, load
+from team.recording.check import checked, holes
 from team.recording.inventory import Inventory
-from team.recording.parts import check_continues, join, next_part, part_of, parts_of
+from team.recording.part_files import part_of, parts_of
+from team.recording.parts import check_continues, join, next_part
 from team.recording.reader import LogError, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.shell import RecordLoop, record
@@ -55,7 +61,7 @@ def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path: Pat
         wait_until(flushed)
         first.close()  # and nothing is completed
         team.says(60)
-        check_continues(path, "t", {"scenario": "s"})
+        assert check_continues(path, "t", {"scenario": "s"})
         recorder, inventory = next_part(path, "t", {"scenario": "s"})
         second = ZenohBus("t", at)
         thread = threading.Thread(target=record, args=(second, recorder, (), inventory))
@@ -114,6 +120,145 @@ def test_a_log_that_is_not_of_this_run_is_not_continued(
     scenario = "another" if wrong == "another scenario" else "s"
     with pytest.raises(LogError, match=r"exists.*choose another name or remove it"):
         check_continues(path, "t", {"scenario": scenario})
+
+
+def final_part(path: Path, part: int, samples: list[Sample]) -> Recorder:
+    """The next part of a log, with these samples and the final map, completed."""
+    recorder, _ = next_part(path, "t", {"scenario": "s"})
+    with recorder:
+        recorder.write([*samples, Sample("central/final", encoded(FINAL), 0, 0, 0)])
+    assert recorder.path == part_of(path, part)
+    return recorder
+
+
+def in_two_parts(path: Path) -> None:
+    """A log whose first recorder was killed and whose second one finished it."""
+    killed, _ = next_part(path, "t", {"scenario": "s"})
+    killed.write(samples_of(10)[:5])
+    wait_until(lambda: logged(path, c.ODOMETRY) == 5)
+    final_part(path, 2, samples_of(10)[5:])
+
+
+def numbers(path: Path) -> list[int]:
+    return [decoded(s.payload, m.Odometry).number for s in open_log(path).samples([c.ODOMETRY])]
+
+
+def test_the_parts_of_a_log_are_read_as_one(path: Path) -> None:
+    in_two_parts(path)
+    assert numbers(path) == list(range(10))
+    log = open_log(path)
+    assert log.complete
+    assert len(log.files) == 2
+    assert not [each for each in checked(log) if each.where == "file"]
+
+
+@pytest.mark.parametrize("written", [0, 8, 500, 10**9])
+def test_a_joining_that_was_killed_while_it_copied_is_begun_again(path: Path, written: int) -> None:
+    in_two_parts(path)
+    whole = path.with_name(f"{path.name}.joining")
+    whole.write_bytes(part_of(path, 2).read_bytes()[:written])
+    assert not check_continues(path, "t", {"scenario": "s"}), (
+        "the run is over, and the joining is not"
+    )
+    assert numbers(path) == list(range(10))
+    assert join(path) == [path]
+    assert numbers(path) == list(range(10))
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("removed", [0, 1])
+def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice(
+    path: Path, removed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed, _ = next_part(path, "t", {"scenario": "s"})
+    killed.write(samples_of(10)[:3])
+    wait_until(lambda: logged(path, c.ODOMETRY) == 3)
+    again, _ = next_part(path, "t", {"scenario": "s"})
+    again.write(samples_of(10)[3:6])
+    wait_until(lambda: logged(again.path, c.ODOMETRY) == 3)
+    final_part(path, 3, samples_of(10)[6:])
+    unlink = Path.unlink
+    died = []
+
+    def dies(self: Path, missing_ok: bool = False) -> None:
+        if ".part" in self.name:
+            if len(died) == removed:
+                raise KeyboardInterrupt
+            died.append(self)
+        unlink(self, missing_ok)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", dies)
+        with pytest.raises(KeyboardInterrupt):
+            join(path)
+    assert len(list(path.parent.iterdir())) == 3 - removed
+    assert numbers(path) == list(range(10)), "what was joined is not read from its part"
+    assert not check_continues(path, "t", {"scenario": "s"})
+    assert join(path) == [path]
+    assert numbers(path) == list(range(10))
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_log_that_was_joined_and_goes_on_gives_no_number_to_two_parts(path: Path) -> None:
+    in_two_parts(path)
+    join(path)
+    final_part(path, 3, samples_of(12)[10:])
+    assert numbers(path) == list(range(12))
+    assert join(path) == [path]
+    assert numbers(path) == list(range(12))
+
+
+def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path: Path) -> None:
+    in_two_parts(path)
+    path.unlink()  # and its second part stays
+    killed, _ = next_part(path, "t", {"scenario": "s"})
+    killed.write(samples_of(3))
+    wait_until(lambda: logged(path, c.ODOMETRY) == 3)
+    assert numbers(path) == [0, 1, 2]
+    final_part(path, 3, samples_of(4)[3:])
+    assert join(path) == [path]
+    assert numbers(path) == [0, 1, 2, 3]
+    assert part_of(path, 2).exists()
+
+
+@pytest.mark.parametrize("step_s", [0.0, 7200.0])
+def test_a_clock_that_was_set_makes_no_log_another_run_s(
+    path: Path, step_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = time.time
+    with monkeypatch.context() as wrong:  # two hours behind, until the network told the time
+        wrong.setattr(time, "time", lambda: before() - step_s)
+        killed, _ = next_part(path, "t", {"scenario": "s"})
+    killed.write(samples_of(1))
+    wait_until(lambda: logged(path, c.ODOMETRY) == 1)
+    old_s = before() - 7200.0
+    os.utime(path, (old_s, old_s))
+    if step_s:
+        assert check_continues(path, "t", {"scenario": "s"})
+    else:
+        with pytest.raises(LogError, match=r"2\.0 hours ago.*--resume"):
+            check_continues(path, "t", {"scenario": "s"})
+        assert check_continues(path, "t", {"scenario": "s"}, same_run=True)
+
+
+def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(path: Path) -> None:
+    scenario = "thesis"
+    text = dumps(load(scenario))
+    team = load(scenario).team
+    for samples in (samples_of(10)[:5], samples_of(10)[5:]):
+        recorder, _ = next_part(path, team, {"scenario": text})
+        with recorder:
+            recorder.write(samples)
+            if samples[0].counter:
+                recorder.write([Sample("central/final", encoded(FINAL), 0, 0, 0)])
+    command = ["record", scenario, "--output", str(path)]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert parts_of(path) == [path]
+    assert numbers(path) == list(range(10))
+    assert CliRunner().invoke(app, [*command, "--resume"]).exit_code == 0
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2, "this may be another run: nothing of it would be recorded"
 
 
 @pytest.fixture
