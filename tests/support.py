@@ -50,16 +50,22 @@ def nobody_listens() -> Iterator[str]:
 
 
 class Link:
-    """A TCP link to `endpoint` that a test can cut and mend."""
+    """A TCP link to `endpoint` that a test can cut, stall and mend.
+
+    A stalled link accepts connections and passes nothing on, as that to a stopped process.
+    """
 
     def __init__(self, endpoint: str) -> None:
-        host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+        protocol, _, at = endpoint.partition("/")
+        host, port = at.rsplit(":", 1)
         self._to = (host, int(port))
         self._open: list[socket.socket] = []
         self._whole = True
+        self._flows = threading.Event()
+        self._flows.set()
         self._turn = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self.endpoint = f"{protocol}/127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
     def __enter__(self) -> Self:
@@ -67,6 +73,7 @@ class Link:
 
     def __exit__(self, *_: object) -> None:
         self.cut()
+        self._flows.set()
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -80,8 +87,12 @@ class Link:
                 connection.close()
             self._open.clear()
 
+    def stall(self) -> None:
+        self._flows.clear()
+
     def mend(self) -> None:
         self._whole = True
+        self._flows.set()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
@@ -100,12 +111,13 @@ class Link:
             return
         self._open += [near, far]
         for pair in ((near, far), (far, near)):
-            threading.Thread(target=_pump, args=pair, daemon=True).start()
+            threading.Thread(target=_pump, args=(*pair, self._flows), daemon=True).start()
 
 
-def _pump(source: socket.socket, sink: socket.socket) -> None:
+def _pump(source: socket.socket, sink: socket.socket, flows: threading.Event) -> None:
     with contextlib.suppress(OSError):
         while data := source.recv(65_536):
+            flows.wait()
             sink.sendall(data)
         sink.shutdown(socket.SHUT_RDWR)
 

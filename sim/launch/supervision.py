@@ -8,10 +8,11 @@ or centre there is no map: then the run ends. Peers need no centre.
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from central.desk.orders import ordered
 from sim.launch.supervisor import Ended, Supervised
-from sim.launch.watch import Watch
+from sim.launch.watch import TURN_S, Watch
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Outgoing
@@ -61,11 +62,7 @@ def supervise(
     silence, memory = Silence(end_silent_s), Memory()
     over_at: float | None = None
     while True:
-        try:
-            watch.take(bus)
-        except BusError as error:
-            watch.failures.append(str(error))
-            return
+        _receive(bus, watch)
         is_final = watch.is_over
         memory.look(services, is_final=is_final)
         for service in services:
@@ -80,6 +77,19 @@ def supervise(
         if over_at is not None and time.monotonic() - over_at > LEAVING_S:
             _end_who_stays(services[1:], watch)
             return
+
+
+def _receive(bus: Bus, watch: Watch) -> None:
+    """Take what has arrived; where the link to the router is refused, supervise without it.
+
+    The processes have links of their own, and end by themselves.
+    """
+    try:
+        watch.take(bus)
+    except BusError as error:
+        if str(error) not in watch.failures:
+            watch.failures.append(str(error))
+        time.sleep(TURN_S)
 
 
 def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) -> None:
@@ -111,7 +121,8 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     node = node_of(service.name)
     order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
     if not _is_needed(service.name, watch):
-        ordered(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
+        with suppress(BusError):  # named by `_receive`
+            ordered(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
 
 
 def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:

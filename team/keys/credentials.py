@@ -26,9 +26,10 @@ _REMEDY = "make new ones by `teamslam keys` and copy them"
 
 @dataclass(frozen=True)
 class Credentials:
-    """The checked files of one node; ends: when the certificate expires."""
+    """The checked files of one node; name: the certificate's common name; ends: when it expires."""
 
     node: str
+    name: str
     team: str
     authority: Path
     certificate: Path
@@ -91,7 +92,7 @@ def credentials_of(
     if team is not None and owner != team:
         raise KeysError(f"{paths[1]}: of the team {owner!r}, not of {team!r}; choose its folder")
     others = bool(paths[2].stat().st_mode & 0o077)
-    return Credentials(node, owner, *paths, certificate.not_valid_after_utc, others)
+    return Credentials(node, common, owner, *paths, certificate.not_valid_after_utc, others)
 
 
 def _certificate(path: Path) -> x509.Certificate:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from team.keys.roster import REPLAY, Roster
+from team.wire.zenoh.session import DOOR
 
 _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
 _LISTENS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
@@ -41,7 +42,16 @@ def access_control(roster: Roster) -> dict[str, Any]:
         _rule("hear", "egress", _HEARS, every),
         _rule("no truth", "egress", ("put", "reply"), _keys(prefix, TRUTH), allow=False),
     ]
-    subjects, policies = [], []
+    door = [f"{prefix}{DOOR}/*"]
+    rules += [
+        _rule("ask at the door", "ingress", ("query",), door),
+        _rule("be told at the door", "egress", ("reply",), door),
+    ]
+    # Who has no other rule, as a revoked certificate, is told so.
+    subjects: list[dict[str, object]] = [{"id": "any certificate", "link_protocols": ["tls"]}]
+    policies = [
+        {"rules": ["ask at the door", "be told at the door"], "subjects": ["any certificate"]}
+    ]
     for node in sorted(roster.nodes):
         rules.append(_rule(f"own {node}", "ingress", _SAYS, _keys(prefix, owned(node))))
         subjects.append({"id": node, "cert_common_names": [roster.common_name(node)]})

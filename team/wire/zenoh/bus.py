@@ -30,7 +30,7 @@ from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
 from team.wire.zenoh.queries import Queries, Question, Reply
 from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
-from team.wire.zenoh.session import RouterAccess, client
+from team.wire.zenoh.session import RouterLink, client
 
 if TYPE_CHECKING:  # a node without keys needs none of it
     from team.keys.credentials import Credentials
@@ -93,7 +93,7 @@ class ZenohBus:
         self._session = client(connect, patience_s, keys)
         self._recovery = Recovery(self._session, self._prefix, self._queue.put)
         self._queries = Queries(self._session, self._prefix, self._queue.put)
-        self._door = None if keys is None else RouterAccess(self._session, connect, keys)
+        self._link = RouterLink(self._session, connect, keys)
 
     def __enter__(self) -> Self:
         return self
@@ -237,8 +237,7 @@ class ZenohBus:
         publishes faster than this node reads can not keep it here.
         """
         self._check_open()
-        if self._door is not None:
-            self._door.look(time.monotonic())
+        self._link.look(time.monotonic())
         samples: list[Sample] = []
         until = time.monotonic() + timeout_s
         waiting: int | None = None

@@ -1,19 +1,22 @@
-"""Finds out why a link to a router fails: Zenoh reports nothing but a timeout.
+"""Examines a link to a router that fails: Zenoh reports nothing but a timeout.
 
-One TLS handshake by the standard library, beside Zenoh, distinguishes the cases: no server listens;
-the router refuses our certificate, or we its; one side speaks TLS and the other does not.
+One TLS handshake by the standard library, beside Zenoh, distinguishes the cases. Only positive
+evidence refuses a link: a TLS alert about our certificate, a router's certificate that can not be
+verified, an answer that is not TLS. A timeout, a closed connection or any other error of the
+network is no evidence, and is reported as a reason to wait.
 """
 
 import re
 import socket
 import ssl
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from team.keys.credentials import Credentials
 
 TIMEOUT_S = 1.0
-"""Timeout [s] of each step; a router on a busy machine that takes longer is tried again."""
+"""Timeout [s] of each step of a handshake."""
 _ENDPOINT = re.compile(r"(?P<protocol>\w+)/(?P<host>\[[^]]+\]|[^:/?#]+):(?P<port>\d+)")
 _ALERTS = {
     "UNKNOWN_CA": "it is of another authority than the router's: copy ca.pem and both files of "
@@ -24,78 +27,86 @@ _ALERTS = {
     "BAD_CERTIFICATE": "it does not take it for one of its team",
     "DECRYPT_ERROR": "it is of another authority than the router's, of the same name",
 }
+_NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL", "HTTP_REQUEST")
+"""Reasons of OpenSSL for an answer that is not TLS."""
 
 
-def why_refused(connect: str, keys: "Credentials | None") -> str | None:
-    """The reason in words, with the remedy; None: no server listens there, or TLS is not the
-    reason.
+@dataclass(frozen=True)
+class Examined:
+    """The result of one handshake.
+
+    refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
+    is no link yet, in words; empty if the handshake succeeded. router_ends: when the router's
+    certificate expires [s since 1970], if it was received.
     """
+
+    refused: str | None = None
+    waits_for: str = ""
+    router_ends: float | None = None
+
+
+def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT_S) -> Examined:
+    """Make one handshake with the router at `connect`; takes at most three times `timeout_s`."""
     at = _ENDPOINT.match(connect)
     if at is None:
-        return None
+        return Examined()
     host, port = at["host"].strip("[]"), int(at["port"])
     try:
-        link = socket.create_connection((host, port), TIMEOUT_S)
-    except OSError:
-        return None
+        link = socket.create_connection((host, port), timeout_s)
+    except TimeoutError:
+        return Examined(waits_for="no answer")
+    except ConnectionRefusedError:
+        return Examined(waits_for="nothing listens there")
+    except OSError as error:
+        return Examined(waits_for=error.strerror or str(error))
     with link:
         return _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
 
 
-def router_ends(connect: str, keys: "Credentials") -> float | None:
-    """When the router's certificate expires [s since 1970]; None where that can not be read now."""
-    at = _ENDPOINT.match(connect)
-    if at is None:
-        return None
-    host, port = at["host"].strip("[]"), int(at["port"])
-    try:
-        with (
-            socket.create_connection((host, port), TIMEOUT_S) as link,
-            keys.context().wrap_socket(link, server_hostname=host) as tls,
-        ):
-            shown = tls.getpeercert()
-    except OSError:
-        return None
-    ends = None if shown is None else shown.get("notAfter")
-    return ssl.cert_time_to_seconds(ends) if isinstance(ends, str) else None
-
-
-def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> str | None:
+def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> Examined:
     try:
         context = keys.context()
-    except OSError as error:
-        return f"{keys.certificate} or its key can not be read any more: {error.strerror or error}"
+    except OSError as error:  # as while a renewed pair is copied
+        reason = error.strerror or str(error)
+        return Examined(waits_for=f"{keys.certificate} or its key can not be read: {reason}")
     try:
         tls = context.wrap_socket(link, server_hostname=host)
     except ssl.SSLCertVerificationError as error:
-        return (
+        return Examined(
             f"{connect}: the router's certificate is not good: {error.verify_message}. If the host "
             "is not in it: `teamslam keys TEAM -o DIR --router HOST`; if it is of another "
             f"authority than {keys.authority}: copy both from one folder"
         )
-    except ssl.SSLError as error:
-        return _alerted(error, connect, keys)
     except OSError as error:
-        return f"{connect}: what listens there speaks no TLS ({error}): a router without --keys?"
+        return _failed(error, connect, keys)
     with tls:
-        try:  # TLS 1.3: what the router says of our certificate comes after the handshake
+        ends = (tls.getpeercert() or {}).get("notAfter")
+        router_ends = ssl.cert_time_to_seconds(ends) if isinstance(ends, str) else None
+        try:  # TLS 1.3: the router's answer to our certificate comes after the handshake
             tls.recv(1)
-        except ssl.SSLError as error:
-            return _alerted(error, connect, keys)
-        except OSError:
-            return None
-    return None
+        except TimeoutError:
+            pass
+        except OSError as error:
+            return _failed(error, connect, keys)
+    return Examined(router_ends=router_ends)
 
 
-def _alerted(error: ssl.SSLError, connect: str, keys: "Credentials") -> str:
-    reason = error.reason or str(error)
+def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
+    """The result of a handshake that raised an error."""
+    if isinstance(error, TimeoutError):
+        return Examined(waits_for="connections are accepted, TLS is not answered")
+    reason = (error.reason if isinstance(error, ssl.SSLError) else error.strerror) or str(error)
     for alert, meaning in _ALERTS.items():
-        if alert in reason:
-            return f"{connect}: the router refuses {keys.certificate}: {meaning}"
-    return f"{connect}: what listens there speaks no TLS ({reason}): a router without --keys?"
+        if "ALERT" in reason and alert in reason:
+            return Examined(f"{connect}: the router refuses {keys.certificate}: {meaning}")
+    if reason in _NOT_TLS:
+        return Examined(
+            f"{connect}: the answer there is not TLS ({reason}): is it a router without --keys?"
+        )
+    return Examined(waits_for=f"the TLS handshake was broken off ({reason})")
 
 
-def _without_keys(link: socket.socket, connect: str) -> str | None:
+def _without_keys(link: socket.socket, connect: str) -> Examined:
     """Whether it is a router with keys, which answers a greeting in TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
@@ -104,5 +115,7 @@ def _without_keys(link: socket.socket, connect: str) -> str | None:
         with context.wrap_socket(link):
             pass
     except OSError:
-        return None
-    return f"{connect}: the router there has keys and refuses whoever has none: give --keys DIR"
+        return Examined(waits_for="connections are accepted and not answered")
+    return Examined(
+        f"{connect}: the router there has keys and refuses whoever has none: give --keys DIR"
+    )

@@ -26,7 +26,7 @@ from team.wire.channels import (
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FinalMapRequest
 from team.wire.zenoh.access import access_control
-from team.wire.zenoh.session import DOOR, opened
+from team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
 from team.wire.zenoh.stored import StoredMessages
 
 if TYPE_CHECKING:  # a router without keys needs none of it
@@ -66,13 +66,13 @@ def router(
         ) from error
     with session:
         _Keeper(session)
-        door = keys and session.liveliness().declare_token(f"team/{keys[1].team}/{DOOR}")
+        if keys is not None:
+            _answer_door(session, keys[1])
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
         locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
         if not (locators and locators[0]):
             raise BusError(f"the router at {listen} does not tell its endpoint")
         yield str(locators[0][0])
-        del door  # held until here
 
 
 class _Keeper:
@@ -131,6 +131,18 @@ class _Keeper:
         with query:
             for order in self._of(query.key_expr)[0].orders():
                 query.reply(query.key_expr, order)
+
+
+def _answer_door(session: zenoh.Session, roster: Roster) -> None:
+    """Answer to each certificate of the authority, by common name, whether the roster has it."""
+    names = {roster.common_name(node) for node in roster.nodes}
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            accepted = str(query.key_expr).rpartition("/")[2] in names
+            query.reply(query.key_expr, ACCEPTED if accepted else REVOKED)
+
+    session.declare_queryable(f"team/{roster.team}/{DOOR}/*", Callback(answer, indirect=False))
 
 
 def _asker(query: zenoh.Query) -> str:

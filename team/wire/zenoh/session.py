@@ -6,6 +6,8 @@ watched.
 """
 
 import json
+import logging
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -23,13 +25,17 @@ _BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link
 FIRST_LOOK_S = 3.0
 """Time [s] without a connection after which a client finds out why."""
 LINK_S = 1.0
-"""Interval [s] at which a node with keys checks that the router still accepts it."""
-DEAF = 4
-"""Number of consecutive checks without any sample from a connected router, after which the node
-concludes that the router withholds all samples.
-"""
+"""Interval [s] between two looks at the link."""
+LONGEST_S = 30.0
+"""Longest interval [s] between two examinations of a link that fails; intervals double up to it."""
+REPEAT_S = 60.0
+"""Interval [s] at which a client that waits for its router logs the reason again."""
+ANSWER_S = 5.0
+"""Timeout [s] of the query whether the router accepts our certificate, and of an examination."""
 DOOR = "router/door"
-"""Key of the token of a router with keys, which every accepted node can see."""
+"""Key below which a router with keys answers whether it accepts a certificate, by common name."""
+ACCEPTED, REVOKED = b"accepted", b"revoked"
+_LOG = logging.getLogger("teamslam")
 
 
 def opened(settings: dict[str, object]) -> zenoh.Session:
@@ -70,17 +76,18 @@ def client(connect: str, patience_s: float, keys: "Credentials | None") -> zenoh
         try:
             return opened(settings | {"connect/timeout_ms": max(1, round(1e3 * wait_s))})
         except zenoh.ZError as error:
-            from team.wire.zenoh.handshake import why_refused  # ssl: only here
+            from team.wire.zenoh.handshake import examine  # ssl: only here
 
-            refused = why_refused(connect, keys)
-            if refused is not None:
-                raise BusError(refused) from error
+            found = examine(connect, keys)
+            if found.refused is not None:
+                raise BusError(found.refused) from error
             wait_s = deadline - time.monotonic()
             if wait_s <= 0.0:
                 example = "tls/HOST:PORT" if keys is not None else "tcp/HOST:PORT"
+                reason = f": {found.waits_for}" if found.waits_for else ""
                 raise BusError(
-                    f"no router answers at {connect} ({patience_s:g} s): start `teamslam router`, "
-                    f"or give its endpoint, as {example}"
+                    f"no router answers at {connect} ({patience_s:g} s){reason}; start `teamslam "
+                    f"router{' --keys DIR' if keys else ''}`, or give its endpoint, as {example}"
                 ) from error
 
 
@@ -98,52 +105,113 @@ def _client_tls(keys: "Credentials") -> dict[str, object]:
     }
 
 
-class RouterAccess:
-    """Checks whether a router with keys still accepts this node: Zenoh itself would retry silently.
+class RouterLink:
+    """The link of one session to its router: reports why there is none, and when it can not be.
 
-    An absent router is waited for. Where the router no longer accepts us, or we no longer accept
-    it, a handshake finds the reason; a router that connects us and then withholds all samples has a
-    roster without our certificate: nothing else uses the key of its token.
+    The absence of an answer never ends a process: a router that is gone, stopped or behind a bad
+    radio link is waited for without limit, and the reason is logged. Only evidence raises
+    `BusError`: what a handshake found (`team.wire.zenoh.handshake`), or the router's own statement
+    that its roster does not have our certificate. Zenoh connects a revoked certificate, too, and
+    drops its messages silently; so each new link is followed by that query.
     """
 
-    def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials") -> None:
-        from team.wire.zenoh import handshake
-
-        self._handshake = handshake
+    def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:
         self._session = session
         self._connect = connect
         self._keys = keys
-        self._due = self._answered_at = 0.0
-        self._router_ends = self._handshake.router_ends(connect, keys)
-        self._answered = True
-        self._deaf = 0
+        self._due = 0.0
+        self._away_since: float | None = None
+        self._logged_s: float | None = None
+        self._examine_due = 0.0
+        self._interval_s = LINK_S
+        self._examining: threading.Thread | None = None
+        self._router_ends: float | None = None
+        self._waits_for = ""
+        self._accepted_by = ""
+        self._asking = False
+        self._refused: str | None = None
 
     def look(self, now_s: float) -> None:
-        """Checks every LINK_S seconds; raises BusError with the reason."""
+        """Look at the link every LINK_S seconds; raises `BusError` on evidence against it."""
+        if self._refused is not None:
+            raise BusError(self._refused)
         if now_s < self._due:
             return
         self._due = now_s + LINK_S
-        linked = bool(self._session.info.routers_zid())
-        self._deaf = 0 if self._answered or not linked else self._deaf + 1
-        self._answered_at = now_s if self._answered else self._answered_at
-        # A link that comes up again just before the end Zenoh may keep behind it.
-        ended = self._router_ends is not None and time.time() > self._router_ends
-        if ended or now_s - self._answered_at > FIRST_LOOK_S:
-            refused = self._handshake.why_refused(self._connect, self._keys)
-            if refused is not None:
-                raise BusError(refused)
-            self._router_ends = self._handshake.router_ends(self._connect, self._keys)
-        if self._deaf > DEAF:
-            raise BusError(
-                f"{self._connect}: the router gives {self._keys.certificate} a link, but lets it "
-                "hear and say nothing: it is revoked, or the router has another roster. Copy the "
-                f"newest {self._keys.node}.pem and .key, and roster.json to the router, and start "
-                "both again"
-            )
-        self._answered = False
+        router = next((str(each) for each in self._session.info.routers_zid()), None)
+        if router is None:
+            self._wait(now_s)
+        else:
+            self._connected(router, now_s)
+
+    def _connected(self, router: str, now_s: float) -> None:
+        if self._logged_s is not None and self._away_since is not None:
+            away_s = now_s - self._away_since
+            _LOG.warning("connected to the router at %s again, after %.0f s", self._connect, away_s)
+        self._away_since = self._logged_s = None
+        if self._keys is None:
+            return
+        if router != self._accepted_by and not self._asking:
+            self._ask_whether_accepted(router, self._keys)
+        # A link that comes up again just before the certificate's end Zenoh may keep behind it.
+        if self._router_ends is None or time.time() > self._router_ends:
+            self._examine(now_s)
+        else:
+            self._interval_s = LINK_S
+
+    def _wait(self, now_s: float) -> None:
+        """Without a link: find out why, and log it now and then."""
+        if self._away_since is None:
+            self._away_since, self._interval_s = now_s, LINK_S
+        away_s = now_s - self._away_since
+        if away_s < FIRST_LOOK_S:
+            return
+        self._examine(now_s)
+        if self._waits_for and (self._logged_s is None or now_s - self._logged_s >= REPEAT_S):
+            self._logged_s = now_s
+            _LOG.warning(
+                "waiting for the router at %s: %s, no link for %.0f s",
+                self._connect, self._waits_for, away_s,
+            )  # fmt: skip
+
+    def _examine(self, now_s: float) -> None:
+        """Make a handshake on a thread of its own, at intervals that double."""
+        running = self._examining is not None and self._examining.is_alive()
+        if running or now_s < self._examine_due:
+            return
+        self._examine_due = now_s + self._interval_s
+        self._interval_s = min(2.0 * self._interval_s, LONGEST_S)
+
+        def run() -> None:
+            from team.wire.zenoh.handshake import examine  # ssl: only here
+
+            found = examine(self._connect, self._keys, ANSWER_S)
+            self._router_ends = found.router_ends or self._router_ends
+            self._waits_for = found.waits_for or "a handshake succeeds, a link is being made"
+            self._refused = found.refused
+
+        self._examining = threading.Thread(target=run, name="handshake", daemon=True)
+        self._examining.start()
+
+    def _ask_whether_accepted(self, router: str, keys: "Credentials") -> None:
+        self._asking = True
 
         def hear(reply: zenoh.Reply) -> None:
-            self._answered = self._answered or reply.ok is not None
+            answer = b"" if reply.ok is None else reply.ok.payload.to_bytes()
+            if answer == ACCEPTED:
+                self._accepted_by = router
+            elif answer == REVOKED:
+                self._refused = (
+                    f"{self._connect}: the router does not accept {keys.certificate}: it is "
+                    f"revoked, or the router has another roster. Copy the newest {keys.node}.pem "
+                    "and .key, and roster.json to the router, and start both again"
+                )
 
-        key = f"team/{self._keys.team}/{DOOR}"
-        self._session.liveliness().get(key, Callback(hear, indirect=False), timeout=LINK_S)
+        def over() -> None:
+            self._asking = False
+
+        self._session.get(
+            f"team/{keys.team}/{DOOR}/{keys.name}",
+            Callback(hear, drop=over, indirect=False),
+            timeout=ANSWER_S,
+        )

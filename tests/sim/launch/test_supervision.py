@@ -4,9 +4,10 @@ import time
 
 import pytest
 
-from sim.launch.supervision import FEW, Silence
+from sim.launch.supervision import FEW, Silence, supervise
 from sim.launch.supervisor import Child, Supervised
 from sim.launch.watch import Watch
+from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
 
 
 class Quiet(Child):
@@ -119,3 +120,30 @@ def test_a_process_that_fails_five_times_is_given_up_whatever_it_says() -> None:
         service.died(0.0)
         given_up.append(service.given_up)
     assert given_up == [False] * 4 + [True]
+
+
+class Refused(MemoryBus):
+    """A bus whose link to the router is refused."""
+
+    def receive(self, timeout_s: float = 0.0) -> list[Sample]:
+        raise BusError("operator.pem has expired")
+
+
+def test_a_launch_whose_own_link_is_refused_supervises_on_until_the_processes_have_ended() -> None:
+    services = [Service(k) for k in range(3)]
+    turns: list[list[str]] = []
+    for service in services:
+        service.over = service.given_up = False
+        service.due = service.ended_s = None
+        service.child.measure = lambda: None  # type: ignore[method-assign]
+
+    def show(watch: Watch) -> None:
+        turns.append(list(watch.failures))
+        if len(turns) == 3:
+            for service in services:
+                service.child = Ending(0)
+
+    supervise(services, Refused(MemoryNetwork()), Watch(), show, None)
+    assert len(turns) == 4
+    assert turns[-1] == ["operator.pem has expired"]
+    assert all(service.over for service in services)
