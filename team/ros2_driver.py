@@ -8,7 +8,7 @@ ends the process.
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from typing import Protocol, runtime_checkable
 
@@ -19,8 +19,9 @@ from team.containment import place_of
 from team.driver.measured import MeasurementError
 from team.ros2.arrivals import MOST_WAITING, Backlog, Lost
 from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, decode
-from team.ros2.frames import misplaced
+from team.ros2.frames import Frames, misplaced
 from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
+from team.ros2.owners import Owners
 from team.ros2.topics import RobotTopics
 from team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
 from team.wire.zenoh.foreign import ForeignSample
@@ -70,13 +71,26 @@ class Ros2Driver:
 
     taken: messages by topic; dropped: by reason; lost: published, and never here. What waits is
     handed over in the order of its stamps, since topics come in no order among themselves.
+    name, others: the robot's name, and the topics of the others in the file, which may be its own,
+    too: a detection there belongs to the robot from whose base its frame hangs.
     """
 
-    def __init__(self, robot: Robot, topics: RobotTopics, domain: int = 0) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        topics: RobotTopics,
+        domain: int = 0,
+        *,
+        name: str = "",
+        others: Mapping[str, RobotTopics] | None = None,
+    ) -> None:
         self._robot = robot
         self._topics = topics
         self._domain = domain
-        self._translator = Translator(topics)
+        frames = Frames()
+        robots = {**(others or {}), name: topics}
+        owners = Owners(robots, dict.fromkeys(robots, frames))
+        self._translator = Translator(topics, frames, name, owners)
         self._kinds = dict(topics.types)
         if topics.odometry:
             self._kinds.setdefault(topics.odometry, ODOMETRY)
@@ -93,6 +107,7 @@ class Ros2Driver:
         self._names = {topics.odometry, *topics.detections, *self._static} - {""}
         self._silent = {topics.odometry} - {""}
         self._began_s = time.monotonic()
+        self._undecided_at_s: float | None = None
 
     @property
     def keys(self) -> list[str]:
@@ -237,6 +252,20 @@ class Ros2Driver:
             "messages_dropped": float(self.dropped.total() + self._backlog.dropped.total()),
         }
 
+    @property
+    def refusal(self) -> str:
+        """The text about detections none of which can be assigned to this robot, with the remedy;
+        empty as long as some can, and until the transforms had time to come.
+        """
+        question = self._translator.question()
+        if not question or self._translator.has_detections:
+            self._undecided_at_s = None
+            return ""
+        now = time.monotonic()
+        if self._undecided_at_s is None:
+            self._undecided_at_s = now
+        return question if now - self._undecided_at_s > SILENT_S else ""
+
     def warnings(self) -> tuple[str, ...]:
         """What is lost or late, why, and what to do."""
         said = [
@@ -256,6 +285,8 @@ class Ros2Driver:
         configured = self._robot.sensor_mount
         if configured is not None and self.mounts:
             said += misplaced(self.mounts[0], configured)
+        if question := self._translator.question():
+            said.append(question)
         late_s = self._backlog.oldest_s
         if late_s > BEHIND_S:
             said.append(

@@ -21,6 +21,7 @@ REASONS = {
     "team/robot/main.py": "the robot's process: how it resumes, and what it asks for",
     "team/robot/node.py": "the node: its parts are modules of their own, here is who hears what",
     "team/translate.py": "both directions of each message side by side",
+    "team/ros2_driver.py": "a robot's topics: their intake, order and warnings",
     "team/driver/driver.py": "a user's face: a method for each kind of measurement",
     "team/library.py": "a user's face: what `from team import …` gives",
     "team/config.py": "tables of fields with their meaning",

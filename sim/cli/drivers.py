@@ -4,11 +4,14 @@ import logging
 import time
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, fail, over_tls, parsed_start
+
+if TYPE_CHECKING:
+    from team.ros2_driver import Ros2Driver
 
 app = typer.Typer()
 _LOG = logging.getLogger("teamslam")
@@ -87,7 +90,9 @@ def driver(
                 latency_s=latency,
             ) as source,
         ):
-            translated = Ros2Driver(source, topics.robots[robot], topics.domain)
+            translated = Ros2Driver(
+                source, topics.robots[robot], topics.domain, name=robot, others=topics.robots
+            )
             with ForeignKeys(
                 ros2_connect or connect,
                 translated.keys,
@@ -101,6 +106,8 @@ def driver(
                     translated.deliver(AT_ONCE)
                     source.tell(translated.figures(), translated.warnings())
                     translated.report()
+                    if translated.refusal:
+                        fail(f"{ros2}: {translated.refusal}", WRONG_USE)
                 until = time.monotonic() + LAST_S
                 while time.monotonic() < until:  # what is on its way; a topic need not fall silent
                     for sample in foreign.receive(LAST_S):
@@ -110,13 +117,18 @@ def driver(
                     "the stream of %s ends here and is delivered; %s keeps it", robot, source.path
                 )
                 source.tell(translated.figures(), translated.warnings())
-            for topic, count in translated.taken.items():
-                _LOG.info("%s: %d messages", topic, count)
-            for reason, count in translated.dropped.items():
-                _LOG.warning("%s: %d", reason, count)
-            for text in translated.warnings():
-                _LOG.warning("%s", text)
+            _log_totals(translated)
     except MeasurementError as error:
         fail(f"--start: {error}", WRONG_USE)
     except DriverError as error:
         fail(str(error), FAILED)
+
+
+def _log_totals(translated: "Ros2Driver") -> None:
+    """Log what was taken and dropped in all, and the warnings that remain."""
+    for topic, count in translated.taken.items():
+        _LOG.info("%s: %d messages", topic, count)
+    for reason, count in translated.dropped.items():
+        _LOG.warning("%s: %d", reason, count)
+    for text in translated.warnings():
+        _LOG.warning("%s", text)

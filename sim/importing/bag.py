@@ -1,15 +1,23 @@
 """ROS 2 bags → tables: finds the topics, and converts their messages."""
 
 from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sim.importing.bag_topics import UndecidedError, decided, listing
 from sim.importing.tables import RobotTables
 from team.ros2.bags import Bag, opened_bag
-from team.ros2.decoding import DamagedError, Record, TransformsRecord, decode
+from team.ros2.decoding import (
+    DamagedError,
+    OdometryRecord,
+    Record,
+    TransformsRecord,
+    decode,
+)
 from team.ros2.frames import Frames
-from team.ros2.keys import static_topics
+from team.ros2.keys import moving_topics, static_topics
+from team.ros2.owners import Owners
 from team.ros2.topics import Topics
 from team.ros2.translator import Translator
 
@@ -36,7 +44,7 @@ def imported_bag(path: Path, topics: Topics | None, robot: str | None) -> Import
     with opened_bag(path) as bag:
         chosen = topics or decided(bag, path, robot)
         _check_present(chosen, bag, path)
-        return _translated(bag, chosen)
+        return _translated(bag, chosen, path)
 
 
 def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
@@ -50,11 +58,8 @@ def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
                 )
 
 
-def _translated(bag: Bag, topics: Topics) -> Imported:
-    translators = {
-        name: Translator(each, _static_frames(bag, each.odometry))
-        for name, each in topics.robots.items()
-    }
+def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
+    translators = _translators(bag, topics)
     tables = {name: RobotTables(name) for name in topics.robots}
     robots_by_topic: dict[str, list[str]] = {}
     for name, robot in topics.robots.items():
@@ -78,6 +83,9 @@ def _translated(bag: Bag, topics: Topics) -> Imported:
         for name in robots_by_topic[raw.topic]:
             for measured in translators[name].take(raw.topic, record):
                 tables[name].take(measured)
+    questions = [text for each in translators.values() if (text := each.question())]
+    if questions:
+        raise UndecidedError(f"{path}: {questions[0]}")
     notes = [
         f"{topic}: {count} of {seen[topic]} messages dropped: damaged (first: {first[topic]})"
         for topic, count in sorted(damaged.items())
@@ -91,6 +99,28 @@ def _translated(bag: Bag, topics: Topics) -> Imported:
         notes += [f"{name}: {count} dropped: {why}" for why, count in translator.dropped.items()]
         notes += _mounted(translator, tables[name])
     return Imported(list(tables.values()), notes, sum(seen.values()))
+
+
+def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
+    """A translator for each robot; where robots share a topic of detections, all transforms of the
+    bag are read first, since they tell whose a detection is.
+    """
+    frames = {name: _static_frames(bag, each.odometry) for name, each in topics.robots.items()}
+    owners = Owners(topics.robots, frames)
+    translators = {
+        name: Translator(each, frames[name], name, owners) for name, each in topics.robots.items()
+    }
+    if owners.shared:
+        for name, each in topics.robots.items():
+            for record in _records(bag, {each.odometry}):
+                if isinstance(record, OdometryRecord):
+                    owners.add_odometry(name, record.frame, record.child)
+                    break
+            moving = moving_topics(each.odometry) | owners.shared
+            for record in _records(bag, moving):
+                if isinstance(record, TransformsRecord):
+                    owners.add_links([name], translators[name].links(record))
+    return translators
 
 
 def _stamped(record: Record, arrival_ns: int) -> Record:
@@ -115,13 +145,17 @@ def _static_frames(bag: Bag, odometry: str) -> Frames:
     odometry topic has, too.
     """
     frames = Frames()
-    static = static_topics(odometry)
-    for raw in bag.messages(static):
-        try:
-            record = decode(raw.kind, raw.data, bag.store)
-        except (DamagedError, KeyError):
-            continue
+    for record in _records(bag, static_topics(odometry)):
         if isinstance(record, TransformsRecord):
             for transform in record.transforms:
                 frames.take(transform)
     return frames
+
+
+def _records(bag: Bag, topics: Collection[str]) -> Iterator[Record]:
+    """The sound messages of these topics."""
+    for raw in bag.messages(topics):
+        try:
+            yield decode(raw.kind, raw.data, bag.store)
+        except (DamagedError, KeyError):
+            continue

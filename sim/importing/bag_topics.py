@@ -76,9 +76,12 @@ def _proposed(bag: Bag, robot: str | None) -> Proposal:
     robots: dict[str, RobotTopics] = {}
     others: dict[str, list[str]] = {}
     warnings: list[str] = []
-    for space in _spaces(found, tagged, bases):
+    spaces = _spaces(found, tagged, bases)
+    everyones = [] if "" in spaces or None in spaces else _candidates(found, tagged, "")[1]
+    for space in spaces:
         alone = space is None
         odometry, detections, truth = _candidates(found, tagged, space)
+        detections = detections or everyones
         name = _robot_name(_only_space(found) if space is None else space, robot if alone else None)
         if len(odometry) != 1:
             warnings.append(

@@ -85,13 +85,27 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 
 @dataclass
 class Frames:
-    """The transforms that do not change: each frame's pose in its parent."""
+    """The transforms that do not change: each frame's pose in its parent.
+
+    moving: the parents of frames whose transforms may change.
+    """
 
     parents: dict[str, Transform] = field(default_factory=dict)
+    moving: dict[str, str] = field(default_factory=dict)
 
     def take(self, transform: Transform) -> None:
         """Add a static transform."""
         self.parents[transform.child] = transform
+
+    def above(self, frame: str) -> list[str]:
+        """The frame and its ancestors, by transforms of both kinds."""
+        found = [frame]
+        while len(found) < DEEPEST:
+            parent = self.parents[frame].parent if frame in self.parents else self.moving.get(frame)
+            if parent is None:
+                break
+            found.append(frame := parent)
+        return found
 
     def base_from(
         self, frame: str, base: str

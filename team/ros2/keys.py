@@ -11,6 +11,7 @@ RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
 BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
 SLASH = "§"
 STATIC = "tf_static"
+MOVING = "tf"
 
 
 def expressions(topics: Iterable[str], domain: int) -> list[str]:
@@ -38,5 +39,14 @@ def of_token(key: str) -> tuple[str, str] | None:
 
 def static_topics(odometry: str) -> set[str]:
     """The topics of a robot's static transforms: /tf_static, and those in its namespaces."""
+    return _in_spaces(odometry, STATIC)
+
+
+def moving_topics(odometry: str) -> set[str]:
+    """The topics of a robot's other transforms: /tf, and those in its namespaces."""
+    return _in_spaces(odometry, MOVING)
+
+
+def _in_spaces(odometry: str, name: str) -> set[str]:
     spaces = odometry.strip("/").split("/")[:-1]
-    return {"/" + "/".join([*spaces[:k], STATIC]) for k in range(len(spaces) + 1)}
+    return {"/" + "/".join([*spaces[:k], name]) for k in range(len(spaces) + 1)}

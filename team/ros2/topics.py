@@ -22,7 +22,8 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry_frame → base_frame. detections: messages of a detector, or tf2_msgs/TFMessage whose
     child frames are tags. truth: nav_msgs/Odometry or a pose, for the evaluation.
     teammates: the tags that robots carry, by the tag's number; landmarks: numbers of tags that are
-    called otherwise; names: whether the id (the class where it is empty) or the class names a
+    called otherwise; frames: those of its detections, where transforms do not tell whose they are;
+    names: whether the id (the class where it is empty) or the class names a
     detection of vision_msgs. mount: the sensor's pose (x, y, yaw) on the base and
     optical: whether its frame is a camera's (z ahead, x right); both are of tf_static if absent.
     types: of topics that come over a bridge which does not tell them.
@@ -34,6 +35,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     truth: str = ""
     base_frame: str = "base_link"
     odometry_frame: str = "odom"
+    frames: tuple[str, ...] = ()
     teammates: dict[str, RobotName] = {}
     landmarks: dict[str, Annotated[int, Meta(ge=0, lt=2**31)]] = {}
     types: dict[str, str] = {}
@@ -61,4 +63,12 @@ def load_topics(path: Path) -> Topics:
         raise TopicsError(f"{path}: {error}; docs/your_ros2_robot.md has an example") from None
     if not found.robots:
         raise TopicsError(f"{path}: no robot; give [robots.r1] with odometry and detections")
+    robots: dict[tuple[str, str, str], str] = {}
+    for name, each in found.robots.items():
+        motion = each.odometry, each.odometry_frame, each.base_frame
+        if (other := robots.setdefault(motion, name)) != name and each.odometry:
+            raise TopicsError(
+                f"{path}: {other} and {name} have the same odometry, {each.odometry}: give each "
+                "its own topic, or, of transforms, its own odometry_frame and base_frame"
+            )
     return found

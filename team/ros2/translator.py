@@ -15,10 +15,14 @@ from team.ros2.decoding import (
     TransformsRecord,
 )
 from team.ros2.frames import BODY, OPTICAL, Frames, Mount, heading
+from team.ros2.owners import Owners
 from team.ros2.topics import RobotTopics
 
 TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")
 """A tag's name: its number, with its family before it (tag36h11:7) or alone."""
+
+MOST_NAMED = 20
+"""Frames that are not decided are told apart up to this number."""
 
 
 class Pose(NamedTuple):
@@ -57,12 +61,24 @@ Measured = Pose | Speeds | Seen
 class Translator:
     """Takes one robot's messages in order of arrival; `dropped` counts those left out, by reason.
 
-    mounts: the sensors' mounts by frame, each from its first detection on.
+    mounts: the sensors' mounts by frame, each from its first detection on. robot, owners: its name
+    among those that share its topics.
     """
 
-    def __init__(self, topics: RobotTopics, frames: Frames | None = None) -> None:
+    def __init__(
+        self,
+        topics: RobotTopics,
+        frames: Frames | None = None,
+        robot: str = "",
+        owners: Owners | None = None,
+    ) -> None:
         self.topics = topics
         self.frames = Frames() if frames is None else frames
+        self.robot = robot
+        self.owners = Owners({robot: topics}, {robot: self.frames}) if owners is None else owners
+        self._unclaimed: set[str] = set()
+        self._some_decided = False
+        self._is_shared = False
         self.dropped: Counter[str] = Counter()
         self.mounts: dict[str, Mount] = {}
         self.said: list[str] = []
@@ -76,15 +92,22 @@ class Translator:
         if topic == topics.odometry:
             found += self._odometry(record)
         if topic in topics.detections:
-            found += self._detections(record)
+            if isinstance(record, TransformsRecord):
+                self.owners.add_links([self.robot], self.links(record))
+            found += self._detections(topic, record)
         if topic == topics.truth:
             found += self._truth(record)
         return found
+
+    def links(self, record: TransformsRecord) -> list[tuple[str, str]]:
+        """The (parent, child) of transforms that are no tags'."""
+        return [(t.parent, t.child) for t in record.transforms if not self._is_tag(t)]
 
     def take_static(self, record: TransformsRecord) -> None:
         """Static transforms; a sensor whose place was not known is looked for again."""
         for transform in record.transforms:
             self.frames.take(transform)
+        self.owners.forget()
         for frame in self._guessed & self.mounts.keys():
             if self.frames.mount(frame, self.topics.base_frame) is not None:
                 self._guessed.discard(frame)
@@ -96,10 +119,13 @@ class Translator:
 
     def _odometry(self, record: Record) -> list[Measured]:
         match record:
-            case OdometryRecord() if self.topics.use == "pose":
+            case OdometryRecord():
+                self.owners.add_odometry(self.robot, record.frame, record.child)
+                if self.topics.use == "twist":
+                    return [Speeds(record.stamp_ns, record.forward, record.yaw_rate)]
                 x, y, _ = record.position
                 return [Pose(record.stamp_ns, x, y, heading(record.rotation))]
-            case OdometryRecord() | SpeedRecord():
+            case SpeedRecord():
                 return [Speeds(record.stamp_ns, record.forward, record.yaw_rate)]
             case TransformsRecord():
                 ours = (self.topics.odometry_frame, self.topics.base_frame)
@@ -120,20 +146,68 @@ class Translator:
                 self.dropped["no pose in a message of the truth topic"] += 1
                 return []
 
-    def _detections(self, record: Record) -> list[Measured]:
+    def _detections(self, topic: str, record: Record) -> list[Measured]:
         match record:
+            case TagsRecord() if not self._is_ours(record.frame, topic in self.owners.shared):
+                return []
             case TagsRecord():
                 tags = [(self._name(tag), tag.position, tag.covariance) for tag in record.tags]
                 return self._seen(record.stamp_ns, record.frame, tags)
             case TransformsRecord():
                 found = []
+                shared = topic in self.owners.shared or None
                 for t in record.transforms:
-                    if t.child in self.topics.landmarks or TAG.match(t.child):
+                    if self._is_tag(t) and self._is_ours(t.parent, shared):
                         found += self._seen(t.stamp_ns, t.parent, [(t.child, t.position, None)])
                 return found
             case _:
                 self.dropped["no detection in a message of a detections topic"] += 1
                 return []
+
+    def _is_tag(self, transform: Transform) -> bool:
+        return transform.child in self.topics.landmarks or bool(TAG.match(transform.child))
+
+    def _is_ours(self, frame: str, shared: bool | None) -> bool:
+        """Whether detections in a frame are this robot's.
+
+        shared: whether other robots have the topic; None: it has transforms, which may be of robots
+        that the file of topics does not have. Of several frames there, one that hangs from no base
+        is not decided.
+        """
+        owner = self.owners.owner(frame)
+        if owner == self.robot:
+            self._some_decided = True
+            return True
+        if owner is not None:
+            self.dropped[f"a detection in a frame of {owner}"] += 1
+            return False
+        if self.topics.frames:
+            self.dropped["a detection in a frame that `frames` does not list"] += 1
+            return False
+        if shared is False:
+            return True
+        self._is_shared |= shared is True
+        if len(self._unclaimed) < MOST_NAMED:
+            self._unclaimed.add(frame)
+        if self.undecided:
+            self.dropped["a detection in a frame that hangs from no robot's base"] += 1
+        return not self.undecided
+
+    @property
+    def undecided(self) -> set[str]:
+        """The frames whose detections nothing assigns to a robot, and which are left out."""
+        alone = len(self._unclaimed) == 1 and not (self._is_shared or self._some_decided)
+        return set() if alone else self._unclaimed
+
+    @property
+    def has_detections(self) -> bool:
+        """Whether a detection was assigned to this robot by its frame."""
+        return self._some_decided
+
+    def question(self) -> str:
+        """The text about the frames that are not decided, with the remedy; empty without any."""
+        frames = {frame for frame in self._unclaimed if self.owners.owner(frame) is None}
+        return self.owners.question(self.robot, frames) if frames and self.undecided else ""
 
     def _seen(self, stamp_ns: int, frame: str, tags: list[tuple]) -> list[Measured]:  # type: ignore[type-arg]
         mount = self._mount(frame)

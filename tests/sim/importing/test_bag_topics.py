@@ -128,3 +128,86 @@ def test_what_was_stamped_before_the_clock_was_set_is_dropped_and_counted(tmp_pa
     assert "r1: 2 odometry rows dropped: by another clock than most rows: it jumps" in result.output
     (stream,) = read(tmp_path / "set").streams
     assert stream.intervals.duration_ns.tolist() == [S, S, S]
+
+
+def shared_tf(*, bases: tuple[str, str], odoms: tuple[str, str], linked: bool = True) -> list[Any]:
+    """Two robots, each with its odometry and camera, and one /tf with both robots' tags in it.
+
+    linked: whether /tf has the moving transform from each robot's odometry frame to its base and
+    /tf_static the one from there to its camera.
+    """
+    messages: list[Any] = []
+    for robot, base, odom, ahead in zip(("ann", "bob"), bases, odoms, (0.2, 0.7), strict=True):
+        camera = f"{robot}/camera"
+        if linked:
+            messages += static("/tf_static", (base, camera, ros.vector(ahead), LEVEL))
+            moved = ros.transforms((S, odom, base, ros.vector(1.0), LEVEL))
+            messages.append((S, "/tf", TF, moved))
+        told = odometry(f"/{robot}/odom", base)
+        for _, _, _, message in told:
+            message.header.frame_id = odom
+        tags = [(S, camera, f"tag36h11:{k}", ros.vector(2.0 + ahead), LEVEL) for k in (1, 2)]
+        messages += [*told, (S, "/tf", TF, ros.transforms(*tags[: 1 + (robot == "bob")]))]
+    return messages
+
+
+@pytest.mark.parametrize("by", ["base", "odometry frame"])
+def test_in_a_shared_tf_each_robot_has_the_detections_of_its_own_camera(
+    tmp_path: Path, by: str
+) -> None:
+    bases, odoms = ("ann/base_link", "bob/base_link"), ("ann/odom", "bob/odom")
+    messages = shared_tf(bases=bases, odoms=odoms)
+    if by == "odometry frame":  # the base of the odometry is not in the tree of transforms
+        for _, topic, kind, message in messages:
+            if kind == ODOMETRY:
+                message.child_frame_id = f"{topic.split('/')[1]}/imu"
+    result = run(ros.write_bag(tmp_path / "bag", messages), "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    ids = {s.robot: s.landmark_detections.ids.tolist() for s in read(tmp_path / "set").streams}
+    assert ids == {"ann": [1], "bob": [1, 2]}
+    assert "ann: 2 dropped: a detection in a frame of bob" in result.output
+    assert ("no transform" in result.output) == (by != "base")
+
+
+@pytest.mark.parametrize(
+    ("names", "linked"), [(("base_link", "base_link"), True), (("a/base", "b/base"), False)]
+)
+def test_detections_that_may_be_of_either_robot_are_refused_with_their_frames_and_a_remedy(
+    tmp_path: Path, names: tuple[str, str], linked: bool
+) -> None:
+    messages = shared_tf(bases=names, odoms=("odom", "odom"), linked=linked)
+    bag = ros.write_bag(tmp_path / "bag", messages)
+    topics = tmp_path / "topics.toml"
+    text = '[robots.{0}]\nodometry = "/{0}/odom"\ndetections = ["/tf"]\n'
+    topics.write_text(text.format("ann") + text.format("bob"))
+    result = run(bag, "-o", tmp_path / "set", "--ros2", topics)
+    assert isinstance(result.exception, DatasetError)  # exit status 2
+    said = str(result.exception)
+    assert "the frames ann/camera, bob/camera" in said
+    assert '[robots.ann] frames = ["ann/camera", "bob/camera"]' in said
+    assert not (tmp_path / "set").exists()
+    listed = [text.format(name) + f'frames = ["{name}/camera"]\n' for name in ("ann", "bob")]
+    topics.write_text("".join(listed))
+    assert run(bag, "-o", tmp_path / "set", "--ros2", topics).exit_code == 0
+    ids = {s.robot: s.landmark_detections.ids.tolist() for s in read(tmp_path / "set").streams}
+    assert ids == {"ann": [1], "bob": [1, 2]}
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_tags_of_a_robot_that_is_not_imported_are_not_guessed_to_be_of_the_one_that_is(
+    tmp_path: Path, linked: bool
+) -> None:
+    bases, odoms = ("ann/base_link", "bob/base_link"), ("ann/odom", "bob/odom")
+    messages = shared_tf(bases=bases, odoms=odoms, linked=linked)
+    bag = ros.write_bag(tmp_path / "bag", messages)
+    text = (
+        '[robots.ann]\nodometry = "/ann/odom"\ndetections = ["/tf"]\nbase_frame = "ann/base_link"\n'
+    )
+    (tmp_path / "topics.toml").write_text(text)
+    result = run(bag, "-o", tmp_path / "set", "--ros2", tmp_path / "topics.toml")
+    assert isinstance(result.exception, DatasetError)
+    assert "bob/camera" in str(result.exception)
+    (tmp_path / "topics.toml").write_text(text + 'frames = ["ann/camera"]\n')
+    result = run(bag, "-o", tmp_path / "set", "--ros2", tmp_path / "topics.toml")
+    assert "ann: 2 dropped: a detection in a frame that `frames` does not list" in result.output
+    assert read(tmp_path / "set").streams[0].landmark_detections.ids.tolist() == [1]
