@@ -19,8 +19,6 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from tests import sizes
-
 ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests"
 PACKAGES = ("team", "central", "sim")
@@ -395,10 +393,3 @@ def test_linear_algebra_that_is_loaded_after_estimation_has_one_thread_too() -> 
         [sys.executable, "-c", code], env=bare, capture_output=True, text=True, timeout=60
     )
     assert ran.stdout == "[1, 1]\n", ran.stderr
-
-
-def test_each_long_module_and_function_has_its_reason() -> None:
-    assert [name for name, _, reason in sizes.rows() if not reason] == []
-    source = "def long():\n" + "    pass\n" * sizes.LONG_FUNCTION
-    assert list(sizes.long_functions(source)) == [("long", sizes.LONG_FUNCTION + 1)]
-    assert sizes.reason("central/node.py") == ""
