@@ -5,9 +5,8 @@
 in_a_run: an interval of odometry as the segmenter takes it, against composing it at once.
 improved: a step of FastSLAM 2.0 against one of 1.0, 100 particles and four known landmarks.
 innovation: the NIS of that step against the step.
-in_blocks: odometry at 70 Hz with a scan every half second, decoded and taken by a robot's node in
-blocks, against message by message. singly_us and in_blocks_us: what an interval then takes [us],
-with its share of scans and keyframes; they are the machine's and have no baseline.
+node_us: an interval of odometry at 70 Hz, decoded and taken by a robot's node [us], with its share
+of a scan every half second and of keyframes; it is the machine's and has no baseline.
 CPU time, the halves of a ratio alternate, each is the least of its rounds. Held against
 benchmarks/ratios.json; exit status 1 if one is worse.
 """
@@ -27,9 +26,7 @@ from team.estimation.hybrid_slam.innovation import innovation
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.models import Increment, increment_of
 from team.estimation.odometry import OdometryInterval
-from team.robot.driven import driven
 from team.robot.node import RobotNode
-from team.stream.odometry_block import decoded_odometry
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
 
@@ -100,13 +97,13 @@ def steps() -> list[Callable[[], None]]:
     return [step("fastslam1"), step("fastslam2"), judged]
 
 
-def driving() -> list[Callable[[], None]]:
-    """A robot's node takes the same payloads message by message and in blocks."""
+def driving() -> Callable[[], None]:
+    """A robot's node takes odometry and scans."""
     front_end = FrontEnd(particles=PARTICLES, keyframe_s=0.5, window_s=10.0)
     config = RobotConfig("r1", MOTION, SENSOR, front_end)
     start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
     scan = np.array([3.0, 4.0]).tobytes()
-    inputs: list[list[bytes]] = []
+    inputs: list[bytes] = []
     number = 0
     for k in range(DRIVEN):
         if k % SCANNED == 0:
@@ -120,7 +117,7 @@ def driving() -> list[Callable[[], None]]:
                 ranges=scan,
                 bearings=np.array([0.1, -0.2]).tobytes(),
             )
-            inputs += [[encoded(seen)], []]
+            inputs.append(encoded(seen))
         number += 1
         interval = m.Odometry(
             stamp_ns=(k + 1) * INTERVAL_NS,
@@ -131,40 +128,27 @@ def driving() -> list[Callable[[], None]]:
             forward=0.01,
             yaw_rate=0.02,
         )
-        inputs[-1].append(encoded(interval))
+        inputs.append(encoded(interval))
 
-    def singly() -> None:
+    def taken() -> None:
         node = RobotNode(config)
         node.handle(start, 0)
-        for payload in (each for run in inputs for each in run):
+        for payload in inputs:
             node.handle(decoded(payload), 0)
 
-    def in_blocks() -> None:
-        node = RobotNode(config)
-        node.handle(start, 0)
-        for run in inputs:
-            if len(run) == 1:
-                node.handle(decoded(run[0]), 0)
-                continue
-            table = decoded_odometry("r1", run)
-            block = table.block("r1", 0, 0, len(run))
-            driven(node, block, lambda message: node.handle(message, 0))
-
-    return [singly, in_blocks]
+    return taken
 
 
 def measured(rounds: int) -> dict[str, float]:
     """The ratios."""
-    singly, in_blocks = least(driving(), rounds)
+    (node,) = least([driving()], rounds)
     at_once, in_a_run = least([composed_at_once, composed_in_a_run], rounds)
     plain, improved, judged = least(steps(), rounds)
     return {
         "in_a_run": in_a_run / at_once,
         "improved": improved / plain,
         "innovation": judged / improved,
-        "in_blocks": in_blocks / singly,
-        "singly_us": 1e6 * singly / DRIVEN,
-        "in_blocks_us": 1e6 * in_blocks / DRIVEN,
+        "node_us": 1e6 * node / DRIVEN,
     }
 
 

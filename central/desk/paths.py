@@ -16,9 +16,7 @@ from team import translate
 from team.containment import Boundary
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.window_path import Ends, placed, window_path
-from team.robot.driven import driven
 from team.robot.node import RobotNode
-from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
@@ -73,10 +71,7 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
     if measurements is not None:
         count = max(measurements) + 1
         for each in measurements.consecutive(0, count):
-            if isinstance(each, OdometryBlock):
-                driven(node, each, lambda message: boundary.give(node, message))
-            else:
-                boundary.give(node, each)
+            boundary.give(node, each)
     end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
     boundary.give(node, m.End(stamp_ns=0, streams=(end,)))
     return windows

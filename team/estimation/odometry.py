@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 
 from team.config import MotionModel
 from team.estimation import dense, elementary
@@ -80,35 +80,6 @@ class OdometryInterval(NamedTuple):
         s, c = elementary.sin_and_cos(0.5 * turn)
         column[0], column[1] = c * x + s * y, c * y - s * x
         return column
-
-
-class Intervals(NamedTuple):
-    """Consecutive intervals that tell speeds, one row each: ends and durations [ns], mean forward
-    speeds [m/s] and yaw rates [rad/s].
-    """
-
-    ends_ns: Int64[np.ndarray, " n"]
-    durations_ns: Int64[np.ndarray, " n"]
-    forward: Float[np.ndarray, " n"]
-    yaw_rates: Float[np.ndarray, " n"]
-
-    def first(self, count: int) -> "Intervals":
-        """The first `count` of them."""
-        return self.part(0, count)
-
-    def part(self, begin: int, end: int) -> "Intervals":
-        """Those from `begin` to `end` − 1."""
-        if not begin and end >= len(self.forward):
-            return self
-        return Intervals(*(column[begin:end] for column in self))
-
-    @property
-    def last(self) -> OdometryInterval:
-        """The last one."""
-        end_ns, duration_ns = int(self.ends_ns[-1]), int(self.durations_ns[-1])
-        return OdometryInterval(
-            end_ns, duration_ns, float(self.forward[-1]), float(self.yaw_rates[-1])
-        )
 
 
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)

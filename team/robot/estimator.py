@@ -16,7 +16,7 @@ from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import TeammateScan
-from team.estimation.odometry import Intervals, OdometryInterval
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.estimation.submap import Became, LocalMap
 from team.pairs import ESTIMATORS
@@ -134,16 +134,6 @@ class MakesSubmaps(Protocol):
 
     def open_window(self) -> LocalMap | None:
         """The Gaussian since the last submap, if there is a keyframe in it."""
-
-
-@runtime_checkable
-class DrivesOn(Protocol):
-    """An estimator that takes many odometry intervals at once."""
-
-    def drive_on(self, intervals: Intervals) -> int:
-        """Take the first of some measured intervals, those that lead to no estimate; returns their
-        number.
-        """
 
 
 @runtime_checkable

@@ -22,7 +22,6 @@ from team.robot.estimator import (
     NOTHING_KNOWN,
     NOTHING_NEW,
     Associates,
-    DrivesOn,
     Estimates,
     InitialPose,
     KnownMap,
@@ -31,7 +30,6 @@ from team.robot.estimator import (
     estimator_of,
 )
 from team.stream.judge import StreamJudge
-from team.stream.odometry_block import OdometryBlock
 from team.wire import messages as m
 
 MOST_SET_ASIDE = 8
@@ -63,12 +61,11 @@ class BoundedEstimator:
         self._keeps_window = PAIRS[config.estimator, config.fusion] == "submap"
         self.estimator: RobotEstimator
         self._windows: MakesSubmaps | None
-        self._drives_on: DrivesOn | None
         self._begin_estimator(0, AT_ORIGIN)
         self._judge = StreamJudge(config.bounds)
         self._start: m.InitialPose | None = None
         self._closed: list[ClosedWindow] = []
-        self._window: list[m.Measurement | OdometryBlock] = []
+        self._window: list[m.Measurement] = []
         self._aside = 0
         self.submaps: list[LocalMap] = []
         self.gated = 0
@@ -118,7 +115,6 @@ class BoundedEstimator:
         known = self._known or NOTHING_KNOWN
         self.estimator = estimator_of(self._config, incarnation, initial, known)
         self._windows = self.estimator if isinstance(self.estimator, MakesSubmaps) else None
-        self._drives_on = self.estimator if isinstance(self.estimator, DrivesOn) else None
 
     def resume(self, submap: m.Submap) -> None:
         """Continue behind the next submap of an earlier process. Raises ValueError where there
@@ -180,9 +176,6 @@ class BoundedEstimator:
         self._judge = StreamJudge(self._config.bounds, end_ns)
         for measurement in self._window:
             match measurement:
-                case OdometryBlock():
-                    for each in measurement.messages():
-                        self.drive(each)
                 case m.Odometry() | m.Increment() | m.Steering():
                     self.drive(measurement)
                 case m.Observations() | m.Points() | m.Detections():
@@ -218,27 +211,6 @@ class BoundedEstimator:
         if rejected not in UNMEASURED:
             return IntervalOutcome(NOTHING_NEW, rejected)
         return IntervalOutcome(self.estimator.drive(interval, measured=rejected is None), rejected)
-
-    def drive_on(self, block: OdometryBlock) -> int:
-        """Take the first of many odometry intervals at once, those that are within the bounds and
-        lead to no estimate, as `drive` takes each; returns their number.
-        """
-        if self._drives_on is None or self._start is None:
-            return 0
-        intervals, began_ns = block.intervals(self._config.clock_offset_s), self._start.stamp_ns
-        count = self._judge.sensible(intervals)
-        if not count or block.stamps_ns[0] < began_ns:
-            return 0
-        if another_time(int(block.stamps_ns[count - 1]), began_ns) is not None:
-            return 0
-        count = self._drives_on.drive_on(intervals.first(count))
-        if count:
-            self._judge.passed(int(intervals.ends_ns[count - 1]))
-            if self._windows is not None:
-                self._windows.consumed(block.first + count - 1)
-            if self._keeps_window:
-                self._window.append(block.part(0, count))
-        return count
 
     def observe(self, measurement: m.AnyScan | m.Detections) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""

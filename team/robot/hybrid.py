@@ -22,7 +22,7 @@ from team.estimation.hybrid_slam.pose_grid import TeammateScan
 from team.estimation.map_joining.conditioning import pose_now
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.map_joining.whole_map import WholeMap, absorbed, initial_map, joined
-from team.estimation.odometry import Intervals, OdometryInterval
+from team.estimation.odometry import OdometryInterval
 from team.estimation.plausible import are_landmarks
 from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
@@ -100,15 +100,6 @@ class HybridEstimator:
             return self._with_submap(closed)
         now_ns = self._slam.last_keyframe_ns
         return NOTHING_NEW if now_ns == before_ns else Estimates(pose_ns=now_ns)
-
-    def drive_on(self, intervals: Intervals) -> int:
-        """Take the first of some measured intervals at once, those that lead to nothing else;
-        returns their number.
-        """
-        count = self._slam.drive_on(intervals)
-        if count:
-            self._open = None
-        return count
 
     def finish(self) -> tuple[Estimates, int]:
         """End the stream; returns the last submap, and the number of scans that no odometry

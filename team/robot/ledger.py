@@ -63,13 +63,6 @@ class Ledger:
         self.counts[disposition] += 1
         self._on_disposition(number, disposition)
 
-    def count_intervals(self, first: int, count: int) -> None:
-        """Counts so many odometry intervals from a number on, all of them used."""
-        self.counts[self.used] += count
-        if self._on_disposition is not no_listener:
-            for number in range(first, first + count):
-                self._on_disposition(number, self.used)
-
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
         """Recounts measurements that were counted as used and were not, for this reason."""
         for number in numbers:

@@ -34,7 +34,6 @@ from team.robot.statements import MessageWriter
 from team.robot.stream_end import EndOfStream
 from team.robot.warnings import driver_away, slipped, unexpected
 from team.stream.inbox import Inbox
-from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -44,9 +43,6 @@ from team.wire.digest import configured
 AHEAD = 64
 """Number of submaps of an earlier process that the centre may have taken since it was asked for
 them."""
-
-AT_ONCE = 1000
-"""Most odometry intervals that are taken at once: what one of them leads to is known only there."""
 
 Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWindow]
 """What is sent instead of a closed window, given the team's map and the submaps before it."""
@@ -282,34 +278,6 @@ class RobotNode:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
         out = [*self._handled(message), *self._go_on()]
         return self._sound(out) if out else out
-
-    def drive_on(self, block: OdometryBlock) -> tuple[int, list[Outgoing]]:
-        """Take the first of many odometry intervals at once: those that only move the robot, as
-        `handle` takes each. Returns their number and what is to be published. The next one needs
-        `handle`, unless all or AT_ONCE of them were taken.
-        """
-        inbox, pace = self._inbox, self._pace
-        is_own = block.robot == self.robot and inbox.is_next(block.incarnation, block.first)
-        here = is_own and block.incarnation == self._incarnation and self._consumed == block.first
-        if not here or self._pending or self._blocked or not self._stream_end.is_open:
-            return 0, []
-        count = self._front.drive_on(block.part(0, AT_ONCE))
-        if not count:
-            return 0, []
-        inbox.passed(count)
-        self._steps += count
-        self.ledger.count_intervals(block.first, count)
-        offset_ns, reports, taken = round(self.config.clock_offset_s * 1e9), [], 0
-        while taken < count:
-            to_report = min(max(pace.until_report, 1), count - taken)
-            taken += to_report
-            self._consumed += to_report
-            pace.unreported += to_report
-            end_ns = int(block.stamps_ns[taken - 1]) + offset_ns
-            self._now_ns, self._passed_ns = max(self._now_ns, end_ns), max(self._passed_ns, end_ns)
-            if pace.until_report <= 0:
-                reports.append(self._progress())
-        return count, reports
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue behind a measurement whose handling raised an exception, as if it had not come.

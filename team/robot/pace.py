@@ -69,11 +69,6 @@ class Pace:
         self.credited = received
         return True
 
-    @property
-    def until_report(self) -> int:
-        """Number of measurements to the next report of progress."""
-        return PROGRESS_MEASUREMENTS - self.unreported
-
     def counted(self) -> bool:
         """Count a used measurement; returns whether progress is to be reported."""
         self.unreported += 1

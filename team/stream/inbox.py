@@ -56,16 +56,6 @@ class Inbox:
         ):
             self._waiting[measurement.number] = measurement
 
-    def is_next(self, incarnation: int, number: int) -> bool:
-        """Whether this measurement is the one whose turn it is, and no other waits for its own."""
-        waits = self._waiting or self._later or self._of_source
-        here = self.incarnation == incarnation and 0 < self.next_measurement == number
-        return here and not waits
-
-    def passed(self, count: int) -> None:
-        """Note that so many measurements have been consumed when each `is_next`."""
-        self.next_measurement += count
-
     def refusal(self, measurement: Measurement) -> str | None:
         """Why a measurement can not be of this stream, in words; None if it can.
 

@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from team.config import Bounds
-from team.estimation.compiled import compiled
-from team.estimation.odometry import Intervals, OdometryInterval
+from team.estimation.odometry import OdometryInterval
 from team.estimation.plausible import is_motion_spread as _spread
 from team.rejection import Rejection
 
@@ -56,22 +55,6 @@ class StreamJudge:
         )
         return None if sensible else Rejection.SPEED
 
-    def sensible(self, intervals: Intervals) -> int:
-        """Number of the first intervals that `odometry` would not refuse, which are all in their
-        order. 0 for a stream that has none yet.
-        """
-        if self._now_ns is None:
-            return 0
-        bounds = self._bounds
-        speeds = bounds.speed_m_s, bounds.yaw_rate_rad_s
-        longest_ns = min(bounds.interval_s * 1e9, 2.0**52)
-        jump_ns = min(self._jump_ns, LONGEST_NS)
-        return _sensible(intervals, self._now_ns, jump_ns, longest_ns, speeds)
-
-    def passed(self, end_ns: int) -> None:
-        """Note that all `sensible` intervals up to this time have been taken."""
-        self._now_ns, self._jumped_ns = end_ns, None
-
     def time(self, stamp_ns: int) -> Rejection | None:
         """Why a measurement at this time is refused."""
         ahead_ns = 0 if self._now_ns is None else stamp_ns - self._now_ns
@@ -81,21 +64,3 @@ class StreamJudge:
         """Which ranges are within the bounds."""
         within: Bool[np.ndarray, " n"] = ranges <= self._bounds.extent_m
         return within
-
-
-@compiled
-def _sensible(
-    intervals: Intervals,
-    now_ns: int,
-    jump_ns: int,
-    longest_ns: float,
-    speeds: tuple[float, float],
-) -> int:
-    for k in range(len(intervals.forward)):
-        end_ns, duration_ns = intervals.ends_ns[k], intervals.durations_ns[k]
-        in_time = 0 < end_ns - now_ns <= jump_ns and 0 < duration_ns <= longest_ns
-        slow = abs(intervals.forward[k]) <= speeds[0] and abs(intervals.yaw_rates[k]) <= speeds[1]
-        if not (in_time and slow):
-            return k
-        now_ns = end_ns
-    return len(intervals.forward)

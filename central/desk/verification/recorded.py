@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import TypeVar
 
 import msgspec
-import numpy as np
 
 from central.config import CentralConfig
 from central.desk.names import in_order
@@ -14,7 +13,6 @@ from central.desk.verification.measurements import RecordedMeasurements
 from team.config import RobotConfig
 from team.former_names import with_current_names
 from team.recording.reader import Log, LogError
-from team.stream.odometry_block import decoded_odometry
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -60,39 +58,16 @@ class Recorded:
     known_map: m.KnownMap | None = None
     withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
     unsound: int = 0
-    _filed: int = 0
     _indexed: int = 0
     _by_channel: dict[str, list[RecordedOutput]] = field(default_factory=dict)
 
     def take_all(self, samples: Sequence[Sample]) -> None:
-        """File samples in the order of the log; those with odometry are decoded together."""
-        odometry: dict[str, list[int]] = {}
-        for place, sample in enumerate(samples):
-            robot = _driver_of(sample.key)
-            if robot is None:
-                self.take(sample, self._filed + place)
-            else:
-                odometry.setdefault(robot, []).append(place)
-        for robot, places in odometry.items():
-            table = decoded_odometry(robot, [samples[place].payload for place in places])
-            of_log = self._filed + np.array(places)
-            for k in np.flatnonzero(~table.is_plain).tolist():
-                self.take(samples[places[k]], int(of_log[k]))
-            for incarnation in np.unique(table.incarnations[table.is_plain]).tolist():
-                rows = table.is_plain & (table.incarnations == incarnation)
-                self._stream(robot, incarnation).put_rows(table.only(rows), of_log[rows])
-        self._filed += len(samples)
+        """File samples in the order of the log."""
+        for sample in samples:
+            self.take(sample)
 
-    def _stream(self, robot: str, incarnation: int) -> RecordedMeasurements:
-        there = self.measurements.get((robot, incarnation))
-        if there is None:
-            there = self.measurements[robot, incarnation] = RecordedMeasurements(robot, incarnation)
-        return there
-
-    def take(self, sample: Sample, place: int = 0) -> None:
-        """File one sample, at this place of the log; a viewer's samples are neither input nor
-        output.
-        """
+    def take(self, sample: Sample) -> None:
+        """File one sample; a viewer's samples are neither input nor output."""
         if _is_a_view(sample.key):
             return
         try:
@@ -102,7 +77,8 @@ class Recorded:
             return
         match message:
             case m.Measurement():
-                self._stream(message.robot, message.incarnation).put(message, place)
+                stream = (message.robot, message.incarnation)
+                self.measurements.setdefault(stream, RecordedMeasurements()).put(message)
             case m.Configuration():
                 of_a_fold = channel is ch.TEAM_CONFIG
                 self.configured["central" if of_a_fold else message.node] = message
@@ -226,11 +202,6 @@ def _is_a_view(key: str) -> bool:
 
 
 @lru_cache(maxsize=4096)
-def _driver_of(key: str) -> str | None:
-    """The robot of an odometry key; None for any other key."""
-    return ch.ODOMETRY.owner(key)
-
-
 def identity(key: str, message: m.Message) -> Identity:
     """The names of a message's inputs, after its key."""
     match message:

@@ -8,13 +8,11 @@ from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.robot.driven import driven
 from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import OnDisposition, no_listener
 from team.robot.node import RobotNode
 from team.robot.poses import RunningPoses
 from team.robot.statements import MessageWriter
-from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -64,12 +62,6 @@ class RecomputedRobot:
             on_disposition=on_disposition,
         )
         self._boundary = Boundary(ch.robot_node(config.id))
-
-    def driven(self, each: m.Measurement | OdometryBlock) -> list[Outgoing]:
-        """Handle a measurement, or many odometry intervals at once."""
-        if isinstance(each, m.Measurement):
-            return self.given(each)
-        return driven(self.node, each, self.given)
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell does: one that raises is set aside."""
@@ -171,8 +163,8 @@ def _life(
             node.node.resume(start, [s for s in chain if s.last_measurement < first])
         counter = first
         for each in measurements.consecutive(first, last):
-            yield from node.driven(each)
-            counter += each.size if isinstance(each, OdometryBlock) else 1
+            yield from node.given(each)
+            counter += 1
         if counter == last and until is not None:
             end = m.StreamEnd(robot=start.robot, incarnation=start.incarnation, measurements=until)
             yield from node.given(m.End(stamp_ns=0, streams=(end,)))
@@ -234,8 +226,8 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     done = max((d.measurements for d in _dones(log, robot, incarnation)), default=None)
     consumed = 0
     for each in measurements.consecutive(0, len(measurements) if done is None else done):
-        node.driven(each)
-        consumed += each.size if isinstance(each, OdometryBlock) else 1
+        node.given(each)
+        consumed += 1
     if consumed and done is not None:
         end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=consumed)
         node.given(m.End(stamp_ns=0, streams=(end,)))

@@ -2,8 +2,7 @@
 takes.
 """
 
-from bisect import bisect_right, insort
-from collections.abc import Sequence
+from bisect import insort
 
 import msgspec
 import numpy as np
@@ -19,7 +18,7 @@ from team.estimation.hybrid_slam.reduction import KeyframeScan, all_between, red
 from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, scanned
 from team.estimation.mount import of_sensor
-from team.estimation.odometry import STANDING, Intervals, OdometryInterval
+from team.estimation.odometry import STANDING, OdometryInterval
 from team.estimation.scans import Own, calibrated, unclaimed
 from team.rejection import Rejection
 
@@ -184,47 +183,6 @@ class Segmenter:
             self._settle()
             keyframes.append(self._close_keyframe(stamp_ns))
         return keyframes
-
-    def quiet(self, intervals: Intervals) -> int:
-        """Number of the first intervals that lead to no keyframe: no pose node and no end of a
-        keyframe is in them, and no scan that is one or ends one.
-        """
-        grid = self._grid
-        if self._sensor.is_mounted:
-            return 0
-        until_ns = [] if grid is None else [grid.quiet_until_ns]
-        full_ns = self._keyframe_start_ns + self._keyframe_ns
-        if self._keyframe:
-            until_ns.append(full_ns)
-        elif self._waiting:
-            stamp_ns = self._waiting[0].stamp_ns
-            until_ns.append(max(stamp_ns, full_ns) if self._keyframe_ns else stamp_ns)
-        ends_ns = intervals.ends_ns
-        return int(ends_ns.searchsorted(min(until_ns))) if until_ns else len(ends_ns)
-
-    def drive_on(self, intervals: Intervals) -> None:
-        """Take some of the `quiet` intervals, as `drive` takes each of them."""
-        last_ns, covered = intervals.ends_ns[-1], 0
-        if self._waiting:
-            covered = bisect_right(self._waiting, last_ns, key=lambda scan: scan.stamp_ns)
-        scans = self._waiting[:covered]
-        if not any(scan.is_unnamed for scan in scans):
-            self._waiting = self._waiting[covered:]
-            self._go_over(intervals, scans)
-            return
-        covers = int(intervals.ends_ns.searchsorted(scans[0].stamp_ns))
-        if covers:
-            self._go_over(intervals.part(0, covers))
-        self.drive(intervals.part(covers, covers + 1).last)
-        if covers + 1 < len(intervals.ends_ns):
-            self.drive_on(intervals.part(covers + 1, len(intervals.ends_ns)))
-
-    def _go_over(self, intervals: Intervals, scans: Sequence[KeyframeScan] = ()) -> None:
-        """Take intervals, and the scans in them."""
-        self._last, self._unmeasured = intervals.last, None
-        self._run.add_all(intervals, [scan.stamp_ns for scan in scans])
-        self._keyframe += scans
-        self.now_ns = self._last.end_ns
 
     def _keep(self, scan: KeyframeScan) -> None:
         """Keep a scan of the keyframe, here; its pose is known once the motion up to it is."""

@@ -2,11 +2,10 @@
 
 Odometry arrives tens of times between two uses of the resulting motion. Each interval is kept as it
 came; the motions since the last keyframe, since the last pose node and since the first scan of a
-keyframe are updated when they are needed. Where a scan lies, an interval is split, and the place is
-marked: the same call returns the pose at each mark.
+keyframe are updated when they are needed. The place of a scan is marked: the same call returns the
+pose at each mark.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from team.estimation.models import (
     scale_column,
     turn_and_drive,
 )
-from team.estimation.odometry import Intervals, OdometryInterval
+from team.estimation.odometry import OdometryInterval
 from team.estimation.placing import put
 
 Spread = Float[np.ndarray, "3 3"]
@@ -95,39 +94,6 @@ def gone_on(
 
 
 @compiled
-def split(
-    ends_ns: Int64[np.ndarray, " n"],
-    durations_ns: Int64[np.ndarray, " n"],
-    forward: Float[np.ndarray, " n"],
-    yaw_rates: Float[np.ndarray, " n"],
-    stamps_ns: Int64[np.ndarray, " m"],
-) -> tuple[Driven, Marks]:
-    """The intervals, each split where one of the ascending stamps lies in it, and their marks.
-
-    A stamp before its interval is taken as the interval's start, as one between two intervals is.
-    """
-    most = len(ends_ns) + len(stamps_ns)
-    durations, speeds, marks = (
-        np.empty(most, np.int64),
-        np.empty((2, most)),
-        np.empty_like(stamps_ns),
-    )
-    count, place = 0, 0
-    for k in range(len(ends_ns)):
-        here_ns = ends_ns[k] - durations_ns[k]
-        while here_ns < ends_ns[k] or (place < len(marks) and stamps_ns[place] <= ends_ns[k]):
-            is_marked = place < len(marks) and stamps_ns[place] <= ends_ns[k]
-            until_ns = max(stamps_ns[place], here_ns) if is_marked else ends_ns[k]
-            if until_ns > here_ns:
-                durations[count] = until_ns - here_ns
-                speeds[0, count], speeds[1, count] = forward[k], yaw_rates[k]
-                count, here_ns = count + 1, until_ns
-            if is_marked:
-                marks[place], place = count, place + 1
-    return (durations[:count], speeds[0, :count], speeds[1, :count]), marks
-
-
-@compiled
 def _adjoint_of_inverse(step: Pose, Ad: Spread) -> None:
     """`geometry.adjoint` of `geometry.inverse`, in place."""
     s, c = elementary.sin_and_cos(step[2])
@@ -143,7 +109,6 @@ class OdometryRun:
 
     def __init__(self, motion: MotionModel) -> None:
         self._model = model_of(motion)
-        self._stretches: list[Driven] = []
         self._parts: list[tuple[int, float, float]] = []
         self._marks: list[int] = []
         self._count = 0
@@ -157,26 +122,9 @@ class OdometryRun:
         self._parts.append((duration_ns, over.forward, over.yaw_rate))
         self._count += 1
 
-    def add_all(self, intervals: Intervals, stamps_ns: Sequence[int] = ()) -> None:
-        """Adds whole intervals, with a mark at each of the ascending stamps in them."""
-        self._note_parts()
-        stretch: Driven = intervals[1:]
-        if stamps_ns:
-            stretch, marks = split(*intervals, np.array(stamps_ns, np.int64))
-            self._marks += (self._count + marks).tolist()
-        self._stretches.append(stretch)
-        self._count += len(stretch[0])
-
     def mark(self) -> None:
         """Marks this place: `driven` returns the pose here."""
         self._marks.append(self._count)
-
-    def _note_parts(self) -> None:
-        if self._parts:
-            durations, forward, yaw_rates = zip(*self._parts, strict=True)
-            speeds = np.array([forward, yaw_rates], np.float64)
-            self._stretches.append((np.array(durations, np.int64), speeds[0], speeds[1]))
-            self._parts = []
 
     def behind(self, motion: Increment) -> Increment:
         """A motion followed by all stored parts, which remain stored."""
@@ -196,7 +144,7 @@ class OdometryRun:
         """The motions up to now with all stored parts, which are removed, and the poses since the
         first scan at the marks.
         """
-        whole, self._stretches = self._whole(), []
+        whole, self._parts = self._whole(), []
         marks = np.array(self._marks, np.int64) if self._marks else NO_MARKS
         self._marks, self._count = [], 0
         node = since_node.mean, since_node.covariance
@@ -204,13 +152,6 @@ class OdometryRun:
         return gone_on(since, self._model, *whole, marks)
 
     def _whole(self) -> Driven:
-        self._note_parts()
-        if len(self._stretches) != 1:
-            durations, forward, yaw_rates = zip(NO_STRETCH, *self._stretches, strict=True)
-            self._stretches = [
-                (np.concatenate(durations), np.concatenate(forward), np.concatenate(yaw_rates))
-            ]
-        return self._stretches[0]
-
-
-NO_STRETCH: Driven = (np.empty(0, np.int64), np.empty(0), np.empty(0))
+        durations = np.array([part[0] for part in self._parts], np.int64)
+        speeds = np.array([part[1:] for part in self._parts], np.float64).reshape(-1, 2)
+        return durations, np.ascontiguousarray(speeds[:, 0]), np.ascontiguousarray(speeds[:, 1])

@@ -15,7 +15,6 @@ configuration and (seed, robot, incarnation, sequence) alone. Joining submaps is
 from dataclasses import replace
 
 from team.config import RobotConfig
-from team.estimation.compiled import compiled
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
@@ -23,7 +22,7 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.open_window import OpenWindow
 from team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
 from team.estimation.hybrid_slam.window import Window
-from team.estimation.odometry import Intervals, OdometryInterval
+from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.estimation.submap import LocalMap
 from team.rejection import Rejection
@@ -93,29 +92,6 @@ class HybridSlam:
         if self._grid is not None:
             self._grid.go_on(stamp_ns)
         return None
-
-    def drive_on(self, intervals: Intervals) -> int:
-        """Take the first of some measured intervals at once, those that only move the robot, as
-        `drive` takes each; returns their number. The next one leads to a keyframe or closes the
-        window, or there is none.
-        """
-        if self._start_ns is None or self._is_half_a_submap:
-            return 0
-        count = self._segmenter.quiet(intervals)
-        if not count:
-            return 0
-        taken = intervals.first(count)
-        least_m = self._config.front_end.window_m
-        count, driven_m = still_open(
-            taken, self._start_ns, self._lasting_ns, self._driven_m, least_m
-        )
-        if count:
-            taken = taken.first(count)
-            self._driven_m = driven_m
-            self._segmenter.drive_on(taken)
-            if self._grid is not None:
-                self._grid.go_on(int(taken.ends_ns[-1]))
-        return count
 
     def finish(self) -> tuple[ClosedWindow | None, int]:
         """End the stream; returns the last submap, and the number of scans that no odometry
@@ -219,30 +195,6 @@ class HybridSlam:
     def innovation(self) -> Innovation:
         """The innovations of all windows of this incarnation that this process has computed."""
         return self._innovation.plus(self.window.innovation)
-
-
-@compiled
-def still_open(
-    intervals: Intervals,
-    start_ns: int,
-    lasting_ns: tuple[int, int],
-    driven_m: float,
-    least_m: float,
-) -> tuple[int, float]:
-    """Number of the first intervals that do not fill a window, as `HybridSlam._is_full` has it, and
-    the way [m] driven with them.
-
-    lasting_ns: after which a window is closed, and after which that of a standing robot is.
-    """
-    window_ns, standing_ns = lasting_ns
-    for k in range(len(intervals.forward)):
-        way = abs(intervals.forward[k]) * intervals.durations_ns[k] * 1e-9
-        lasting = intervals.ends_ns[k] - start_ns
-        stands = driven_m + way < least_m and lasting < standing_ns
-        if lasting >= window_ns and not stands:
-            return k, driven_m
-        driven_m += way
-    return len(intervals.forward), driven_m
 
 
 def _submap(window: Window) -> LocalMap:

@@ -115,13 +115,6 @@ class PoseGrid:
             times.append(self._node_ns)
         return min(times, default=None)
 
-    @property
-    def quiet_until_ns(self) -> int:
-        """Team time before which there is neither a node nor an inter-robot measurement, also of a
-        window that stays open.
-        """
-        return min([self._node_ns, *(look.stamp_ns for look in self._uncovered[:1])])
-
     def reach(self) -> bool:
         """Note that the observer is at `next_ns`; True if that is a pose node (which comes
         before measurements).

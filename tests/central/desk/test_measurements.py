@@ -1,4 +1,4 @@
-"""The measurements of a log, odometry as arrays: the same as a table of messages by number."""
+"""The measurements of a log are the first message of each number."""
 
 import msgspec
 import numpy as np
@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from central.desk.verification.measurements import RecordedMeasurements
 from central.desk.verification.recorded import Recorded
-from team.stream.odometry_block import OdometryBlock
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
@@ -64,7 +63,7 @@ def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, 
     for each in log:
         if table.setdefault(each.number, each) != each:
             contradicted.add(each.number)
-    there = found.measurements.get(("r1", 0), RecordedMeasurements("r1", 0))
+    there = found.measurements.get(("r1", 0), RecordedMeasurements())
     assert dict(there) == table
     assert {each.number for each in found.contradicted} == contradicted
     assert all((number in there) == (number in table) for number in range(-1, 14))
@@ -74,9 +73,7 @@ def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, 
     if table:
         stamps = [each.stamp_ns for each in table.values()]
         assert there.span_ns == (min(stamps), max(stamps))
-    consecutive = []
-    for each in there.consecutive(begin, end):
-        consecutive += [*each.messages()] if isinstance(each, OdometryBlock) else [each]
+    consecutive = [*there.consecutive(begin, end)]
     last = next((n for n in range(begin, end) if n not in table), end)
     assert consecutive == [table[n] for n in range(begin, last)]
 

@@ -13,7 +13,7 @@ from team.estimation import elementary, geometry
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, increment_of, located
-from team.estimation.odometry import Intervals, OdometryInterval, forward_column
+from team.estimation.odometry import OdometryInterval, forward_column
 
 SECOND = 1_000_000_000
 WHITE = MotionModel(
@@ -261,17 +261,17 @@ def test_a_run_of_intervals_is_one_after_the_other_to_the_bit(kind):
     np.testing.assert_array_equal(segmenter.rest_forward, shift)
 
 
-@pytest.mark.parametrize("at_once", [False, True])
-def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_to_the_bit(at_once):
+def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_to_the_bit():
     """Scans before and between intervals, within them, two at a time, and at their ends."""
     segmenter = Segmenter(WHITE, Sensor(), 100.0)
     segmenter.begin(0)
     durations = np.array([10, 7, 10, 10, 3, 10]) * (SECOND // 10)
     ends = np.cumsum(durations + np.array([5, 0, 0, 8, 0, 0]) * (SECOND // 10))
-    run = Intervals(ends, durations, np.linspace(0.3, 0.8, 6), np.linspace(-0.4, 0.5, 6))
+    columns = ends, durations, np.linspace(0.3, 0.8, 6), np.linspace(-0.4, 0.5, 6)
+    run = [OdometryInterval(*each) for each in zip(*map(np.ndarray.tolist, columns), strict=True)]
     stamps = sorted([1, int(ends[0]), SECOND, SECOND, int(ends[2]) + 5, int(ends[5]) - 1])
     poses, pose = [], np.zeros(3)
-    for end, duration, forward, yaw_rate in zip(*map(np.ndarray.tolist, run), strict=True):
+    for end, duration, forward, yaw_rate, *_ in run:
         here = end - duration
         for until in (*(s for s in stamps[len(poses) :] if s <= end), None):
             part = (end if until is None else max(until, here)) - here
@@ -282,12 +282,8 @@ def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_t
                 poses.append(pose)
     for k, stamp in enumerate(stamps):
         assert segmenter.observe(stamp, *scan((k, 4.0 + k, 0.2 * k))) is None
-    if at_once:
-        assert segmenter.quiet(run) == 6
-        segmenter.drive_on(run)
-    else:
-        for k in range(6):
-            assert segmenter.drive(run.part(k, k + 1).last) == []
+    for each in run:
+        assert segmenter.drive(each) == []
     (found,), _ = segmenter.cut(int(ends[-1]))
     assert found.ids.tolist() == list(range(6))
     for k, at in enumerate(poses):
