@@ -153,8 +153,9 @@ class CentralShell:
             self._shell.take([self._shell.sample_of(order)])
 
     def _awaited(self) -> tuple[str, ...]:
-        """The absent robots that the final map waits for, and what to do."""
-        now, warnings = time.monotonic(), []
+        """What the set's file lacks, and the absent robots that the final map waits for."""
+        now = time.monotonic()
+        warnings = [] if self._stored is None else [*self._stored.warnings]
         for robot in self.node.awaited:
             since = self._since.get(ch.robot_node(robot))
             if since is None and self.node.ends:

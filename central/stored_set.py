@@ -26,6 +26,11 @@ class StoredSet:
         self._found = self._keeper.members
         self._known = {member.hash for member in self._found}
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the file lacks, for the centre's status."""
+        return self._keeper.warnings
+
     def samples(self) -> list[Sample]:
         """The members in the file, as samples that arrive now."""
         now_ns, found = time.time_ns(), self._found

@@ -78,6 +78,7 @@ class PeerShell(RobotShell):
         self.run_in(Shell(bus, self._peer, self._peer.name, stop))
         self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
+        self.shell.notes = lambda: self._keeper.warnings
         self._over_since: float | None = None
         self._alone = Alone()
 
@@ -182,6 +183,7 @@ class CentreShell:
         self._shell = Shell(bus, self._peer, CENTRE, stop)
         self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
+        self._shell.notes = lambda: self._keeper.warnings
         self._alone = Alone()
 
     def run(self) -> None:

@@ -1,24 +1,40 @@
-"""A peer's set on disk: an append-only file, from which a robot continues after a restart.
+"""A peer's or a centre's set on disk: an append-only file, from which it continues after a restart.
 
 After eight bytes that say what it is come records: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A record that a crash has
-truncated is cut off when the file is opened again: its member comes from other peers, or is
-computed again. A record is in the hands of the operating system when `append` returns: a process
-that is killed loses nothing, a computer without power the last seconds.
+truncated is cut off when the file is opened again. Behind a damaged record reading continues at the
+next one whose CRC fits; the file is then written anew without the damage, which is named. What is
+lost comes from other peers, or is computed again. A record is in the hands of the operating system
+when `append` returns: a process that is killed loses nothing, a computer without power the last
+seconds.
 """
 
 import logging
+import os
 import struct
+import time
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import msgpack
 
 from team.peers.members import LARGEST_MEMBER, Member, member_of
+from team.wire import messages as m
 
 MAGIC = b"tmsset1\n"
+RETRY_S = 5.0
+"""Time [s] between two attempts to write to a file that could not be written."""
+SHOWN = 3
+"""Number of gaps of a stream that are listed."""
 _HEAD = struct.Struct("<II")
+_BODY = b"\x93"
+"""The first byte of each body: an array of three."""
+_LEAST = 4
+"""Fewest bytes of a body: the array and three empty values."""
 _LOG = logging.getLogger("teamslam")
 _LARGEST = LARGEST_MEMBER + 2**16
 
@@ -27,85 +43,239 @@ class StoreError(RuntimeError):
     """The file can not be used; the text says why and what to do."""
 
 
+class Record(NamedTuple):
+    """An intact record: its place in the file, and its member; None for one of another version."""
+
+    begin: int
+    end: int
+    member: Member | None
+
+
 def record_of(member: Member) -> bytes:
     """The record of a member."""
     body: bytes = msgpack.packb([member.key, member.payload, member.signature], use_bin_type=True)
     return _HEAD.pack(len(body), zlib.crc32(body)) + body
 
 
-def records_in(content: bytes) -> Iterator[tuple[int, Member]]:
-    """The complete members of a file, each with the end of its record; stops at a truncated one."""
+def records_in(content: bytes) -> Iterator[Record]:
+    """The intact records of a file, also those behind damaged ones."""
     at = len(MAGIC)
-    while at + _HEAD.size <= len(content):
-        length, crc = _HEAD.unpack_from(content, at)
-        body = content[at + _HEAD.size : at + _HEAD.size + length]
-        if length > _LARGEST or len(body) < length or zlib.crc32(body) != crc:
-            return
-        at += _HEAD.size + length
-        try:
-            key, payload, signature = msgpack.unpackb(body)
-            yield at, member_of(key, payload, signature)
-        except (ValueError, TypeError, msgpack.UnpackException):
-            return
+    while (begin := _next_record(content, at)) is not None:
+        length, _ = _HEAD.unpack_from(content, begin)
+        at = begin + _HEAD.size + length
+        yield Record(begin, at, _member_in(content[begin + _HEAD.size : at]))
+
+
+def _next_record(content: bytes, at: int) -> int | None:
+    """The place of the first intact record from `at` on.
+
+    A damaged record whose length is sound is skipped as a whole: what looks like a record within it
+    is its author's. Otherwise each place with the first byte of a body is tried.
+    """
+    while at + _HEAD.size <= len(content) and not _is_intact(content, at):
+        following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]
+        if not _is_intact(content, following):
+            break
+        at = following
+    while at + _HEAD.size < len(content):
+        if _is_intact(content, at):
+            return at
+        body = content.find(_BODY, at + 1 + _HEAD.size)
+        at = len(content) if body < 0 else body - _HEAD.size
+    return None
+
+
+def _is_intact(content: bytes, at: int) -> bool:
+    """Whether the bytes at this place are a whole record with its CRC."""
+    begin = at + _HEAD.size
+    if content[begin : begin + 1] != _BODY:
+        return False
+    length, crc = _HEAD.unpack_from(content, at)
+    if not _LEAST <= length <= min(_LARGEST, len(content) - begin):
+        return False
+    return zlib.crc32(memoryview(content)[begin : begin + length]) == int(crc)
+
+
+def _member_in(body: bytes) -> Member | None:
+    with suppress(ValueError, TypeError, msgpack.UnpackException):
+        key, payload, signature = msgpack.unpackb(body)
+        return member_of(key, payload, signature)
+    return None
+
+
+def missing_in(members: Iterable[Member]) -> list[str]:
+    """The submaps that a set lacks before its last one of each stream, in words."""
+    found: dict[tuple[str, int], set[int]] = {}
+    for member in members:
+        message = member.message
+        if isinstance(message, m.Submap):
+            found.setdefault((message.robot, message.incarnation), set()).add(message.sequence)
+    texts = []
+    for (robot, incarnation), numbers in sorted(found.items()):
+        there = [-1, *sorted(numbers)]
+        gaps = [(a + 1, b - 1) for a, b in pairwise(there) if b - a > 1]
+        if gaps:
+            named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in gaps[:SHOWN])
+            more = f" and {len(gaps) - SHOWN} more gaps" * (len(gaps) > SHOWN)
+            texts.append(f"submaps {named}{more} of {robot}, incarnation {incarnation}")
+    return texts
 
 
 class Store:
-    """The file of one peer; `members`: those in it when it was opened. Raises StoreError."""
+    """The file of one peer. Raises StoreError.
+
+    members: those in it when it was opened. torn: bytes of an incomplete record at its end, cut
+    off. lost: what else was damaged, in words; empty if nothing was.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
             content = path.read_bytes() if path.exists() else b""
-            if content and content[: len(MAGIC)] != MAGIC[: len(content)]:
-                raise StoreError(f"{path} is no set of a peer: give --set another file")
             found = list(records_in(content))
-            self.members = [member for _, member in found]
-            whole = found[-1][0] if found else len(MAGIC)
-            self._file = path.open("r+b" if content else "w+b", buffering=0)
-            if len(content) < len(MAGIC):
-                self._file.write(MAGIC)
-            self.torn = max(len(content) - whole, 0)
-            self._file.truncate(whole)
-            self._file.seek(whole)
+            if _is_foreign(content) and not found:
+                raise StoreError(f"{path} is no set of a peer: give --set another file")
+            self.members = [each.member for each in found if each.member is not None]
+            self._open(content, found)
         except OSError as error:
             raise StoreError(f"{path} can not be written: {error}") from error
 
+    def _open(self, content: bytes, found: Sequence[Record]) -> None:
+        self.torn, self.lost = 0, ""
+        begins = [*(each.begin for each in found), len(content)]
+        ends = [min(len(MAGIC), len(content)), *(each.end for each in found)]
+        *inner, last = [begin - end for begin, end in zip(begins, ends, strict=True)]
+        if _is_cut_off(content, ends[-1]):
+            self.torn, last = last, 0
+        holes = [size for size in (*inner, last) if size]
+        self._size = max(ends[-1], len(MAGIC))
+        if holes or content[: len(MAGIC)] != MAGIC[: len(content)]:
+            self.lost = _in_words(self.path, holes, self.members)
+            intact = b"".join(content[each.begin : each.end] for each in found)
+            with suppress(OSError):  # without room the damage stays, and is skipped each time
+                _replace(self.path, MAGIC + intact)
+                self._size = len(MAGIC) + len(intact)
+        self._file = self.path.open("r+b" if self.path.exists() else "w+b", buffering=0)
+        self._file.truncate(self._size)
+        if len(content) < len(MAGIC):
+            self._write(MAGIC, 0)
+
     def append(self, members: Iterable[Member]) -> None:
-        """Append members. Raises StoreError."""
+        """Append members, all or none. Raises StoreError."""
         records = b"".join(record_of(member) for member in members)
         if records:
             try:
-                self._file.write(records)
+                self._write(records, self._size)
             except OSError as error:
                 raise StoreError(f"{self.path} can not be written: {error}") from error
+            self._size += len(records)
+
+    def _write(self, data: bytes, at: int) -> None:
+        """Write all bytes, in as many pieces as the system takes; after an error, none."""
+        done = 0
+        try:
+            while done < len(data):
+                # A disk that becomes full takes a part without an error, and refuses the next one.
+                done += os.pwrite(self._file.fileno(), data[done:], at + done)
+        except OSError:
+            self._file.truncate(at)
+            raise
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-class Keeper:
-    """Keeps a set in its file as long as this can be written; without a path nowhere.
+def _is_cut_off(content: bytes, at: int) -> bool:
+    """Whether a file ends within the record at this place, as a process leaves it that is killed
+    while it writes.
+    """
+    if at + _HEAD.size > len(content):
+        return any(content[at:]) or at >= len(content)
+    length, _ = _HEAD.unpack_from(content, at)
+    return len(content) - at - _HEAD.size < int(length) <= _LARGEST
 
-    members: those in it when it was opened. Raises StoreError where the file can not be used.
+
+def _is_foreign(content: bytes) -> bool:
+    """Whether a file begins as none of ours; zeros are left where the power has failed."""
+    begin = content[: len(MAGIC)]
+    ours = all(here in (0, there) for here, there in zip(begin, MAGIC, strict=False))
+    return any(content) and not (ours and any(begin))
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file anew, in one step."""
+    fresh = path.with_name(path.name + ".new")
+    with fresh.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    fresh.replace(path)
+
+
+def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> str:
+    places, damaged = max(len(holes), 1), sum(holes)
+    lacks = missing_in(members)
+    missing = f"; of what is known it lacks {', '.join(lacks)}" if lacks else ""
+    return (
+        f"{path} was damaged in {places} place{'s' * (places != 1)}: {damaged} bytes are lost, "
+        f"{len(members)} members are intact{missing}; the rest of the set is asked for again"
+    )
+
+
+class Keeper:
+    """Keeps a set in its file; without a path nowhere.
+
+    members: those in it when it was opened. A file that can not be written is named; its members
+    are kept in memory and written once that is possible. Raises StoreError where the file can not
+    be used.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._store = None if path is None else Store(path)
         self.members = [] if self._store is None else self._store.members
+        self._waiting: list[Member] = []
+        self._failure = ""
+        self._retry_s = 0.0
+        if self._store is not None and self._store.lost:
+            _LOG.warning("%s", self._store.lost)
+        if self._store is not None and self._store.torn:
+            _LOG.info("%s: a record that was cut off, %d bytes", path, self._store.torn)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the file lacks, for the status of its process."""
+        lost = "" if self._store is None else self._store.lost
+        failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not kept"
+        return tuple(text for text in (failure, lost) if text)
 
     def append(self, members: Sequence[Member]) -> None:
-        """Append members; an error of the file is logged, and nothing more is kept."""
-        if self._store is None or not members:
+        """Append members; after an error, with those that could not be written before."""
+        if self._store is None:
             return
+        self._waiting += members
+        if self._waiting and time.monotonic() >= self._retry_s:
+            self._write()
+
+    def _write(self) -> None:
+        assert self._store is not None
         try:
-            self._store.append(members)
+            self._store.append(self._waiting)
         except StoreError as error:
-            _LOG.error("the set is not kept any more: %s", error)
-            self.close()
+            if not self._failure:
+                _LOG.error("the set is not kept: %s; trying again every %g s", error, RETRY_S)
+            self._failure = str(error)
+            self._retry_s = time.monotonic() + RETRY_S
+            return
+        if self._failure:
+            _LOG.warning("the set is kept again, with %d members", len(self._waiting))
+        self._waiting, self._failure, self._retry_s = [], "", 0.0
 
     def close(self) -> None:
-        """Close the file."""
+        """Write what is not written yet, and close the file."""
         if self._store is not None:
+            self._write()
+            if self._waiting:
+                _LOG.error("%d members of the set are not kept", len(self._waiting))
             self._store.close()
             self._store = None

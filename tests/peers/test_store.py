@@ -1,11 +1,22 @@
 """A set on disk: what a robot that was started again finds there, however its file was torn."""
 
+import errno
+import os
+import random
+import struct
+import zlib
+from itertools import accumulate
 from pathlib import Path
 
+import msgpack
 import pytest
 
+from team.peers.members import member_of
 from team.peers.replica import Replica
-from team.peers.store import MAGIC, Store, StoreError, record_of
+from team.peers.store import MAGIC, Keeper, Store, StoreError, record_of
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import encoded
 from tests.peers.teams import said
 
 MEMBERS = [each for occasion in said("r1", 4, "r2") for each in occasion]
@@ -48,6 +59,146 @@ def test_a_torn_or_damaged_end_is_cut_off_and_nothing_before_it(tmp_path: Path) 
     assert kept_in(tmp_path / "damaged.set", bytes(damaged)) == len(MEMBERS) - 1
     assert kept_in(tmp_path / "torn.set", MAGIC[:3]) == 0
     assert (tmp_path / "torn.set").read_bytes() == MAGIC
+
+
+RECORDS = [record_of(each) for each in MEMBERS]
+WHOLE = MAGIC + b"".join(RECORDS)
+ENDS = [len(MAGIC), *(len(MAGIC) + n for n in accumulate(map(len, RECORDS)))]
+
+
+def touched(first: int, last: int) -> set[int]:
+    """The records that have a byte in this interval, both ends included."""
+    return {k for k in range(len(RECORDS)) if ENDS[k] <= last and first < ENDS[k + 1]}
+
+
+def check_recovered(path: Path, content: bytes, lost: set[int]) -> Store:
+    """Every intact record is found, the loss is named once, and the file goes on."""
+    path.write_bytes(content)
+    store = Store(path)
+    assert store.members == [each for k, each in enumerate(MEMBERS) if k not in lost]
+    store.append([MEMBERS[0]])
+    store.close()
+    again = Store(path)
+    again.close()
+    assert again.members == [*store.members, MEMBERS[0]]
+    assert not again.lost
+    assert not again.torn
+    return store
+
+
+def test_truncated_at_any_byte_a_set_has_every_whole_record(tmp_path: Path) -> None:
+    for size in (*range(ENDS[4]), *range(ENDS[-2], len(WHOLE))):
+        cut = max(sum(end <= size for end in ENDS) - 1, 0)
+        path = tmp_path / "set"
+        path.write_bytes(WHOLE[:size])
+        store = Store(path)
+        store.close()
+        assert store.members == MEMBERS[:cut]
+        if size % 20 == 0:
+            check_recovered(path, WHOLE[:size], set(range(cut, 99)))
+        assert bool(store.torn) == (size not in (*ENDS, *range(len(MAGIC))))
+        assert not store.lost
+
+
+def test_behind_flipped_bits_a_set_has_every_intact_record_and_names_the_loss(
+    tmp_path: Path,
+) -> None:
+    rng = random.Random(1)
+    for _ in range(120):
+        damaged = bytearray(WHOLE)
+        places = rng.sample(range(len(WHOLE)), rng.choice([1, 1, 2, 5]))
+        for at in places:
+            damaged[at] ^= 1 << rng.randrange(8)
+        lost = set().union(*(touched(at, at) for at in places))
+        store = check_recovered(tmp_path / "set", bytes(damaged), lost)
+        assert store.lost or store.torn
+
+
+def test_behind_zeroed_blocks_a_set_has_every_intact_record_and_names_the_loss(
+    tmp_path: Path,
+) -> None:
+    rng = random.Random(2)
+    for _ in range(80):
+        size = rng.choice([16, 64, 512, 4096])
+        at = rng.randrange(len(WHOLE) - 16)
+        last = min(at + size, len(WHOLE)) - 1
+        damaged = bytearray(WHOLE)
+        damaged[at : last + 1] = bytes(last + 1 - at)
+        changed = [k for k in range(at, last + 1) if WHOLE[k]]
+        lost = set().union(*(touched(k, k) for k in changed))
+        store = check_recovered(tmp_path / "set", bytes(damaged), lost)
+        assert bool(store.lost or store.torn) == bool(changed)
+    assert check_recovered(tmp_path / "zeros", bytes(4096), set(range(99))).lost
+
+
+def test_what_is_known_to_be_lost_is_named_by_its_number(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    submaps = [k for k, each in enumerate(MEMBERS) if isinstance(each.message, m.Submap)]
+    damaged = bytearray(WHOLE)
+    damaged[ENDS[submaps[1]] + 30] ^= 4
+    path = tmp_path / "r1.set"
+    path.write_bytes(bytes(damaged))
+    keeper = Keeper(path)
+    (warning,) = keeper.warnings
+    keeper.close()
+    missing = MEMBERS[submaps[1]].message
+    assert isinstance(missing, m.Submap)
+    size = len(RECORDS[submaps[1]])
+    assert f"damaged in 1 place: {size} bytes are lost" in warning
+    assert f"{len(MEMBERS) - 1} members are intact" in warning
+    assert f"lacks submaps {missing.sequence} of r1" in warning
+    assert warning in caplog.text
+
+
+def test_a_record_within_a_damaged_one_is_not_taken(tmp_path: Path) -> None:
+    """Its author has put it there: only what the process itself has written counts."""
+    order = m.GivenUp(stamp_ns=0, node="robot/r2", by="nobody", reason="")
+    forged = member_of(ch.GIVEN_UP.key("robot/r2"), encoded(order))
+    body = msgpack.packb(["robot/r1/submap", record_of(forged) * 3, b""])
+    outer = bytearray(struct.pack("<II", len(body), zlib.crc32(body)) + body)
+    outer[8 + 3] ^= 1
+    path = tmp_path / "r1.set"
+    path.write_bytes(MAGIC + bytes(outer) + RECORDS[0])
+    store = Store(path)
+    store.close()
+    assert store.members == [MEMBERS[0]]
+
+
+def test_a_write_that_is_cut_short_is_finished_or_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A disk that becomes full takes a part without an error, and refuses the next write."""
+    path = tmp_path / "r1.set"
+    room = 5000
+    pwrite = os.pwrite
+
+    def into_room(file: int, data: bytes, at: int) -> int:
+        taken = min(len(data), room - at)
+        if taken <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return pwrite(file, data[: max(taken // 2, 1)], at)  # in pieces, too
+
+    monkeypatch.setattr(os, "pwrite", into_room)
+    monkeypatch.setattr("team.peers.store.RETRY_S", 0.0)
+    keeper = Keeper(path)
+    several = [MEMBERS[k % len(MEMBERS)] for k in range(60)]
+    for each in several[:50]:
+        keeper.append([each])
+    (warning,) = keeper.warnings
+    assert "No space left on device" in warning
+    assert "members are not kept" in warning
+    assert caplog.text.count("the set is not kept") == 1
+    whole = kept_in(path, path.read_bytes())
+    assert 0 < whole < 50
+    room = 10**9
+    for each in several[50:]:
+        keeper.append([each])
+    assert not keeper.warnings
+    keeper.close()
+    again = Store(path)
+    again.close()
+    assert again.members == several
 
 
 def test_another_file_is_not_overwritten(tmp_path: Path) -> None:
