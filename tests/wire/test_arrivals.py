@@ -2,9 +2,11 @@
 
 import itertools
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from team.wire.zenoh import arrivals as module
 from team.wire.zenoh.arrivals import DELAY_S, PATIENCE_S, Arrivals
 
 
@@ -69,6 +71,54 @@ def test_what_the_publisher_has_no_more_is_gone_and_named() -> None:
     assert arrivals.answered(0, 3) == [1, 4]
     assert arrivals.missing is None
     assert arrivals.lacking == [(0, 0), (2, 3)]
+
+
+def test_numbers_of_32_bits_cost_no_memory_and_no_time() -> None:
+    """A heartbeat and a reply name them; a set of them asked for 240 GB."""
+    newest = 2**32 - 2
+    arrivals: Arrivals[int] = Arrivals(0)
+    arrivals.know(newest)
+    arrivals.take(7, 7)
+    assert arrivals.answered(0, newest) == [7]
+    assert arrivals.lacking == [(0, 6), (8, newest)]
+    assert arrivals.take(newest + 1, 8) == [8]
+    assert arrivals.missing is None
+
+
+def test_a_publisher_that_leaves_gaps_without_end_is_not_tracked_without_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "MOST_GAPS", 10)
+    arrivals: Arrivals[int] = Arrivals(0)
+    delivered = []
+    for number in range(1, 2_001, 2):
+        delivered += arrivals.take(number, number)
+        assert len(arrivals.lacking) <= 22
+    assert delivered == list(range(1, 1_981, 2)), "the oldest gap is given up for each new one"
+    lost = {n for begin, end in arrivals.lacking for n in range(begin, end + 1)}
+    assert set(range(0, 2_000, 2)) <= lost
+
+
+def test_a_number_that_the_publisher_never_had_is_unlearnt() -> None:
+    """A heartbeat of another key that came under this one: the cache's reply corrects it."""
+    arrivals: Arrivals[int] = Arrivals(0)
+    arrivals.take(0, 0)
+    arrivals.know(500)
+    assert arrivals.due(0.0) is None
+    assert arrivals.due(PATIENCE_S) == (1, 500)
+    assert arrivals.answered(1, 0, known=500) == []
+    assert (arrivals.missing, arrivals.lacking) == (None, [])
+    assert arrivals.take(1, 1) == [1]
+
+
+def test_a_heartbeat_that_comes_during_the_reply_is_not_unlearnt() -> None:
+    arrivals: Arrivals[int] = Arrivals(0)
+    arrivals.take(0, 0)
+    arrivals.know(1)
+    known = arrivals.newest
+    arrivals.know(2)
+    arrivals.answered(1, 1, known=known)
+    assert arrivals.lacking == [(1, 1), (2, 2)]
 
 
 def test_of_the_newest_alone_nothing_older_is_asked_for_or_waited_for() -> None:

@@ -19,9 +19,10 @@ from team.wire import messages as m
 from team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
 from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from team.wire.zenoh import bus as zenoh_bus
+from team.wire.zenoh import recovery as recovery_module
 from team.wire.zenoh.attachment import Attachment, pack, unpack
 from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.recovery import Recovery
+from team.wire.zenoh.recovery import Heartbeat, Recovery
 from team.wire.zenoh.router import router
 from team.wire.zenoh.session import client
 from tests.support import (
@@ -409,6 +410,48 @@ def test_on_a_key_of_no_channel_nothing_is_missing(endpoint: str) -> None:
         own = Sample("robot/r13/submap", b"", 0, 0, 390)
         assert recovery.arrived(own, publisher) == []
         assert recovery.lacking() == {"robot/r13/submap": [(0, 389)]}
+
+
+def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Keys and publishers are names from the wire; what is beyond the bound is not requested."""
+    asked: list[tuple[str, str]] = []
+    monkeypatch.setattr(
+        Recovery, "_ask_cache", lambda self, key, publisher, *_: asked.append((key, publisher))
+    )
+    monkeypatch.setattr(recovery_module, "MOST_OF_A_NODE", 10)
+    monkeypatch.setattr(recovery_module, "MOST_PUBLISHERS", 15)
+    monkeypatch.setattr(recovery_module, "MOST_ASKED", 4)
+    with client(endpoint, 5.0, None) as session:
+        recovery = Recovery(session, "team/t/", lambda item: None)
+        for key in ("robot/r1/submap", "robot/r2/submap"):
+            for k in range(1_000):
+                recovery.take_heartbeat(Heartbeat(key, f"{key}/{k}", 2**32 - 2))
+        lost = {key: len(intervals) for key, intervals in recovery.lacking().items()}
+        assert lost == {"robot/r1/submap": 10, "robot/r2/submap": 5}
+        assert recovery.untracked == 1_985
+        assert len(caplog.records) < 120
+        for tick in range(40):
+            before = len(asked)
+            recovery.overdue(0.15 * tick)
+            assert len(asked) <= before + 4
+        assert len(set(asked)) == 15, "each is asked in its turn"
+
+
+def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(
+    endpoint: str,
+) -> None:
+    with client(endpoint, 5.0, None) as session:
+        source = zenoh.SourceInfo(session.declare_publisher("any").id, 0)
+        recovery = Recovery(session, "team/t/", lambda item: None)
+        own = Sample("robot/r1/submap", b"", 0, 0, 0)
+        assert recovery.arrived(own, source) == [own]
+        name = f"{source.source_id.zid}/{source.source_id.eid}"
+        recovery.take_heartbeat(Heartbeat("robot/r2/submap", name, 25))
+        assert recovery.lacking() == {}
+        recovery.take_heartbeat(Heartbeat("robot/r1/submap", name, 2))
+        assert recovery.lacking() == {"robot/r1/submap": [(1, 2)]}
 
 
 def test_receive_waits_for_the_first_and_no_longer(endpoint: str) -> None:

@@ -9,12 +9,16 @@ for as long as the publisher lives: `docs/decisions/07-delivery-by-counts.md`.
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from team.wire.intervals import IntervalSet
+
 PATIENCE_S = 0.5
 """Time [s] for which a publication is missing before it is requested from its publisher."""
 LONGEST_S = 8.0
 """Longest interval [s] between two requests; intervals double up to it."""
 DELAY_S = 2.0
 """Longest time [s] for which publications after a gap are delayed."""
+MOST_GAPS = 4096
+"""Largest number of gaps of one publisher on one key; beyond it the oldest gap is given up."""
 T = TypeVar("T")
 
 
@@ -22,25 +26,24 @@ T = TypeVar("T")
 class Arrivals(Generic[T]):
     """The publications of one publisher on one key; those before `first` are not requested.
 
+    All numbers come from the wire, so memory is in proportion to what has arrived, not to them.
+
     in_order: whether publications after a gap are delayed for a while, until the gap is closed.
     newest: the last number known, from an arrival or a heartbeat.
-    gone: intervals that the publisher itself no longer has.
     """
 
     first: int
     in_order: bool = True
     newest: int = -1
-    gone: list[tuple[int, int]] = field(default_factory=list)
-    _whole: int = field(init=False)
-    _beyond: set[int] = field(default_factory=set, init=False)
+    _settled: IntervalSet = field(default_factory=IntervalSet, init=False)
+    """The numbers from `first` on that have arrived or are gone."""
+    _gone: IntervalSet = field(default_factory=IntervalSet, init=False)
+    """The numbers that the publisher itself no longer has, and those of gaps that were given up."""
     _delayed: dict[int, T] = field(default_factory=dict, init=False)
     _since_s: float | None = field(default=None, init=False)
     _due_s: float = field(default=0.0, init=False)
     _asked: int = field(default=0, init=False)
     _loose: bool = field(default=False, init=False)
-
-    def __post_init__(self) -> None:
-        self._whole = self.first
 
     def take(self, number: int, item: T) -> list[T]:
         """Records an arrival; returns the items to be delivered now, none if it had arrived
@@ -48,13 +51,14 @@ class Arrivals(Generic[T]):
         """
         if number < self.first:  # was not asked for: Zenoh hands it over once
             return [item]
-        if number < self._whole or number in self._beyond:
+        if number in self._settled:
             return []
         if number <= self.newest:
             self._since_s = None  # a gap closes: patience begins anew
         self.newest = max(self.newest, number)
-        self._beyond.add(number)
-        self._advance()
+        self._settled.add(number, number)
+        if len(self._settled) > MOST_GAPS:
+            self._give_up(*self._open()[0])
         if self._loose or not self.in_order:
             return [item]
         self._delayed[number] = item
@@ -67,15 +71,13 @@ class Arrivals(Generic[T]):
     @property
     def missing(self) -> tuple[int, int] | None:
         """The first and the last missing number; some numbers in between may have arrived."""
-        last = self.newest
-        while last >= self._whole and last in self._beyond:
-            last -= 1
+        last = self._settled.last_absent(self.newest)
         return (self._whole, last) if last >= self._whole else None
 
     @property
     def lacking(self) -> list[tuple[int, int]]:
         """The intervals that are missing, those that the publisher no longer has first."""
-        return [*self.gone, *self._open()]
+        return [*self._gone, *self._open()]
 
     def due(self, now_s: float) -> tuple[int, int | None] | None:
         """The interval to be requested now, if a gap has lasted long enough; end None: everything
@@ -106,29 +108,33 @@ class Arrivals(Generic[T]):
         self._loose = True
         return self._released(self.newest + 1)
 
-    def answered(self, first: int, newest: int) -> list[T]:
+    def answered(self, first: int, newest: int, known: int | None = None) -> list[T]:
         """Records that the publisher's reply with all it has from `first` to `newest` is complete.
 
         What is still missing in that interval is gone; returns the items that it had delayed.
+        known: the last number known when it was requested. A larger one than the publisher has,
+            and nothing newer since, was that of another key: Zenoh can deliver a heartbeat, too,
+            under another key after a cut.
         """
         for begin, end in self._open():
-            lost = (max(begin, first), min(end, newest))
-            if lost[0] <= lost[1]:
-                self.gone.append(lost)
-                self._beyond |= set(range(lost[0], lost[1] + 1))
-        self._advance()
+            self._give_up(max(begin, first), min(end, newest))
+        if self.newest == known:
+            self.newest = max(newest, self._settled.last)
         return self._released(self._whole)
 
-    def _open(self) -> list[tuple[int, int]]:
-        here = sorted(n for n in self._beyond if n <= self.newest)
-        begins = [self._whole, *(n + 1 for n in here)]
-        ends = [*(n - 1 for n in here), self.newest]
-        return [(b, e) for b, e in zip(begins, ends, strict=True) if b <= e]
+    @property
+    def _whole(self) -> int:
+        """The first number from `first` on that has not arrived and is not gone."""
+        return self._settled.next_absent(self.first)
 
-    def _advance(self) -> None:
-        while self._whole in self._beyond:
-            self._beyond.remove(self._whole)
-            self._whole += 1
+    def _give_up(self, first: int, last: int) -> None:
+        """Records the numbers first … last as gone; nothing if last < first."""
+        self._gone.add(first, last)
+        self._gone.join_first(MOST_GAPS)
+        self._settled.add(first, last)
+
+    def _open(self) -> list[tuple[int, int]]:
+        return self._settled.gaps(self.first, self.newest)
 
     def _released(self, end: int) -> list[T]:
-        return [self._delayed.pop(n) for n in sorted(self._delayed) if n < end]
+        return [self._delayed.pop(n) for n in sorted(n for n in self._delayed if n < end)]

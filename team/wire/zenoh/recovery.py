@@ -3,10 +3,17 @@
 Zenoh's advanced subscriber does most of this, but some late joiners receive only a part of the
 history. The arrivals of each publisher are therefore counted (`team.wire.zenoh.arrivals`) and
 compared with its heartbeats, and what has been missing for half a second is requested.
+
+Keys, publishers and numbers come from the wire. The publishers tracked on the keys of one node, and
+those of all nodes, are bounded: samples of a publisher beyond the bound are delivered as they come,
+and are not requested where they are missing. A robot has some 30 keys with a cache, the centre five
+for each robot, and a process that is started again is a new publisher, so that a team of a hundred
+robots, each started again thirty times, is within the bounds.
 """
 
 import logging
 import struct
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,6 +30,19 @@ _BEAT = struct.Struct("<I")  # a heartbeat's payload: the number of the last pub
 _LOOK_S = 0.1  # between two looks at what is missing
 _ANSWER_S = 10.0
 _NEVER = 2**63
+_SEVERAL = ""  # in place of a publisher's key: samples of it arrived on several
+MOST_OF_A_NODE = 4_096
+"""Largest number of publishers, each on one key, that are tracked on the keys of one node."""
+MOST_PUBLISHERS = 131_072
+"""Largest number of them in all: some 100 MB."""
+MOST_BEATS = 131_072
+"""Number of heartbeats by name beyond which the known ones are forgotten; each is news again."""
+LONGEST_KEY = 512
+"""Longest key, in characters, on which missing samples are requested."""
+MOST_ASKED = 256
+"""Largest number of requests to caches in one look."""
+MOST_LOGGED = 100
+"""Log lines of one kind that are written one by one; then one of so many is."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -37,12 +57,16 @@ class Heartbeat:
 
 @dataclass
 class CacheAnswer:
-    """A complete reply of a publisher's cache: the requested interval, and the samples."""
+    """A complete reply of a publisher's cache: the requested interval, and the samples.
+
+    known: the publisher's last number that was known at the request. newest: that of the reply.
+    """
 
     key: str
     publisher: str
     first: int
     repeated: bool
+    known: int
     newest: int = -1
     failed: bool = False
 
@@ -65,7 +89,12 @@ class Recovery:
         self._beats: dict[str, bytes] = {}
         self._arrivals: dict[tuple[str, str], Arrivals[Sample]] = {}
         self._incomplete: set[tuple[str, str]] = set()
+        self._tracked: Counter[str] = Counter()
+        self._keys: dict[str, str] = {}
+        self._asked = 0
         self._look_due = 0.0
+        self.untracked = 0
+        """Number of samples and heartbeats of publishers beyond the bounds."""
 
     def watch(self, key: str) -> None:
         """Subscribes to the heartbeats of the publishers of a key, given with the session's
@@ -84,7 +113,10 @@ class Recovery:
     def _beat(self, sample: zenoh.Sample) -> None:
         """Passes on a heartbeat with a new number; called on Zenoh's receiving thread."""
         name, beat = str(sample.key_expr), sample.payload.to_bytes()
-        if len(beat) == _BEAT.size and self._beats.get(name) != beat:
+        sound = len(beat) == _BEAT.size and len(name) <= LONGEST_KEY
+        if sound and self._beats.get(name) != beat:
+            if len(self._beats) >= MOST_BEATS:
+                self._beats.clear()
             self._beats[name] = beat
             key, _, rest = name.removeprefix(self._prefix).partition(ADVANCED)
             publisher = "/".join(rest.split("/")[:2])
@@ -92,16 +124,24 @@ class Recovery:
                 self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
 
     def take_heartbeat(self, beat: Heartbeat) -> None:
-        """Records a publisher's last number."""
-        self._arrivals_of(beat.key, beat.publisher, beat.newest).know(beat.newest)
-        self._incomplete.add((beat.key, beat.publisher))
+        """Records a publisher's last number; nothing if the publisher is that of another key."""
+        if self._keys.get(beat.publisher, beat.key) not in (beat.key, _SEVERAL):
+            return
+        arrivals = self._arrivals_of(beat.key, beat.publisher, beat.newest)
+        if arrivals is not None:
+            arrivals.know(beat.newest)
+            self._incomplete.add((beat.key, beat.publisher))
 
     def answered(self, answer: CacheAnswer) -> list[Sample]:
         """Records that a cache's reply is complete; returns the samples to be delivered now."""
         if not answer.repeated or answer.failed or answer.newest < 0:
             return []
-        arrivals = self._arrivals_of(answer.key, answer.publisher, answer.newest)
-        return arrivals.answered(answer.first, answer.newest)
+        arrivals = self._arrivals.get((answer.key, answer.publisher))
+        if arrivals is None:  # forgotten since
+            return []
+        if answer.newest < arrivals.newest:
+            self._beats.clear()  # so that a heartbeat with a number that is unlearnt is news
+        return arrivals.answered(answer.first, answer.newest, answer.known)
 
     def arrived(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
         """Records a received publication; returns the samples to be delivered now, each once and in
@@ -109,26 +149,39 @@ class Recovery:
         """
         publisher, number = _numbered(source)
         arrivals = self._arrivals_of(sample.key, publisher, number)
+        if arrivals is None:
+            return [sample]
+        if self._keys.setdefault(publisher, sample.key) != sample.key:
+            self._keys[publisher] = _SEVERAL
         delivered = arrivals.take(number, sample)
         if arrivals.missing is not None:
             self._incomplete.add((sample.key, publisher))
         return delivered
 
-    def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample]:
-        """The arrivals of one publisher on one key; on a `latest` channel nothing older than the
-        first known number is requested, on a key of no channel nothing.
-
-        After a link was cut, Zenoh may hand over samples on keys that are composed of parts of
-        others: docs/decisions/07.
+    def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample] | None:
+        """The arrivals of one publisher on one key; None beyond the bounds, and on a key of no
+        channel. On a `latest` channel nothing older than the first known number is requested.
         """
         found = self._arrivals.get((key, publisher))
         if found is None:
             row = row_of(key)
-            whole = row is not None and (row.delivery == "all" or row.name in self._whole)
-            first = _NEVER if row is None else 0 if whole else first_known
-            found = Arrivals(first, in_order=whole)
+            if row is None or len(key) > LONGEST_KEY:
+                return None
+            node = _node_of(key)
+            if self._tracked[node] >= MOST_OF_A_NODE or len(self._arrivals) >= MOST_PUBLISHERS:
+                self._note_untracked(key)
+                return None
+            whole = row.delivery == "all" or row.name in self._whole
+            found = Arrivals(0 if whole else first_known, in_order=whole)
             self._arrivals[key, publisher] = found
+            self._tracked[node] += 1
         return found
+
+    def _note_untracked(self, key: str) -> None:
+        self.untracked += 1
+        if _is_logged(self.untracked):
+            text = "%.80r: too many publishers there, what is missing is not requested (%d so far)"
+            _LOG.warning(text, key, self.untracked)
 
     def overdue(self, now_s: float) -> list[Sample]:
         """Requests what has been missing for a while; returns samples that no longer wait for
@@ -138,28 +191,36 @@ class Recovery:
             return []
         self._look_due = now_s + _LOOK_S
         late: list[Sample] = []
+        asked = 0
         for key, publisher in sorted(self._incomplete):
             arrivals = self._arrivals[key, publisher]
-            requested = arrivals.due(now_s)
+            requested = arrivals.due(now_s) if asked < MOST_ASKED else None
             if arrivals.missing is None:
                 self._incomplete.discard((key, publisher))
             elif requested is not None:
-                self._ask_cache(key, publisher, *requested)
+                self._ask_cache(key, publisher, arrivals.newest, *requested)
+                asked += 1
             late += arrivals.overdue(now_s)
         return late
 
-    def _ask_cache(self, key: str, publisher: str, first: int, last: int | None) -> None:
-        answer = CacheAnswer(key, publisher, first, repeated=last is None)
+    def _ask_cache(
+        self, key: str, publisher: str, known: int, first: int, last: int | None
+    ) -> None:
+        answer = CacheAnswer(key, publisher, first, repeated=last is None, known=known)
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is None:
                 answer.failed = True
             elif reply.ok.source_info is not None:
-                answer.newest = max(answer.newest, _numbered(reply.ok.source_info)[1])
+                author, number = _numbered(reply.ok.source_info)
+                if author == publisher:
+                    answer.newest = max(answer.newest, number)
                 self._put(reply.ok)
 
         until = "" if last is None else str(last)
-        _LOG.info("%s: %d to %s are missing, asked for", key, first, until or "the newest")
+        self._asked += 1
+        if _is_logged(self._asked):
+            _LOG.info("%.80s: %d to %s are missing, asked for", key, first, until or "the newest")
         self._session.get(
             f"{self._prefix}{key}{ADVANCED}{publisher}/**?_anyke;_sn={first}..{until}",
             Callback(take, drop=lambda: self._put(answer), indirect=False),
@@ -172,6 +233,8 @@ class Recovery:
     def again(self) -> None:
         """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
         self._arrivals.clear()
+        self._tracked.clear()
+        self._keys.clear()
         self._incomplete.clear()
         self._beats.clear()  # so that the next heartbeats are news
 
@@ -186,6 +249,16 @@ class Recovery:
             if intervals := arrivals.lacking:
                 found.setdefault(key, []).extend(intervals)
         return found
+
+
+def _node_of(key: str) -> str:
+    """The node on whose keys a key is: no process publishes on keys of another node."""
+    first, _, rest = key.partition("/")
+    return f"{first}/{rest.partition('/')[0]}" if first in ("robot", "source") else first
+
+
+def _is_logged(count: int) -> bool:
+    return count <= MOST_LOGGED or count % MOST_LOGGED == 0
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:

@@ -1,0 +1,82 @@
+"""A set of integers as sorted, disjoint, closed intervals: its memory does not depend on their
+length.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+
+Interval = tuple[int, int]
+"""First and last number, both included."""
+
+
+class IntervalSet:
+    """A set of integers; adjacent and overlapping intervals are merged.
+
+    `len` is the number of intervals, not of integers.
+    """
+
+    def __init__(self) -> None:
+        self._begins: list[int] = []
+        self._ends: list[int] = []
+
+    def add(self, first: int, last: int) -> None:
+        """Add the integers first … last; nothing if last < first."""
+        if last < first:
+            return
+        low = bisect_left(self._ends, first - 1)  # the first that reaches or touches it
+        high = bisect_right(self._begins, last + 1)
+        if low < high:
+            first = min(first, self._begins[low])
+            last = max(last, self._ends[high - 1])
+        self._begins[low:high] = [first]
+        self._ends[low:high] = [last]
+
+    def __contains__(self, number: int) -> bool:
+        at = bisect_left(self._ends, number)
+        return at < len(self._begins) and self._begins[at] <= number
+
+    def __len__(self) -> int:
+        return len(self._begins)
+
+    def __iter__(self) -> Iterator[Interval]:
+        """The intervals in ascending order."""
+        return zip(self._begins, self._ends, strict=True)
+
+    @property
+    def last(self) -> int:
+        """The largest integer; −1 if there is none."""
+        return self._ends[-1] if self._ends else -1
+
+    def join_first(self, count: int) -> None:
+        """Join the first intervals, with what lies between them, until at most `count` are left."""
+        excess = len(self._begins) - count
+        if excess > 0:
+            del self._begins[1 : 1 + excess], self._ends[:excess]
+
+    def next_absent(self, number: int) -> int:
+        """The smallest integer from `number` on that is not in the set."""
+        at = bisect_left(self._ends, number)
+        inside = at < len(self._begins) and self._begins[at] <= number
+        return self._ends[at] + 1 if inside else number
+
+    def last_absent(self, number: int) -> int:
+        """The largest integer up to `number` that is not in the set."""
+        at = bisect_left(self._ends, number)
+        inside = at < len(self._begins) and self._begins[at] <= number
+        return self._begins[at] - 1 if inside else number
+
+    def gaps(self, first: int, last: int) -> list[Interval]:
+        """The intervals of the integers first … last that are not in the set, in ascending
+        order.
+        """
+        found: list[Interval] = []
+        at = bisect_left(self._ends, first)
+        while first <= last:
+            begin = self._begins[at] if at < len(self._begins) else last + 1
+            if first < begin:
+                found.append((first, min(begin - 1, last)))
+            if at == len(self._begins):
+                break
+            first = max(first, self._ends[at] + 1)
+            at += 1
+        return found
