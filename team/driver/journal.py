@@ -2,17 +2,20 @@
 
 The file only grows. It begins with a head (MessagePack); a record is `<IBq`: the payload's length,
 its kind, its stamp [ns]; then the payload, an encoded measurement with number 0, and its CRC-32.
-A record that a crash has cut off is left out. The numbers follow from the records by `Sorter`, so a
-driver that is started again goes on where it was.
+A record that a crash has cut off is left out; a file that a crash has left empty, or with a part of
+its head, is begun anew. The numbers follow from the records by `Sorter`, so a driver that is
+started again goes on where it was.
 """
 
 import fcntl
 import os
+import shutil
 import struct
 import threading
 import time
 import zlib
 from array import array
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +25,7 @@ import msgspec
 
 from team.driver.order import Sorter
 from team.driver.source import FIRST_INCARNATION
+from team.wall_clock import wall_clock, was_set_since
 from team.wire import messages as m
 from team.wire.codec import decoded
 
@@ -31,11 +35,15 @@ whether the stream goes on, and a pose in the odometry's frame, three floats.
 """
 State = Literal["open", "left", "ended"]
 MAGIC = b"teamslam stream 1\n"
-OLD_S = 3600.0
-"""A stream that was not ended and has not grown for this long [s] is set aside as an old one."""
+OLD_S = 86_400.0
+"""A stream that is not delivered and has not grown for this long [s] is set aside: its next
+odometry would be refused as of another clock. Not where the wall clock was set meanwhile.
+"""
 _HEAD = struct.Struct("<IBq")
 _CHECK = struct.Struct("<I")
 _POSE = struct.Struct("<3d")
+_LONGEST = 9
+"""Bytes of the longest number in a head."""
 
 
 class JournalError(RuntimeError):
@@ -49,6 +57,8 @@ class Journal:
     incarnation: the one in progress; 0 before anything was measured. state: of the stream, as in
     its head. delivered: every receiver has all of it. calls: the offsets of all records but marks,
     in order of arrival. driven_ns, pose: end of the last odometry interval, and the odometry pose.
+    cut: bytes behind the last whole record; is_damaged: they are no incomplete one. clock: the
+    wall clock at the last mark.
     """
 
     path: Path
@@ -62,6 +72,8 @@ class Journal:
     pose: tuple[float, float, float] | None = None
     calls: "array[int]" = field(default_factory=lambda: array("q"))
     cut: int = 0
+    is_damaged: bool = False
+    clock: dict[str, str] = field(default_factory=dict)
     _numbered: dict[int, "array[int]"] = field(default_factory=dict)
     _sorter: Sorter = field(default_factory=lambda: Sorter(0))
     _file: int = -1
@@ -106,16 +118,19 @@ class Journal:
         record = _HEAD.pack(len(payload), kind, stamp_ns) + payload
         record += _CHECK.pack(zlib.crc32(record))
         at = self._size
+        self._write(record, at)
+        self._size += len(record)
+        self._take(at, kind, stamp_ns, payload)
+
+    def _write(self, data: bytes, at: int) -> None:
         try:
-            written = os.pwrite(self._file, record, at)
+            written = os.pwrite(self._file, data, at)
         except OSError as error:
             raise JournalError(
                 f"{self.path}: {error.strerror}; make room and start again"
             ) from None
-        if written != len(record):
+        if written != len(data):
             raise JournalError(f"{self.path}: the disk is full; make room and start again")
-        self._size += written
-        self._take(at, kind, stamp_ns, payload)
 
     def mark(
         self,
@@ -135,6 +150,7 @@ class Journal:
             "latency_ns": latency_ns,
             "incarnation": incarnation,
             "delivered": delivered,
+            "clock": wall_clock(),
         }
         self.append(MARK, 0, msgpack.packb(said))
 
@@ -143,6 +159,7 @@ class Journal:
             if kind == MARK:
                 said = msgpack.unpackb(payload)
                 self.state, self.delivered = said["state"], said["delivered"]
+                self.clock = said.get("clock", {})
                 if self.incarnation:
                     self._numbered[self.incarnation].extend(self._sorter.flush())
                 if said["latency_ns"] is not None:
@@ -174,19 +191,37 @@ class Journal:
         return self.incarnation + 1 if self.incarnation else self.first_incarnation
 
     def read(self) -> None:
-        """Read the records of the file; a record cut off by a crash will be overwritten."""
+        """Read the records of the file up to the first one that is not whole."""
         at, end = self._size, os.fstat(self._file).st_size
         while at + _HEAD.size <= end:
             head = os.pread(self._file, _HEAD.size, at)
             length, kind, stamp_ns = _HEAD.unpack(head)
             rest = os.pread(self._file, length + _CHECK.size, at + _HEAD.size)
-            whole = len(rest) == length + _CHECK.size
+            self.is_damaged = whole = len(rest) == length + _CHECK.size
             if not whole or _CHECK.unpack(rest[length:])[0] != zlib.crc32(head + rest[:length]):
                 break
+            self.is_damaged = False
             self._take(at, kind, stamp_ns, rest[:length])
             at += _HEAD.size + len(rest)
         self.cut, self._size = end - at, at
-        os.ftruncate(self._file, at)
+
+    def cut_off(self) -> str:
+        """Remove the bytes behind the last whole record; returns what was removed, in words.
+
+        A killed process leaves an incomplete record. Damage in the middle of the file is another
+        matter: a copy with what is behind it is kept.
+        """
+        if not self.cut:
+            return ""
+        said = f"; {self.cut} bytes of a record that was cut off are left out"
+        if self.is_damaged:
+            copy = self.path.with_name(f"{self.path.name}.damaged")
+            said = f"; {self.cut} bytes behind a damaged record are left out"
+            with suppress(OSError):
+                shutil.copyfile(self.path, copy)
+                said += f": {copy} has them"
+        os.ftruncate(self._file, self._size)
+        return said
 
 
 def pose_payload(pose: tuple[float, float, float]) -> bytes:
@@ -202,64 +237,121 @@ def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
     JournalError for a file of another robot or of no driver, or one that another driver has open.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    found = path.stat() if path.exists() else None
-    journal = _existing(path, robot) if found is not None and found.st_size else None
-    said = ""
-    first = FIRST_INCARNATION
-    if journal is not None and found is not None:
-        age_s = time.time() - found.st_mtime
-        if not journal.delivered and age_s < OLD_S:
+    journal = _locked(path, robot)
+    age_s = time.time() - os.fstat(journal._file).st_mtime
+    try:
+        if not _read_whole(journal):
+            left = f"{path}: {journal.cut} bytes of a beginning are left out" * bool(journal.cut)
+            journal.first_incarnation = _first_after(_newest_aside(path), robot)
+            return _begun(journal, latency_ns), left
+        if not journal.delivered and (age_s < OLD_S or was_set_since(journal.clock)):
+            left = journal.cut_off()
             other = journal._sorter.latency_ns != latency_ns
             if other or journal.state == "left":
                 journal.mark("open", latency_ns=latency_ns)
             count = journal.count(journal.incarnation)
-            said = f"{path}: goes on after measurement {count - 1}, {age_s:.0f} s old"
-            said += f"; {journal.cut} bytes of a record that was cut off are left out" * bool(
-                journal.cut
-            )
+            said = f"{path}: goes on after measurement {count - 1}, {age_s:.0f} s old{left}"
             return journal, said
-        first = journal.next_incarnation
+    except BaseException:
         journal.close()
-        aside = _set_aside(path)
-        why = "has ended" if journal.delivered else f"is {age_s / 3600.0:.1f} h old"
-        said = f"{path}: its stream {why}: it is now {aside}, and a new one begins"
-    journal = Journal(path, robot, first)
-    _open(journal, os.O_CREAT | os.O_EXCL)
-    head = {"robot": robot, "incarnation": first}
-    journal._size = os.write(journal._file, MAGIC + msgpack.packb(head))
+        raise
+    journal.close()
+    aside = _set_aside(path)
+    why = "has ended" if journal.delivered else f"is {age_s / 3600.0:.1f} h old, and not delivered"
+    fresh = _locked(path, robot)
+    fresh.first_incarnation = journal.next_incarnation
+    said = f"{path}: its stream {why}: it is now {aside}, and a new one begins"
+    return _begun(fresh, latency_ns), said
+
+
+def _read_whole(journal: Journal) -> bool:
+    """Read an open file; False if nothing is in it. Raises JournalError for one of others."""
+    found = _head_of(journal)
+    if found is not None:
+        journal.first_incarnation, journal._size = found
+        journal.read()
+    return found is not None
+
+
+def _first_after(aside: Path | None, robot: str) -> int:
+    """The first incarnation of a new file beside one that was set aside: they are not confused."""
+    if aside is not None:
+        with suppress(JournalError, OSError):
+            earlier = _locked(aside, robot)
+            try:
+                if _read_whole(earlier):
+                    return earlier.next_incarnation
+            finally:
+                earlier.close()
+    return FIRST_INCARNATION
+
+
+def _begun(journal: Journal, latency_ns: int) -> Journal:
+    """A journal with its head, and nothing else."""
+    head = MAGIC + msgpack.packb({"robot": journal.robot, "incarnation": journal.first_incarnation})
+    os.ftruncate(journal._file, 0)
+    journal._write(head, 0)
+    journal._size = len(head)
     journal.mark("open", latency_ns=latency_ns)
-    return journal, said
+    return journal
 
 
-def _open(journal: Journal, flags: int) -> None:
+def _locked(path: Path, robot: str) -> Journal:
+    journal = Journal(path, robot)
+    journal._file = os.open(journal.path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        journal._file = os.open(journal.path, os.O_RDWR | flags, 0o644)
         fcntl.flock(journal._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(journal._file)
         raise JournalError(
             f"{journal.path}: another driver has it open: end that one, or give another file"
         ) from None
+    return journal
 
 
-def _existing(path: Path, robot: str) -> Journal:
-    journal = Journal(path, robot)
-    _open(journal, 0)
+def _head_of(journal: Journal) -> tuple[int, int] | None:
+    """The first incarnation of an open file, and the length of its head; None: nothing is in it.
+
+    A crash leaves a file empty, or with a part of its head and zeros. Raises JournalError for a
+    file of another robot or of no driver.
+    """
     begin = os.pread(journal._file, 4096, 0)
     unpacker = msgpack.Unpacker()
     unpacker.feed(begin[len(MAGIC) :])
-    try:
-        head: dict[str, Any] = unpacker.unpack() if begin.startswith(MAGIC) else {}
-    except (ValueError, msgpack.UnpackException):
-        head = {}
-    if head.get("robot") != robot:
-        journal.close()
-        whose = f"of {head['robot']}" if "robot" in head else "no driver's"
-        raise JournalError(f"{path}: a file {whose}, not of {robot}: give another file")
-    journal.first_incarnation = int(head["incarnation"])
-    journal._size = len(MAGIC) + unpacker.tell()
-    journal.read()
-    return journal
+    head: dict[str, Any] = {}
+    if begin.startswith(MAGIC):
+        with suppress(ValueError, msgpack.UnpackException):
+            read = unpacker.unpack()
+            head = read if isinstance(read, dict) else {}
+    first = head.get("incarnation")
+    if head.get("robot") == journal.robot and isinstance(first, int) and first > 0:
+        return first, len(MAGIC) + unpacker.tell()
+    beginning = MAGIC + msgpack.packb({"robot": journal.robot, "incarnation": 0})[:-1]
+    there = begin.rstrip(b"\0")
+    is_begun = beginning.startswith(there[: len(beginning)])
+    is_short = len(there) < len(beginning) + _LONGEST
+    if is_begun and is_short and _is_blank(journal._file, len(begin)):
+        journal.cut = os.fstat(journal._file).st_size
+        return None
+    whose = f"of {head['robot']}" if "robot" in head else "no driver's"
+    raise JournalError(f"{journal.path}: a file {whose}, not of {journal.robot}: give another file")
+
+
+def _is_blank(file: int, at: int) -> bool:
+    """Whether a file has only zeros from here on."""
+    while block := os.pread(file, 2**20, at):
+        if any(block):
+            return False
+        at += len(block)
+    return True
+
+
+def _newest_aside(path: Path) -> Path | None:
+    """The file that was set aside last."""
+    number = 1
+    while path.with_name(f"{path.name}.{number}").exists():
+        number += 1
+    return path.with_name(f"{path.name}.{number - 1}") if number > 1 else None
 
 
 def _set_aside(path: Path) -> Path:

@@ -29,14 +29,11 @@ from team.recording.part_files import (
 from team.recording.reader import Log, LogError, log_of, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.repair import salvaged
+from team.wall_clock import wall_clock, was_set_since
 from team.wire.channels import FINAL_MAP, TEAM_FINAL
 
 LONGEST_AWAY_S = 3600.0
 """Time [s] after which a recorder does not continue a log: it is then taken for another run's."""
-CLOCK_STEP_S = 60.0
-"""A wall clock that has moved by more than this [s] against the time since boot was set."""
-BOOT, CLOCK = "clock.boot", "clock.offset_s"
-"""Names of the metadata with the boot, and with the wall clock minus the time since that boot."""
 ROOM = 16 * 2**20
 """Bytes that must remain free on the disk."""
 JOINING = ".joining"
@@ -63,7 +60,11 @@ def check_continues(
         if (log.team, log.metadata.get("scenario")) != (team, metadata.get("scenario")):
             raise LogError(part, "exists, of another team or scenario", remedy)
     away_s = time.time() - parts[-1].stat().st_mtime
-    if not same_run and away_s > LONGEST_AWAY_S and not _clock_was_set(log):
+    if (
+        not same_run
+        and away_s > LONGEST_AWAY_S
+        and not was_set_since({} if log is None else log.metadata)
+    ):
         what = f"exists, and is from {away_s / 3600:.1f} hours ago"
         raise LogError(path, what, f"{remedy}; --resume if it is of this run")
     if log is None or not _is_over(open_log(path)):
@@ -83,29 +84,6 @@ def _is_over(log: Log) -> bool:
     return False
 
 
-def _clock() -> dict[str, str]:
-    """The boot, and the wall clock minus the time since it, where the system reports them."""
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        offset_s = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
-    except (OSError, AttributeError):
-        return {}
-    return {BOOT: boot, CLOCK: f"{offset_s:.1f}"}
-
-
-def _clock_was_set(log: LogFile | None) -> bool:
-    """Whether the wall clock was set since a part was begun: its age in the file system is wrong.
-
-    As on a computer without a battery for its clock, once the network has told the time.
-    """
-    now, then = _clock(), {} if log is None else log.metadata
-    if not now or then.get(BOOT) != now[BOOT]:
-        return False
-    with suppress(KeyError, ValueError):
-        return abs(float(now[CLOCK]) - float(then[CLOCK])) > CLOCK_STEP_S
-    return False
-
-
 def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recorder, Inventory]:
     """A recorder for the next part, and the inventory of the earlier ones.
 
@@ -121,7 +99,7 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
     named = {} if log_id is None else {LOG_ID: log_id}
     part = part_of(path, next_number(path))
     try:
-        recorder = Recorder(part, team, {**metadata, **_clock(), **named})
+        recorder = Recorder(part, team, {**metadata, **wall_clock(), **named})
     except RecorderError:
         if earlier:  # not a log of somebody else: the name was free
             part.unlink(missing_ok=True)

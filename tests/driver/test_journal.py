@@ -1,12 +1,14 @@
 """A driver's file: what was measured is there after any death, with the same numbers."""
 
 import os
+import time
 
+import msgpack
 import msgspec
 import pytest
 
 from team.driver import journal as j
-from team.driver.journal import JournalError, opened
+from team.driver.journal import Journal, JournalError, opened
 from team.driver.node import SourceNode
 from team.driver.order import Sorter
 from team.wire import messages as m
@@ -86,8 +88,63 @@ def test_a_stream_that_has_ended_or_is_old_steps_aside_and_the_next_one_counts_o
     second.close()
     os.utime(path, (0, 0))
     third, said = opened(path, "r1", LATENCY_NS)
-    assert "h old" in said
+    assert "h old, and not delivered: it is now" in said
     assert third.next_incarnation == 3
+
+
+@pytest.mark.parametrize("zeros", [0, 1, 4096, 9000])
+def test_a_file_that_a_crash_left_empty_or_half_written_is_begun_anew(tmp_path, zeros):
+    path = tmp_path / "r1.stream"
+    journal = Journal(path, "r1")
+    head = j.MAGIC + msgpack.packb({"robot": "r1", "incarnation": 1})
+    for size in range(len(head)):
+        path.write_bytes(head[:size] + bytes(zeros))
+        journal, said = opened(path, "r1", LATENCY_NS)
+        assert ("left out" in said) == bool(size + zeros)
+        measured(journal, j.START, 0)
+        assert journal.incarnation == 1
+        journal.close()
+        again, said = opened(path, "r1", LATENCY_NS)
+        assert "goes on after measurement 0" in said
+        again.close()
+
+
+def test_a_file_begun_anew_beside_one_set_aside_counts_on(tmp_path):
+    path = tmp_path / "r1.stream"
+    filled(path).close()
+    path.rename(tmp_path / "r1.stream.1")
+    path.touch()
+    journal, _ = opened(path, "r1", LATENCY_NS)
+    assert journal.next_incarnation == 2
+
+
+@pytest.mark.parametrize("step_s", [7200.0, 50 * 365 * 86_400.0])
+def test_a_clock_that_was_set_makes_no_undelivered_stream_an_old_one(tmp_path, monkeypatch, step_s):
+    path = tmp_path / "r1.stream"
+    now = time.time
+    with monkeypatch.context() as wrong:  # until the network told the time
+        wrong.setattr(time, "time", lambda: now() - step_s)
+        filled(path).close()
+    before_s = now() - step_s
+    os.utime(path, (before_s, before_s))
+    journal, said = opened(path, "r1", LATENCY_NS)
+    assert "goes on after measurement" in said
+    assert journal.count(1) == 7
+
+
+def test_behind_a_damaged_record_nothing_is_read_and_nothing_destroyed(tmp_path):
+    path = tmp_path / "r1.stream"
+    journal = filled(path)
+    before, at = numbered(journal), journal.calls[3]
+    journal.close()
+    content = bytearray(path.read_bytes())
+    content[at + 20] ^= 1
+    path.write_bytes(content)
+    again, said = opened(path, "r1", LATENCY_NS)
+    assert "behind a damaged record are left out" in said
+    assert (tmp_path / "r1.stream.damaged").read_bytes() == content
+    found = numbered(again)
+    assert found == before[: len(found)]
 
 
 def test_a_file_has_one_driver_and_one_robot(tmp_path):
