@@ -29,10 +29,25 @@ def kind_of(path: str | Path) -> Kind:
             raise DatasetError(
                 f"{path}: the data set is in its folder {inner}: give that"
             ) from None
+        strays = _other_tables(Path(path))
+        if strays:
+            shown = f"{', '.join(strays[:4])}{', …' if len(strays) > 4 else ''}"
+            raise DatasetError(
+                f"{path}: its CSV tables have names of their own ({shown}): `teamslam import "
+                f"{path} -o FOLDER` proposes which are what, and makes a data set of them"
+            ) from None
         raise DatasetError(
             f"{path}: no data set in it; {folder_files.EXPECTED}; or "
             f"{tables.EXPECTED.removeprefix('expected ')}"
         ) from None
+
+
+def _other_tables(place: Path) -> list[str]:
+    """The CSV files of a folder and of the folders in it."""
+    if not place.is_dir():
+        return []
+    found = [*sorted(place.glob("*.csv")), *sorted(place.glob("*/*.csv"))]
+    return [each.relative_to(place).as_posix() for each in found]
 
 
 def _with_tables_within(place: Path) -> Path | None:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sim.datasets.tables import DatasetError
+from sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 from team.ros2.bags import Bag, Topic, opened_bag
 from team.ros2.decoding import READERS, DamagedError, OdometryRecord, TransformsRecord, decode
 from team.ros2.keys import STATIC
@@ -13,12 +14,6 @@ from team.ros2.translator import TAG
 ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-TRUTH_WORDS = ("truth", "gt", "mocap", "vicon", "vrpn", "optitrack")
-FUSED_WORDS = (
-    "filtered", "fused", "ekf", "ukf", "global", "map", "amcl", "gps", "slam", "localization",
-    "kiss", "visual", "vio", "lidar", "icp",
-)  # fmt: skip
-"""Words in the names of odometry that is not the wheels' alone."""
 WHEEL_WORDS = ("wheel", "wheels", "encoder", "encoders", "raw", "controller", "drive")
 PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
 """Words in the first part of a topic that name a part of a robot, and no robot."""
@@ -153,7 +148,9 @@ def _candidates(
     here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
     true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
     odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
-    odometry.sort(key=lambda name: (_has(name, FUSED_WORDS), not _has(name, WHEEL_WORDS), name))
+    odometry.sort(
+        key=lambda name: (has_word(name, FUSED_WORDS), not has_word(name, WHEEL_WORDS), name)
+    )
     other = (*ODOMETRY, *POSES, TRANSFORMS, "geometry_msgs/msg/TransformStamped")
     detections = [t.name for t in here if t.kind in READERS and t.kind not in other]
     detections += [t.name for t in here if t.name in tagged]
@@ -161,19 +158,13 @@ def _candidates(
 
 
 def _is_truth(topic: Topic) -> bool:
-    return _has(topic.name, TRUTH_WORDS)
-
-
-def _has(name: str, words: tuple[str, ...]) -> bool:
-    """Whether a name has one of these words between its / and _."""
-    parts = name.lower().replace("/", "_").replace("-", "_").split("_")
-    return any(word in parts for word in words)
+    return has_word(topic.name, TRUTH_WORDS)
 
 
 def _namespace(topic: str) -> str:
     """The first part of /r1/odom; empty for /odom, /odometry/filtered and /wheel/odom."""
     parts = topic.strip("/").split("/")
-    part = len(parts) > 1 and (parts[0].startswith("odom") or _has(parts[0], PART_WORDS))
+    part = len(parts) > 1 and (parts[0].startswith("odom") or has_word(parts[0], PART_WORDS))
     return parts[0] if len(parts) > 1 and not part else ""
 
 

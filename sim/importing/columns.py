@@ -5,12 +5,15 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
+from sim.datasets import detections_table, folder
 from sim.datasets.csv_table import CsvTable
-from sim.datasets.folder import REQUIRED, TABLES
+from sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POLAR, POSES
 from sim.datasets.tables import DatasetError
+from sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,6 +39,17 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 Map = dict[str, Table]
 
+TABLES: Mapping[str, Sequence[str]] = {
+    **folder.TABLES,
+    "detections": (*detections_table.COLUMNS, *POINTS, *POINT_COVARIANCE),
+    "labels": detections_table.LABELS,
+}
+"""The columns that each table may have: those of a data set; detections may be points, too."""
+REQUIRED: Mapping[str, Sequence[str]] = {
+    **folder.REQUIRED,
+    "detections": ("t_s",),
+    "labels": detections_table.LABELS,
+}
 SYNONYMS: Mapping[str, str] = {
     "t_s": "t time times timestamp stamp sec secs seconds ts epoch unix unix_time header_stamp",
     "forward_m_s": "v vx v_x vel vel_x speed velocity forward forward_speed forward_velocity "
@@ -74,19 +88,23 @@ UNITS = {
 """The factor to our unit, by the unit at the end of a column's name."""
 LARGEST_S = 1e11
 """Times from here on are no seconds: as Unix times, 1e11 s is in the year 5138, 1e11 ms in 1973."""
-KINDS = ("odometry", "observations", "sightings", "truth", "landmarks", "start")
+KINDS = tuple(TABLES)
+MEASURED = ("odometry", "observations", "sightings", "detections")
+PROPOSED = (*MEASURED, "truth", "landmarks", "start")
 FILE_NAMES: Mapping[str, Sequence[str]] = {
     "odometry": ("odom", "wheel", "encoder"),
     "observations": ("observ", "tags", "detection", "marker"),
+    "detections": ("detection", "cone", "pole", "tree", "corner", "feature"),
     "sightings": ("sighting",),
-    "truth": ("truth", "mocap", "vicon", "optitrack"),
+    "truth": (),
     "landmarks": ("landmark",),
     "start": ("start",),
 }
 """Parts of file names by the kind of table that they indicate."""
 PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "truth", "gt", "tag",
             "marker", "landmark", "twist", "encoder", "measured", "measurement", "header",
-            "field")  # fmt: skip
+            "field", "true", "groundtruth", "ref", "reference", "mocap", "optitrack",
+            "vicon")  # fmt: skip
 """Words before a column's name that repeat its file's kind: odom_x, pose.position.y."""
 
 
@@ -107,6 +125,11 @@ def load_map(path: Path) -> Map:
             if ours not in TABLES[kind]:
                 known = ", ".join(TABLES[kind])
                 raise DatasetError(f"{path}: {kind} has no column {ours}; known: {known}")
+        if kind == "observations" and "landmark" not in table.columns:
+            raise DatasetError(
+                f"{path}: observations need the column landmark; measurements without identities "
+                "are [detections]"
+            )
     return found
 
 
@@ -130,52 +153,94 @@ def mapped(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, li
     return found
 
 
+class _Guess(NamedTuple):
+    """A table that a file probably has: our columns, and whether file and table are called alike;
+    rank: the better of two files for one table is higher.
+    """
+
+    file: str
+    kind: str
+    columns: dict[str, str]
+    is_named: bool
+    rank: tuple[int, int]
+
+
 def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
     """A map in TOML for these files as far as the columns' names determine it, and what it
     lacks.
     """
-    lines: list[str] = []
+    guesses: list[_Guess] = []
     lacking: list[str] = []
-    kinds: set[str] = set()
     for name, table in files.items():
-        kind, columns = _kind(name, list(table.columns))
-        if kind is None:
-            lacking.append(
-                f"{name}: no table of ours by its columns' names: {', '.join(table.columns)}"
-            )
+        header = list(table.columns)
+        found = _guesses(name, header)
+        guesses += found
+        if not found:
+            lacking.append(f"{name}: no table of ours by its columns' names: {', '.join(header)}")
+    best: dict[str, _Guess] = {}
+    for guess in sorted(guesses, key=lambda each: each.rank, reverse=True):  # stable
+        best.setdefault(guess.kind, guess)
+    lines: list[str] = []
+    for guess in guesses:
+        kind, columns = guess.kind, guess.columns
+        if best[kind] is not guess:
+            lacking.append(f"{guess.file}: might be {kind}, too")
             continue
-        columns |= _clock(columns.get("t_s", ""), table)
-        if kind in kinds:
-            lacking.append(f"{name}: might be {kind}, too")
-            continue
-        kinds.add(kind)
-        lines += [f"[{kind}]", f'files = ["{name}"]', f"[{kind}.columns]"]
+        columns |= _clock(columns.get("t_s", ""), files[guess.file])
+        lines += [f"[{kind}]", f'files = ["{guess.file}"]', f"[{kind}.columns]"]
         lines += [f"{ours} = {text}" for ours, text in columns.items()] + [""]
-        lacking += [f"{name}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns]
+        lacking += [
+            f"{guess.file}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns
+        ]
     return "\n".join(lines), lacking
 
 
-def _kind(name: str, header: Sequence[str]) -> tuple[str | None, dict[str, str]]:
-    """The table that has most of these columns; of equals the one that the file is named after."""
-    best: tuple[int, int, str, dict[str, str]] | None = None
-    for kind in KINDS:
-        columns = {}
-        for ours in TABLES[kind]:
-            found = _near(ours, header)
-            if found is not None:
-                columns[ours] = found
-        if kind == "odometry" and "forward_m_s" in columns:
-            columns = {
-                key: columns[key] for key in columns if key not in ("x_m", "y_m", "theta_rad")
-            }
-        if "range_m" in columns:
-            columns = {key: columns[key] for key in columns if key not in ("x_m", "y_m")}
-        complete = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
-        named = any(word in name.lower() for word in FILE_NAMES[kind])
-        score = (2 * complete + 2 * named, len(columns), kind, columns)
-        if complete and (best is None or score[:2] > best[:2]):
-            best = score
-    return (None, {}) if best is None else (best[2], best[3])
+def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
+    """The table that has most of these columns, of equals the one that the file is called after;
+    and the truth, where odometry has reference columns beside its own.
+
+    Files and columns that are called a reference are no measurements.
+    """
+    reference = [each for each in header if has_word(each, TRUTH_WORDS)]
+    is_reference = has_word(Path(name).stem, TRUTH_WORDS)
+    own = [each for each in header if each not in reference]
+    found = [
+        guess
+        for kind in PROPOSED
+        if not (is_reference and kind in MEASURED)
+        and (guess := _guess(name, kind, own if kind in MEASURED else header)) is not None
+    ]
+    if not found:
+        return []
+    best = max(found, key=lambda g: (g.is_named, g.kind in MEASURED, len(g.columns)))
+    if best.kind != "odometry" or not reference:
+        return [best]
+    clock = [each for each in own if _near("t_s", [each])]
+    truth = _guess(name, "truth", [*clock, *reference])
+    return [best] if truth is None else [best, truth]
+
+
+def _guess(name: str, kind: str, header: Sequence[str]) -> _Guess | None:
+    """The columns that a kind of table has of a file's; None where it lacks some."""
+    found = {ours: near for ours in TABLES[kind] if (near := _near(ours, header)) is not None}
+    columns = _of_one_form(kind, found)
+    whole = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
+    if kind == "detections":
+        whole &= any(all(ours in columns for ours in form) for form in (POLAR, POINTS))
+    named = any(word in name.lower() for word in FILE_NAMES[kind])
+    named |= kind == "truth" and has_word(Path(name).stem, TRUTH_WORDS)
+    rank = int(named), -int(has_word(Path(name).stem, FUSED_WORDS))
+    return _Guess(name, kind, columns, named, rank) if whole else None
+
+
+def _of_one_form(kind: str, columns: dict[str, str]) -> dict[str, str]:
+    """The columns without those of a second form of the same measurement."""
+    left_out: Sequence[str] = ()
+    if kind == "odometry" and "forward_m_s" in columns:
+        left_out = POSES
+    elif "range_m" in columns:
+        left_out = POINTS
+    return {ours: theirs for ours, theirs in columns.items() if ours not in left_out}
 
 
 def _near(ours: str, header: Sequence[str]) -> str | None:

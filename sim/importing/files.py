@@ -4,11 +4,19 @@ from collections.abc import Collection, Sequence
 from math import atan2
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from sim.datasets.csv_table import CsvTable, read_table
-from sim.datasets.folder import REQUIRED, TABLES
-from sim.datasets.folder_tables import POSES
+from sim.datasets.folder_tables import (
+    POINT_COVARIANCE,
+    POINTS,
+    POLAR,
+    POLAR_COVARIANCE,
+    POSES,
+)
 from sim.datasets.tables import DatasetError
-from sim.importing.columns import Map, Table, mapped, proposed
+from sim.importing.columns import REQUIRED, TABLES, Map, Table, mapped, proposed
 from sim.importing.tables import RobotTables
 
 QUATERNION = 8
@@ -91,9 +99,41 @@ def _take(
             )
             whole = whole.rows(chosen)
     found = mapped(whole, table.columns)
+    if kind == "detections":
+        found = _polar(found, whole)
     tables.columns[kind] = list(found)
     tables.rows[kind] = [*zip(*found.values(), strict=True)]
     return notes
+
+
+def _polar(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
+    """Detections with ranges and bearings in place of points (ahead, left): r = |p|, β = atan2.
+
+    Their covariance is J C Jᵀ with the Jacobian J of (r, β) with respect to the point.
+    """
+    if not all(name in columns for name in POINTS):
+        return columns
+    x, y = (_numbers(columns.pop(name), name, table) for name in POINTS)
+    r, beta = np.hypot(x, y), np.arctan2(y, x)
+    columns |= dict(zip(POLAR, (_texts(r), _texts(beta)), strict=True))
+    if all(name in columns for name in POINT_COVARIANCE):
+        xx, xy, yy = (_numbers(columns.pop(name), name, table) for name in POINT_COVARIANCE)
+        if (r == 0.0).any():
+            raise table.error(int(np.argmax(r == 0.0)), POINTS[0], "a point at the sensor")
+        c, s = x / r, y / r
+        rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
+        rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / r
+        bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (r * r)
+        columns |= dict(zip(POLAR_COVARIANCE, map(_texts, (rr, rb, bb)), strict=True))
+    return columns
+
+
+def _numbers(cells: Sequence[str], name: str, table: CsvTable) -> Float[np.ndarray, " rows"]:
+    return CsvTable(table.name, {name: list(cells)}, table.lines).numbers(name)[:, 0]
+
+
+def _texts(numbers: Float[np.ndarray, " rows"]) -> list[str]:
+    return list(map(repr, numbers.tolist()))
 
 
 def _joined(tables: Sequence[CsvTable]) -> CsvTable:

@@ -30,7 +30,7 @@ from team.ros2.topics import TopicsError, load_topics
 
 TEAM_PROFILE = b"teamslam"
 HEAD = 64
-MEASURED = ("odometry", "observations", "sightings")
+MEASURED = ("odometry", "observations", "sightings", "detections")
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,11 @@ def _written(
         by_name[_started(name, by_name)].start((x, y, theta), sigmas)
     if request.truth is not None:
         if len(tables) != 1:
-            raise DatasetError("--truth is the path of one robot: import the robots one by one")
+            raise DatasetError(
+                "--truth is the path of one robot; of several, put each robot's into its folder "
+                "and name the file as [truth] in the map of columns, --columns FILE (of bags: as "
+                "`truth` in the file of topics, --ros2 FILE)"
+            )
         tables[0].columns["truth"] = ("t_s", *POSES)
         tables[0].rows["truth"] = list(trajectory(request.truth))
     for each in tables:

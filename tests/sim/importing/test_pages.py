@@ -64,9 +64,11 @@ def test_the_scenario_and_the_map_of_the_page_are_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    columns, own = blocks("your_data.md", "toml")
+    columns, further, own = blocks("your_data.md", "toml")
     (tmp_path / "columns.toml").write_text(columns)
     assert set(load_map(tmp_path / "columns.toml")) == {"odometry", "observations"}
+    (tmp_path / "further.toml").write_text(further)
+    assert set(load_map(tmp_path / "further.toml")) == {"detections", "truth"}
     made("python examples/own_data.py my_set", tmp_path)
     (tmp_path / "my_set" / "scenario.toml").write_text(own)
     scenario = load(scenario_beside("my_set"))
