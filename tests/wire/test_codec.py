@@ -3,6 +3,8 @@
 import contextlib
 import json
 import struct
+import time
+import tracemalloc
 
 import msgpack
 import numpy as np
@@ -15,6 +17,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.channels import OBSERVATIONS
 from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
+from team.wire.structure import MOST_VALUES, SMALL
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 
 EXAMPLES = {m.tag_of(type(message)): message for message in examples()}
@@ -278,6 +281,16 @@ def with_two_nodes(stamps: list[int]) -> bytes:
     )
 
 
+def longer(message: m.Message, field: bytes) -> bytes:
+    """The payload with one more field, which no class has."""
+    fields = msgpack.packb(fields_of(message))
+    assert fields[0] == 0xDC, "an array of more than fifteen"
+    count = int.from_bytes(fields[1:3], "big") + 1
+    return b"\xdc" + count.to_bytes(2, "big") + fields[3:] + field
+
+
+LISTS = b"\xdd" + MOST_VALUES.to_bytes(4, "big") + b"\x90" * MOST_VALUES
+"""A list of so many empty lists."""
 NAN, INF = struct.pack("<d", float("nan")), struct.pack("<d", float("inf"))
 POSE = EXAMPLES["pose/1"]
 SUBMAP = EXAMPLES["submap/1"]
@@ -337,7 +350,14 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("not positive definite", with_fields(MET, covariance=indefinite(2)), None),
         ("too large", b"\xdd\x7f\xff\xff\xff" + b"\x00" * 100, None),
         ("too large", with_fields(SUBMAP, ids=from_ids(range(4096)), mean=bytes(8 * 8198)), None),
-        ("too deep", b"\x91" * 100_000, None),
+        ("wrong tag", b"\x91" * 100_000, None),
+        ("too deep", longer(SUBMAP, b"\x91" * 100_000 + b"\xc0"), None),
+        ("too deep", longer(SUBMAP, b"\x91" * 300_000 + b"\xc0"), None),
+        ("too large", longer(SUBMAP, b"\x92" + LISTS * 2), None),
+        ("truncated", longer(SUBMAP, b"\x91" + LISTS)[:-1], None),
+        ("wrong field", b"\x92" + msgpack.packb("status/1") + LISTS, None),
+        ("damaged", longer(SUBMAP, b"\xc1"), None),
+        ("damaged", longer(SUBMAP, b"\xc1" + bytes(SMALL)), None),
         ("damaged", b"\xc1", None),
         ("damaged", b"\x91\xa1\xff", None),
         ("wrong length", with_fields(FOUND, bearings=b""), None),
@@ -362,6 +382,39 @@ def test_an_unsound_payload_is_refused_for_its_reason(
 
 def test_a_payload_beyond_the_limit_is_refused_unread() -> None:
     assert reason_of(b"\x91" * (LARGEST_PAYLOAD + 1)) == "too large"
+
+
+MIB = 2**20
+TIME = b"\x00"
+HOLDING = msgpack.packb(["a", 0, False, [], bytes(8)])
+BOMBS = {
+    "lists as the message": LISTS[:5] + b"\x90" * 8 * MIB,
+    "lists as a field": b"\x96" + msgpack.packb("status/1") + TIME + b"\xa1x\xa0" + LISTS * 32,
+    "lists as a later field": longer(SUBMAP, b"\x9f" + LISTS * 32),
+    "texts": b"\x96" + msgpack.packb("status/1") + TIME + b"\xa1x\xa0\x80\xdd"
+    + (8 * MIB).to_bytes(4, "big") + b"\xa0" * 8 * MIB,
+    "structures": b"\x96" + msgpack.packb("set_summary/1") + TIME + b"\xa1x\x00\xc4\x08" + bytes(8)
+    + b"\xdd" + MIB.to_bytes(4, "big") + HOLDING * MIB + b"\x90",
+}  # fmt: skip
+"""Payloads of megabytes whose values would take many times their size as objects."""
+
+
+@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("kind", [m.Status, m.SetSummary, m.Submap, None], ids=str)
+def test_a_payload_of_many_values_takes_no_more_than_its_size_and_is_refused_at_once(
+    name: str, kind: type[m.Message] | None
+) -> None:
+    payload = BOMBS[name]
+    began = time.process_time()
+    tracemalloc.start()
+    try:
+        reason = reason_of(payload, kind)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert reason in ("wrong tag", "wrong field", "too large")
+    assert peak < len(payload)
+    assert time.process_time() - began < 5.0
 
 
 def test_an_error_names_the_field() -> None:
