@@ -28,6 +28,9 @@ FAREWELL_S = 10.0
 """The centre leaves after the others, at most this long [s] after its final map."""
 ORDERS_S = 30.0
 """Time [s] between two queries to the router for an operator's orders."""
+_ORDERS = m.KeptRequest(
+    stamp_ns=0, channels=tuple(each.name for each in ch.ORDERS if each is not ch.ORDER_SIGNATURE)
+)
 _LOG = logging.getLogger("teamslam")
 
 
@@ -179,7 +182,7 @@ class CentralShell:
         now = time.monotonic()
         if now >= self._orders_due:
             self._orders_due = now + ORDERS_S
-            self._bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
+            self._bus.request(ch.KEPT, "", _ORDERS)
 
     def _gather(self) -> None:
         """Request submaps that robots have sent and the centre lacks; from robots that appear, all

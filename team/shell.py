@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Protocol, TypeVar, runtime_checkable
@@ -20,7 +20,7 @@ from team.containment import Boundary
 from team.spare_time import SpareTime
 from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
-from team.wire.channels import ALIVE, FAULT, QUERIES, STATUS, Channel
+from team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, STATUS, Channel
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FusedMap, Liveliness, Message, Status, tag_of
 
@@ -80,11 +80,20 @@ def judge(boundary: Boundary, final: FusedMap | None) -> None:
 class Shell:
     """Runs one node on one bus.
 
+    ends: the channels on which the node's team ends.
+
     A message that is refused is counted, logged with its reason, and dropped; one whose handling
     raises is set aside (`team.containment`), and the node goes on.
     """
 
-    def __init__(self, bus: Bus, node: Node, name: str, stop: threading.Event) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        node: Node,
+        name: str,
+        stop: threading.Event,
+        ends: Collection[Channel] = (FINAL_MAP,),
+    ) -> None:
         self.bus = bus
         self.node = node
         self._name = name
@@ -96,7 +105,9 @@ class Shell:
         self.notes: Callable[[], tuple[str, ...]] = tuple
         self.believed: Callable[[Sequence[Sample]], Sequence[Sample]] = lambda samples: samples
         """Selects the samples of a turn that reach the node."""
-        self.the_end = TheEnd(bus, name)
+        self.the_end = TheEnd(bus, name, ends)
+        self.take_end: Take = self.take
+        """Takes the samples that end the team, which this node has missed."""
         self._recorder_is_there: bool | None = None
         self._recorder_since = 0.0
         self._messages = 0
@@ -214,8 +225,9 @@ class Shell:
         return None
 
     def look_for_the_end(self) -> None:
-        """Ask the router now and then for a final map that this node has missed."""
-        self.take(self.the_end.missed())
+        """Ask the router now and then for an end of the team that this node has missed."""
+        if missed := self.the_end.missed():
+            self.take_end(missed)
 
     def note(self, samples: Iterable[Sample]) -> None:
         """Note which recorder is present, at a time when nothing else that arrives matters."""

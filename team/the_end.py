@@ -1,16 +1,17 @@
-"""The end of a team: the router keeps the final map for processes that were absent at the end."""
+"""The end of a team: the router stores it for processes that were absent."""
 
 import logging
 import os
 import time
+from collections.abc import Collection
 
-from team.wire.bus import Bus, BusError, Sample
-from team.wire.channels import FINAL_KEPT, FINAL_MAP
-from team.wire.codec import WireError, decoded
-from team.wire.messages import FinalMapReply, FinalMapRequest, FusedMap
+from team.wire.bus import Bus, BusError, Sample, replied
+from team.wire.channels import FINAL_MAP, KEPT, Channel, channel_of
+from team.wire.codec import WireError
+from team.wire.messages import KeptRequest
 
 FINAL_S = 3.0
-"""Time [s] between two queries to the router for a missed final map."""
+"""Time [s] between two queries to the router for a missed end."""
 FINAL_ASK_S = 2.0
 SINCE = "TEAMSLAM_SINCE"
 """Environment variable: start of this process' run [ns, wall clock], where that is earlier than
@@ -31,41 +32,65 @@ os.register_at_fork(after_in_child=_forked)
 
 
 class TheEnd:
-    """Finds out from the router whether the team of this process has ended.
+    """Requests from the router the samples that end the team of this process.
 
     A process that starts again, or that was stopped or cut off while the centre left, learns of the
-    end in this way. A map that is older than the process is another run's, unless whoever started
-    it says that the run began earlier (SINCE), or the router knows an earlier process of this node
-    that was in that run and ended without a `Tally`.
+    end in this way. An end that is older than the process is another run's, unless whoever started
+    it says that the run began earlier (SINCE), or an earlier process of this node was in that run
+    and ended without a `Tally`.
+
+    ends: the channels on which this team ends. With a centre that is the centre's final map alone;
+    without one each robot publishes its own end, and nobody else's. robot: of the robots' channels,
+    the only robot of interest; "*": all.
     """
 
-    def __init__(self, bus: Bus, node: str = "") -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        node: str = "",
+        ends: Collection[Channel] = (FINAL_MAP,),
+        robot: str = "*",
+    ) -> None:
         self._bus = bus
         self._node = node
+        self._ends = tuple(channel.name for channel in ends)
+        self._robot = robot
         self._due = 0.0
         began = os.environ.get(SINCE)
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
         self._began = _STARTED
 
     def missed(self) -> list[Sample]:
-        """The final map, if the router has it; it is asked at most every FINAL_S."""
+        """The samples that end the team, as their authors published them; the router is asked at
+        most every FINAL_S.
+        """
         now = time.monotonic()
         if now < self._due:
             return []
         self._due = now + FINAL_S
+        # Before the query: ages are counted at its arrival, which may take its time.
+        run_s = time.monotonic() - self._began + max(self._before_s, 0.0)
+        request = KeptRequest(
+            stamp_ns=0, channels=self._ends, node=self._node, run_ns=round(1e9 * run_s)
+        )
         try:
-            # Before the question: its age is told as of the answer, which may take its time.
-            life_s = time.monotonic() - self._began + max(self._before_s, 0.0)
-            replies = self._bus.ask(
-                FINAL_KEPT, "", FinalMapRequest(stamp_ns=0, node=self._node), FINAL_ASK_S
-            )
-            replied = [decoded(reply, FinalMapReply) for reply in replies]
-            return [_sample(k.final) for k in replied[:1] if k.missed or 1e-9 * k.age_ns <= life_s]
-        except (BusError, WireError) as error:
+            replies = self._bus.ask(KEPT, "", request, FINAL_ASK_S)
+        except BusError as error:
             _LOG.debug("%s", error)
             return []
+        return [sample for reply in replies for sample in self._ending(reply)]
 
-
-def _sample(final: bytes) -> Sample:
-    stamp_ns = decoded(final, FusedMap).stamp_ns
-    return Sample(FINAL_MAP.key(), final, stamp_ns, time.time_ns(), 0)
+    def _ending(self, reply: bytes) -> list[Sample]:
+        """The sample in a reply, if it is one that was requested."""
+        try:
+            sample = replied(KEPT, "", reply, 0)
+        except WireError as error:
+            _LOG.debug("%s", error)
+            return []
+        found = channel_of(sample.key)
+        wanted = (
+            found is not None
+            and found[0].name in self._ends
+            and (self._robot in ("*", found[1]) or not found[1])
+        )
+        return [sample] if wanted else []

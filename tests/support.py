@@ -511,9 +511,12 @@ def examples() -> Iterator[m.Message]:
     yield m.GivenUp(
         stamp_ns=9_000, node="robot/alpha", by="operator", reason="it fell into the water"
     )
-    yield m.FinalMapRequest(stamp_ns=0, node="robot/alpha")
-    yield m.FinalMapReply(stamp_ns=0, age_ns=5_000_000_000, final=b"\x91\xc0", missed=True)
-    yield m.OrdersRequest(stamp_ns=0)
+    yield m.KeptRequest(
+        stamp_ns=0, channels=("final_map",), node="robot/alpha", run_ns=5_000_000_000
+    )
+    yield m.Kept(
+        stamp_ns=9_000, key="central/final", payload=b"\x91\xc0", wall_ns=10**18, counter=0
+    )
     yield m.FoldRequest(stamp_ns=0)
     yield from peers_examples(digest)
     yield m.Fault(

@@ -1,14 +1,18 @@
 """Presents a team without a centre to the desk: peers' messages about the map, as a centre's.
 
-The running maps are those of one peer, the first that publishes one; the final map is any peer's,
-since all are equal; a prior and a smoothed path are their own robot's. While there is a centre, its
-own messages are used; when it has gone, a peer's.
+The running maps are those of one peer, the first that publishes one; the final map is the one on
+which all peers agree; a prior and a smoothed path are their own robot's. While there is a centre,
+its own messages are used; when it has gone, a peer's. In a team whose robots are no peers, a
+robot's messages about the map are nobody's.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import msgspec
 
+from central.desk.agreement import LISTENS as OF_AGREEMENT
+from central.desk.agreement import Agreement, as_centre_final
+from central.team_config import team_config
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
@@ -19,25 +23,31 @@ _TOKEN = ch.ALIVE.key("central")
 _AS = {
     ch.TEAM_CONFIG.name: ch.CENTRAL_CONFIG,
     ch.TEAM_MAP.name: ch.FUSED_MAP,
-    ch.TEAM_FINAL.name: ch.FINAL_MAP,
     ch.TEAM_PRIOR.name: ch.PRIOR,
     ch.TEAM_TRAJECTORY.name: ch.TRAJECTORY,
 }
-LISTENS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY)
-"""The peers' channels that are presented in this way."""
+LISTENS = (ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.WORLD_CONFIG, *OF_AGREEMENT)
+"""The channels that are presented in this way, or decide how."""
 _FOLD = "fold."
-_LAST = (ch.TEAM_FINAL, ch.TEAM_TRAJECTORY)
+_LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)
 """Messages that stand for the team's unless a centre has published them; a centre that comes back
 late may not.
 """
 
 
 class PeersAsCentre:
-    """Renames samples of peers to a centre's keys."""
+    """Renames samples of peers to a centre's keys.
 
-    def __init__(self) -> None:
+    robots: the robots that are peers, none where the team has a centre only. None: as the
+    `world/config` among the samples names them; before that, those that announce their own fold.
+    """
+
+    def __init__(self, robots: Collection[str] | None = None) -> None:
         self._centre = self._concluded = False
         self._robot: str | None = None
+        self._final: bytes | None = None
+        self._is_told = robots is not None
+        self.agreement = Agreement(robots)
 
     def of(self, sample: Sample) -> Sample | None:
         """The sample as a centre would have published it; None where it has no counterpart."""
@@ -47,9 +57,18 @@ class PeersAsCentre:
         elif sample.key == _TOKEN:
             self._centre = self._centre and _is_alive(sample)
         found = ch.channel_of(sample.key)
-        if found is None or (self._centre and (self._concluded or found[0] not in _LAST)):
+        if found is None:
             return None
         channel, name = found
+        if channel is ch.WORLD_CONFIG and not self._is_told:
+            self._learn(sample)
+        if self.agreement.robots is not None and not self.agreement.robots:
+            return None
+        self.agreement.take(sample)
+        if self._centre and (self._concluded or channel not in _LAST):
+            return None
+        if channel is ch.TEAM_FINAL or channel is ch.CONCLUDED:
+            return self._agreed()
         if channel is ch.STATUS:
             return self._status(sample, name)
         as_channel = _AS.get(channel.name)
@@ -61,6 +80,22 @@ class PeersAsCentre:
                 return None
         renamed = msgspec.structs.replace(sample, key=as_channel.key(name))
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
+
+    def _learn(self, sample: Sample) -> None:
+        """Take the team's peers from the scenario."""
+        try:
+            team = team_config(decoded(sample.payload, m.Configuration).configuration)
+        except (WireError, ValueError):
+            return
+        self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
+
+    def _agreed(self) -> Sample | None:
+        """The final map of all peers, once they agree on it."""
+        agreed = self.agreement.agreed
+        if agreed is None or agreed.payload == self._final:
+            return None
+        self._final = agreed.payload
+        return as_centre_final(agreed)
 
     def _spoken(self, sample: Sample) -> Sample | None:
         try:

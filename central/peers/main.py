@@ -31,6 +31,9 @@ WORLD_GONE_S = 1.0
 """Time [s] after the world's end before a peer leaves: a world that has died is started again
 sooner.
 """
+_ENDS = (ch.CONCLUDED,)
+"""A team of peers ends where each robot has its final map, as that robot itself announces it."""
+_ORDERS = m.KeptRequest(stamp_ns=0, channels=tuple(each.name for each in ch.ORDERS))
 _LOG = logging.getLogger("teamslam")
 
 
@@ -75,7 +78,8 @@ class PeerShell(RobotShell):
         super().__init__(bus, config, stop, patience_s, exchange)
         self._peer = PeerRobot(config, central, robots, exchange, when, signer)
         self.node = self._peer.node
-        self.run_in(Shell(bus, self._peer, self._peer.name, stop))
+        self.run_in(Shell(bus, self._peer, self._peer.name, stop, _ENDS))
+        self.shell.take_end = self._peer.take_end
         self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
         self.shell.notes = lambda: self._keeper.warnings
@@ -97,7 +101,7 @@ class PeerShell(RobotShell):
         for channel in everyones:
             self.bus.subscribe(channel)
         self.bus.watch_alive()
-        self.bus.request(ch.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
+        self.bus.request(ch.KEPT, "", _ORDERS)
         self.shell.answer(ch.MEMBERS, self._peer.name, self._peer.answer)
         self.shell.answer(ch.FOLD, self._peer.robot, self._peer.answer_fold)
 
@@ -180,7 +184,8 @@ class CentreShell:
     ) -> None:
         self._bus = bus
         self._peer = PeerCentre(config, robots, signer)
-        self._shell = Shell(bus, self._peer, CENTRE, stop)
+        self._shell = Shell(bus, self._peer, CENTRE, stop, _ENDS)
+        self._shell.take_end = self._peer.take_end
         self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = Keeper(store)
         self._shell.notes = lambda: self._keeper.warnings

@@ -14,7 +14,7 @@ from team.peers.node import PeerNode
 from team.peers.proofs import OPERATOR, Proofs
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
+from team.wire.bus import Outgoing, Sample, sound
 from team.wire.codec import decoded, encoded
 
 TALK = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
@@ -28,8 +28,8 @@ class Peer:
 
     finished: whether it may leave; set by its shell. carried: members that others have forwarded,
     until the shell takes them. uplink, downlink: bytes of the set's channels that were published,
-    each message once, and received. world_alive: None before any message of a world. ended: whether
-    anyone has had a final map. others: the other robots and the centre that are present.
+    each message once, and received. world_alive: None before any message of a world. ended: the
+    robots whose end the router stores. others: the other robots and the centre that are present.
     unpublished: messages of a fold that was requested; newest: its last map.
     """
 
@@ -49,7 +49,7 @@ class Peer:
         self.uplink = self.downlink = 0
         self.carried: list[Member] = []
         self.world_alive: bool | None = None
-        self.ended = False
+        self.ended: set[str] = set()
         self.others: set[str] = set()
         self.unpublished: list[Outgoing] = []
         self.newest: m.FusedMap | None = None
@@ -122,9 +122,6 @@ class Peer:
             case m.Liveliness(node="world"):
                 self.world_alive = message.alive
                 return []
-            case m.FusedMap():
-                self.ended = self.ended or message.final
-                return []
             case m.Liveliness():
                 self._meet(message)
                 return self._from_fold(self.fold.note(message))
@@ -141,8 +138,25 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether the team has ended, and nobody is present who has the missing members."""
-        return self.ended and self.final is None and not self.others
+        """Whether the team has ended, and nobody is present who has the missing members.
+
+        It has ended where every other robot has announced its own end, but for those that an
+        operator has given up or withdrawn.
+        """
+        stated = self.peer.replica.statements
+        others = {
+            robot
+            for robot in self.peer.replica.robots
+            if ch.robot_node(robot) != self.name
+            and not {("given_up", 0), ("withdrawal", 0)} & stated[robot].keys()
+        }
+        return bool(others) and others <= self.ended and self.final is None and not self.others
+
+    def take_end(self, samples: Sequence[Sample]) -> None:
+        """Note the ends of robots that the router stores, each by the robot itself."""
+        for _, robot, message in sound(samples):
+            if isinstance(message, m.Concluded):
+                self.ended.add(robot)
 
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str

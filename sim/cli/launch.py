@@ -421,6 +421,7 @@ def _conclude(
             _write_report(run, outcome, {**figures, **run_figures(run)}, console)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
+        outcome.failures += evaluation.disagreement
     for name in in_order(outcome.restarts):
         times = outcome.restarts[name]
         text = f"{name} was started again {times} time{'' if times == 1 else 's'}"

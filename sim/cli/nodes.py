@@ -379,6 +379,7 @@ def record(
                 lambda: next_part(output, resolved.team, metadata),
                 stop=stop,
                 scenario=configurations,
+                peers=[robot.id for robot in resolved.robots] if resolved.peers else (),
             )
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:

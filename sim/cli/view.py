@@ -57,7 +57,8 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
         connected(resolved.team, connect, keys, "viewer") as bus,
     ):
         _LOG.info("connected to team %s at %s", resolved.team, connect)
-        _LOG.info("published %d views", run_viewer(bus, stop))
+        peers = [each.id for each in resolved.robots] if resolved.peers else []
+        _LOG.info("published %d views", run_viewer(bus, stop, peers))
 
 
 @app.command()

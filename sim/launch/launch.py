@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from central.desk.peers_as_centre import LISTENS, PeersAsCentre
 from sim.launch.plan import Plan
 from sim.launch.processes import Starter, Used
 from sim.launch.supervision import failure, supervise
@@ -80,8 +81,9 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
             bus.subscribe(ch.FINAL_MAP)
             bus.subscribe(ch.FAULT)
             if plan.scenario.peers:
-                watch.peers = frozenset(each.id for each in plan.scenario.robots)
-                for channel in (ch.CONCLUDED, ch.TEAM_MAP, ch.TEAM_FINAL):
+                watch.peers = frozenset(ids)
+                watch.centre = PeersAsCentre(watch.peers)
+                for channel in LISTENS:
                     bus.subscribe(channel)
                 bus.watch_alive("central")
                 watch.signer = None if own is None else _signer(own)

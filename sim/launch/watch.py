@@ -45,8 +45,8 @@ class Watch:
     the same as a driver's program has them. notes: events of processes, in words. restarts: how
     often each process was started again. given_up: the nodes that were given up. last_message: the
     time of each node's last status. peers: the robots that are to have a final map of their own;
-    concluded: those that have it; concluded_s: since when. signer: signs orders, where there are
-    keys.
+    concluded: those that have it; concluded_s: since when. centre: presents peers' messages as a
+    centre's. signer: signs orders, where there are keys.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -66,7 +66,7 @@ class Watch:
     concluded: dict[str, m.Concluded] = field(default_factory=dict)
     concluded_s: dict[str, float] = field(default_factory=dict)
     signer: "Signs | None" = None
-    _centre: PeersAsCentre = field(default_factory=PeersAsCentre)
+    centre: PeersAsCentre = field(default_factory=PeersAsCentre)
 
     @property
     def world(self) -> m.Status | None:
@@ -112,17 +112,21 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the final map is there: the centre's, and that of every expected peer."""
-        if self.fused is None or not self.fused.final:
-            return False
-        lost = {*self.fused.lost, *(name.removeprefix("robot-") for name in self.given_up)}
-        return self.concluded.keys() >= self.peers - lost
+        """Whether the final map is there: the centre's; without a centre that of every peer, but
+        for those that are given up or withdrawn, whether they agree or not.
+        """
+        if not self.peers:
+            return self.fused is not None and self.fused.final
+        for name in self.given_up:
+            self.centre.agreement.excuse(name.removeprefix("robot-"))
+        needed = self.centre.agreement.needed
+        return bool(needed) and self.concluded.keys() >= set(needed)
 
     def take(self, bus: Bus) -> None:
         """Take the messages that have arrived since the last call."""
         for sample in bus.receive(TURN_S):
             self._take(sample)
-            counterpart = self._centre.of(sample) if self.peers else None
+            counterpart = self.centre.of(sample) if self.peers else None
             if counterpart is not None:
                 self._take(counterpart)
 

@@ -45,7 +45,8 @@ def run_world(
         tells_map(scenario, streams),
         peers=frozenset(robots if scenario.peers else ()),
     )
-    shell = Shell(bus, node, "world", stop)
+    ends = (ch.FINAL_MAP, ch.CONCLUDED) if scenario.peers else (ch.FINAL_MAP,)
+    shell = Shell(bus, node, "world", stop, ends)
     for channel in (*node.listens, *node.announcements):
         bus.subscribe(channel)
     bus.watch_alive()

@@ -13,6 +13,7 @@ from team.driver.node import SourceNode
 from team.keys.credentials import credentials_of
 from team.keys.roster import KeysError
 from team.shell import Shell
+from team.the_end import TheEnd
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import BusError
@@ -138,6 +139,8 @@ class Link:
             bus = stack.enter_context(ZenohBus(self._team, connect, self._attempt_s, own))
             self._be_the_only_one(bus)
             shell = Shell(bus, self._node, self._name, self._leaving)
+            own_ends = (ch.FINAL_MAP, ch.TEAM_FINAL)  # without a centre its own robot's
+            shell.the_end = TheEnd(bus, self._name, own_ends, self._node.journal.robot)
             self._node.alive.clear()
             for channel in self._node.listens:
                 bus.subscribe(channel, self._node.journal.robot)

@@ -21,7 +21,7 @@ from team.wire.codec import WireError
 
 _HEAD = 128  # bytes of a message: its tag, stamp, robot, incarnation and number are within
 Kind = Literal["measurements", "submaps"]
-_ASKED_FOR = (ch.SIGHTING_FACTOR, ch.FINAL_MAP, *ch.REPLIES[ch.ORDERS_KEPT])
+_ASKED_FOR = (ch.SIGHTING_FACTOR, *ch.REPLIES[ch.KEPT])
 """Channels without numbers whose messages are sent as replies."""
 
 

@@ -18,9 +18,13 @@ from team.wire.channels import (
     ALIVE,
     CHANNELS,
     CONCLUDED,
+    ENDS,
     FINAL_MAP,
+    GIVEN_UP,
+    KEPT,
     MEASUREMENTS,
-    ORDERS_KEPT,
+    ORDER,
+    ORDERS,
     RECORDER_PROGRESS,
     SENSORS,
     SENT,
@@ -28,14 +32,15 @@ from team.wire.channels import (
     SUBMAP,
     WORLD_CONFIG,
     channel_of,
+    robot_of,
 )
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     Configuration,
+    KeptRequest,
     Liveliness,
     MeasurementsRequest,
     Message,
-    OrdersRequest,
     Progress,
     Status,
     SubmapsRequest,
@@ -68,6 +73,8 @@ class RecordLoop:
     inventory: of the earlier parts of the log.
     more: opens the next part of a log that could not be written any more; without it the error is
         raised.
+    peers: of a team whose robots are peers, these: it ends where each of them has concluded, but
+        for those that an operator has given up or withdrawn. Any team ends with its centre's map.
     """
 
     def __init__(
@@ -77,8 +84,11 @@ class RecordLoop:
         expected: Collection[str],
         inventory: Inventory | None = None,
         more: More | None = None,
+        peers: Collection[str] = (),
     ) -> None:
         self._bus = bus
+        self._are_peers = bool(peers)
+        self._unconcluded = set(peers)
         self._recorder: Recorder | None = recorder
         self._more = more
         self._failure: RecorderError | None = None
@@ -89,13 +99,14 @@ class RecordLoop:
         self._missing = set(expected)
         self._alive: set[str] = set()
         self._newest_ns = 0
-        self._final = False
+        self._has_map = False
         self._messages = 0
         self._statuses = 0
         for channel in CHANNELS:
             if channel.recorded and channel is not ALIVE:
                 bus.subscribe(channel, whole=True)
-        bus.request(ORDERS_KEPT, "", OrdersRequest(stamp_ns=0))  # who gave them does not stay
+        orders = tuple(channel.name for channel in ORDERS if channel.recorded)
+        bus.request(KEPT, "", KeptRequest(stamp_ns=0, channels=orders))  # who gave them has left
         bus.watch_alive()
         bus.declare_alive(NODE)
 
@@ -107,7 +118,11 @@ class RecordLoop:
     @property
     def finished(self) -> bool:
         """Whether the final map is in the log and no other process is present."""
-        return self._final and not self._alive
+        return self._has_ended and not self._alive
+
+    @property
+    def _has_ended(self) -> bool:
+        return self._has_map or (self._are_peers and not self._unconcluded)
 
     def take(self, samples: list[Sample]) -> None:
         """Writes these samples; reports progress of the robots that are due, or of all when there
@@ -232,7 +247,11 @@ class RecordLoop:
         if channel is ALIVE:
             return self._noted_alive(sample, name)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
-        self._final = self._final or channel in (FINAL_MAP, CONCLUDED)
+        self._has_map = self._has_map or channel is FINAL_MAP
+        if channel is CONCLUDED or channel is ORDER:
+            self._unconcluded.discard(name)
+        elif channel is GIVEN_UP:
+            self._unconcluded.discard(robot_of(name) or "")
         return sample
 
     def _noted_alive(self, sample: Sample, node: str) -> Sample:
@@ -247,13 +266,13 @@ class RecordLoop:
         return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
     def look(self, end: TheEnd) -> None:
-        """Requests a final map that was missed, and removes processes that left without an
+        """Requests an end that was missed, and removes processes that left without an
         announcement.
         """
         missed = end.missed()
-        if missed and not self._final:
+        if missed and not self._has_ended:
             self.take(missed)
-        if missed:
+        if missed and self._has_ended:
             self._alive = {node for node in self._alive if self._bus.is_alive(node)}
 
     def status(self, *, last: bool = False) -> Status:
@@ -288,6 +307,7 @@ def record(
     on_status: Callable[[Status], None] | None = None,
     stop: threading.Event | None = None,
     scenario: Sequence[Configuration] = (),
+    peers: Collection[str] = (),
 ) -> int:
     """Records until the final map is present and all other nodes have left, or until `stop`; then
     closes.
@@ -297,15 +317,16 @@ def record(
     inventory, more: the inventory of earlier parts of the log, and the function that opens the next
         one when this one can not be written.
     scenario: for a team without a world, the configurations that stand in its place in the log.
+    peers: as `RecordLoop`.
     Raises `RecorderError` when the log can not be written: at once without `more`, else at the end.
     """
     stop = threading.Event() if stop is None else stop
-    loop = RecordLoop(bus, recorder, expected, inventory, more)
+    loop = RecordLoop(bus, recorder, expected, inventory, more, peers)
     with closing(loop):
         loop.tell(scenario)
         due = time.monotonic()
         remind_due = due + _REMIND_S
-        end = TheEnd(bus, NODE)
+        end = TheEnd(bus, NODE, ENDS if peers else (FINAL_MAP,))
         while not stop.is_set():
             if loop.finished:
                 # A token goes with a higher priority than data: what it overtook is on its way.

@@ -16,12 +16,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
-from team.wire.channels import ALIVE, END_ORDER, ORDER, REPLIES, VIEW, Channel, channel_of
+from team.wire.channels import ALIVE, END_ORDER, KEPT, ORDER, REPLIES, VIEW, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
     Configuration,
     Fault,
     FusedMap,
+    Kept,
     Liveliness,
     MapEstimate,
     Members,
@@ -210,10 +211,13 @@ def _sender_of(channel: Channel, message: Message) -> str | None:
 
 
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
-    """A reply to a query as a sample of the channel that its message belongs to.
+    """A reply to a query as a sample of the channel that its message belongs to; a stored sample
+    as its author published it.
 
     Raises `WireError` where it is no message that answers this query, or belongs to another robot.
     """
+    if channel is KEPT:
+        return _kept(payload)
     message: Message = decoded(payload)
     of = next((c for c in REPLIES[channel] if isinstance(message, c.kinds)), None)
     robot = getattr(message, "robot", getattr(message, "node", ""))
@@ -222,6 +226,15 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
         text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"
         raise WireError("wrong field", text)
     return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, NO_COUNTER)
+
+
+def _kept(payload: bytes) -> Sample:
+    """The sample in a reply of the router; raises `WireError`."""
+    kept = decoded(payload, Kept)
+    sample = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
+    if opened(sample)[0] not in REPLIES[KEPT]:
+        raise WireError("wrong field", f"the router stores nothing on the key {kept.key[:80]!r}")
+    return sample
 
 
 NO_COUNTER = 2**32 - 1

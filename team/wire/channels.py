@@ -203,11 +203,8 @@ SUBMAPS = Channel(name="submaps", template="central/submaps", message=m.SubmapsR
 SENT = Channel(name="sent", template="robot/{robot}/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                meaning="a query; the replies are the initial poses, submaps and inter-robot factors that the robot has sent")  # fmt: skip
 
-FINAL_KEPT = Channel(name="final_kept", template="router/final", message=m.FinalMapRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-                     meaning="a query; the reply is the final map, even after the centre has left")  # fmt: skip
-
-ORDERS_KEPT = Channel(name="orders_kept", template="router/orders", message=m.OrdersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
-                      meaning="a query; the replies are the operators' valid orders, even after the operators have left")  # fmt: skip
+KEPT = Channel(name="kept", template="router/kept", message=m.KeptRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+               meaning="a query; the replies are `kept` samples of others: the ends of the team, and the operators' orders")  # fmt: skip
 
 TEAM_CONFIG = Channel(name="team_config", template="robot/{robot}/team/config", message=m.Configuration, rate="once", delivery="latest", recorded=True,
                       recomputable=False, meaning="the configuration of the peer's own fold: a centre's")  # fmt: skip
@@ -240,12 +237,16 @@ VIEW = Channel(name="view", template="view/{view}", message=m.Message, rate="abo
                meaning="figures for viewers, in Foxglove's schemas; see Views")  # fmt: skip
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))
-QUERIES = (MEASUREMENTS, SUBMAPS, SENT, FINAL_KEPT, ORDERS_KEPT, MEMBERS, FOLD)
+ENDS = (FINAL_MAP, TEAM_FINAL, CONCLUDED)
+"""Messages that end a team: the centre's; without a centre each robot's, about itself."""
+ORDERS = (GIVEN_UP, ORDER, VERDICT, END_ORDER, ORDER_SIGNATURE)
+"""Operators' orders, and the signatures with which peers relay them."""
+QUERIES = (MEASUREMENTS, SUBMAPS, SENT, KEPT, MEMBERS, FOLD)
 REPLIES = {
     MEASUREMENTS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
     SENT: (START, SUBMAP, SIGHTING_FACTOR),
-    ORDERS_KEPT: (GIVEN_UP, ORDER, VERDICT, END_ORDER),
+    KEPT: (*ENDS, *ORDERS),
     MEMBERS: (CARRIED,),
     FOLD: (TEAM_MAP,),
 }

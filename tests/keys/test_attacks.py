@@ -12,14 +12,16 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from shutil import copytree
 
+import msgspec
 import pytest
 
 from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
 from team.keys.roster import load_roster, nodes_of
+from team.the_end import TheEnd
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import BusError, Outgoing, Sample
+from team.wire.bus import BusError, Outgoing, Sample, opened, replied
 from team.wire.codec import encoded
 from team.wire.zenoh import session
 from team.wire.zenoh.bus import ZenohBus
@@ -28,7 +30,12 @@ from tests.keys.certificates import TEAM, Folders
 from tests.support import examples, odometry, submap, wait_until
 
 HUGE = 2**62
-FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
+FINAL = msgspec.structs.replace(
+    next(e for e in examples() if isinstance(e, m.FusedMap)), final=True
+)
+CONCLUDED = msgspec.structs.replace(
+    next(e for e in examples() if isinstance(e, m.Concluded)), robot="r1"
+)
 ATTACKS = {
     "ends the run": (ch.END, "", m.End(stamp_ns=0, streams=())),
     "forges the final map": (ch.FINAL_MAP, "", FINAL),
@@ -79,6 +86,18 @@ ATTACKS = {
     "gives the truth": (ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth))),
 }
 """What r2 says that is not its own to say."""
+
+
+def on_every_row() -> Iterator[Outgoing]:
+    """A message on each row of the table, on a key of r1, or of a node that is no robot."""
+    said = {type(each): each for each in examples()}
+    names = {"robot": "r1", "node": "robot/r1"}
+    for channel in ch.CHANNELS:
+        if channel not in (*ch.UNOPENED, ch.ALIVE):
+            name = next((n for place, n in names.items() if f"{{{place}}}" in channel.template), "")
+            yield Outgoing(channel, name, said[channel.message])
+
+
 OWN = Outgoing(
     ch.ROBOT_PROGRESS,
     "r2",
@@ -124,26 +143,85 @@ def test_a_robot_that_was_taken_over_says_nothing_for_others(
 ) -> None:
     with door(keys if locked else None) as enter:
         victim, robot = enter("recorder"), enter("robot-r2")
-        for channel in {channel for channel, _, _ in ATTACKS.values()} | {ch.ROBOT_PROGRESS}:
-            victim.subscribe(channel)
+        said = [*(Outgoing(*attack) for attack in ATTACKS.values()), *on_every_row()]
+        for out in said:
+            victim.subscribe(out.channel)
         probe = Outgoing(
             ch.STATUS,
             "robot/r2",
             m.Status(stamp_ns=0, node="robot/r2", state="mapping", figures={}),
         )
-        victim.subscribe(ch.STATUS)
 
         def there() -> bool:
             robot.publish(probe)
             return bool(victim.receive(0.02))
 
         wait_until(there, what="the link")
-        said = [Outgoing(*attack) for attack in ATTACKS.values()]
         for out in said:
             robot.publish(out)
         robot.publish(OWN)
-        heard = {key for key in arriving(victim, OWN.key) if not key.endswith("/status")}
+        heard = set(arriving(victim, OWN.key)) - {probe.key}
         assert heard == (set() if locked else {out.key for out in said})
+
+
+ENDS = {
+    "ends the team in the centre's name": (ch.FINAL_MAP, "", FINAL),
+    "ends the team as r1": (ch.TEAM_FINAL, "r1", FINAL),
+    "concludes as r1": (ch.CONCLUDED, "r1", CONCLUDED),
+    "gives r1 up": (
+        ch.GIVEN_UP,
+        "robot/r1",
+        m.GivenUp(stamp_ns=0, node="robot/r1", by="operator", reason="so"),
+    ),
+    "orders the end": (ch.END_ORDER, "", m.TeamEnd(stamp_ns=0, by="operator", reason="so")),
+}
+"""What the router would store of r2, if r2 could publish it."""
+OWN_END = Outgoing(ch.TEAM_FINAL, "r2", FINAL)
+
+
+@pytest.mark.parametrize("locked", [True, False], ids=["keys", "open"])
+def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_elses(
+    keys: Folders, *, locked: bool
+) -> None:
+    """The final map of a team with a centre is the centre's, whatever a robot publishes before
+    and after it, and garbage hides it from nobody."""
+    true = msgspec.structs.replace(FINAL, dof=99)
+    order = Outgoing(ch.ORDER, "r2", m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason=""))
+    with door(keys if locked else None) as enter:
+        robot, victim, centre = enter("robot-r2"), enter("robot-r1"), enter("central")
+        operator = enter("operator")
+        centre.declare_alive("central")
+
+        def stored() -> list[str]:
+            names = tuple(channel.name for channel in ch.REPLIES[ch.KEPT])
+            request = m.KeptRequest(stamp_ns=0, channels=names, run_ns=3600 * 10**9)
+            return [
+                replied(ch.KEPT, "", each, 0).key for each in victim.ask(ch.KEPT, "", request, 5.0)
+            ]
+
+        def ends(bus: ZenohBus, *channels: ch.Channel) -> list[Sample]:
+            end = TheEnd(bus, "robot/r1", channels or (ch.FINAL_MAP,))
+            end._began -= 3600.0
+            return end.missed()
+
+        operator.publish(order)
+        wait_until(lambda: order.key in stored(), what="the order")
+        for out in (*(Outgoing(*attack) for attack in ENDS.values()), OWN_END):
+            robot.publish(out)
+        wait_until(lambda: OWN_END.key in stored(), what="its own end")
+        forged = {Outgoing(*attack).key for attack in ENDS.values()}
+        assert {*stored()} == ({order.key} if locked else forged) | {OWN_END.key}
+        if not locked:
+            return
+        assert ends(victim) == ends(centre) == [], "no team with a centre has ended"
+        assert [each.key for each in ends(victim, *ch.ENDS)] == [OWN_END.key], "its author remains"
+        centre.publish(Outgoing(ch.FINAL_MAP, "", true))
+        wait_until(lambda: bool(ends(victim)), what="the true end")
+        robot.publish_raw(Sample(OWN_END.key, b"garbage", 0, 0, 1))
+        robot.publish(OWN_END)
+        wait_until(lambda: len(ends(victim, *ch.ENDS)) == 2, what="both ends")
+        (found,) = ends(victim)
+        assert (found.key, opened(found)[2]) == (ch.FINAL_MAP.key(), true)
 
 
 def answers(asker: ZenohBus, channel: ch.Channel, name: str, request: m.Message) -> list[bytes]:
@@ -157,11 +235,13 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
     keys: Folders, *, locked: bool
 ) -> None:
     forged = [encoded(odometry(5, "r1"))]
+    end = m.Kept(stamp_ns=0, key="central/final", payload=encoded(FINAL), wall_ns=0, counter=0)
     wanted = m.MeasurementsRequest(stamp_ns=0, robot="r1", incarnation=1, first=0, last=-1)
     with door(keys if locked else None) as enter:
         robot, attacker = enter("robot-r1"), enter("robot-r2")
         attacker.answer(ch.MEASUREMENTS, "r1", lambda _: forged)
         attacker.answer(ch.SUBMAPS, "", lambda _: forged)
+        attacker.answer(ch.KEPT, "", lambda _: [encoded(end)])
         attacker.declare_alive("robot/r1")
         attacker.declare_alive("robot/r2")
         wait_until(lambda: robot.is_alive("robot/r2"), what="the attacker")
@@ -174,10 +254,12 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         try:
             found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
             found += answers(robot, ch.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="r1"))
+            ended = TheEnd(robot).missed()
         finally:
             over.set()
             serving.join()
         assert found == ([] if locked else forged * 2)
+        assert [each.key for each in ended] == ([] if locked else [ch.FINAL_MAP.key()])
 
 
 def test_a_team_works_with_keys_late_joiners_caches_tokens_and_queries(keys: Folders) -> None:

@@ -1,59 +1,151 @@
-"""What a router keeps of a team, without a network."""
+"""The samples that a router stores of a team, without a network."""
+
+import msgspec
+import pytest
 
 from team.wire import channels as ch
-from team.wire.bus import replied
-from team.wire.codec import encoded
-from team.wire.zenoh.stored import MOST_ORDERS, StoredMessages
+from team.wire import messages as m
+from team.wire.bus import Sample, replied
+from team.wire.codec import WireError, encoded
+from team.wire.zenoh import stored as stored_module
+from team.wire.zenoh.stored import StoredMessages
 from tests.support import examples
+
+S = 10**9
+FINAL = msgspec.structs.replace(
+    next(e for e in examples() if isinstance(e, m.FusedMap)), final=True
+)
+CONCLUDED = next(e for e in examples() if isinstance(e, m.Concluded))
+GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r1", by="operator", reason="lost")
+
+
+def sample(channel: ch.Channel, name: str, message: m.Message, counter: int = 7) -> Sample:
+    return Sample(channel.key(name), encoded(message), 5, 6, counter)
+
+
+def order(number: int) -> Sample:
+    return sample(ch.GIVEN_UP, "robot/r1", msgspec.structs.replace(GIVEN_UP, reason=f"{number}"))
+
+
+def of(
+    stored: StoredMessages,
+    *channels: ch.Channel,
+    now_s: float = 0.0,
+    run_s: float = 0.0,
+    node: str = "",
+) -> list[Sample]:
+    request = m.KeptRequest(
+        stamp_ns=0, channels=tuple(c.name for c in channels), node=node, run_ns=round(run_s * S)
+    )
+    return [replied(ch.KEPT, "", reply, 0) for reply in stored.answer(request, now_s)]
 
 
 def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone() -> None:
     stored = StoredMessages()
     stored.token("robot/r1", alive=True)
     stored.token("world", alive=True)
-    for order in (b"order", b"another", b"order"):
-        stored.order(order)
+    for number in (1, 2, 1):
+        stored.take(order(number), 0.0)
     stored.token("robot/r1", alive=False)
-    assert stored.orders() == [b"order", b"another"]
-    stored.end(b"final", 1.0)
-    assert stored.orders() == []
-    stored.order(b"order")
+    assert of(stored, *ch.ORDERS) == [order(1), order(2)]
+    stored.take(sample(ch.FINAL_MAP, "", FINAL), 1.0)
+    assert of(stored, *ch.ORDERS) == []
+    stored.take(order(1), 2.0)
     stored.token("world", alive=False)
-    assert stored.orders() == []
+    assert of(stored, *ch.ORDERS) == []
 
 
-def test_who_never_said_a_last_word_has_missed_the_end_and_is_told_so_once() -> None:
+def test_a_robots_own_end_takes_nothing_from_the_team() -> None:
+    """Its author stays who it is: no order falls, and the centre's final map stays what it is."""
+    stored = StoredMessages()
+    stored.token("robot/r2", alive=True)
+    stored.take(order(1), 0.0)
+    forged = sample(ch.TEAM_FINAL, "r1", FINAL, counter=0)
+    stored.take(forged, 1.0)
+    assert of(stored, *ch.ORDERS) == [order(1)]
+    assert of(stored, ch.FINAL_MAP, now_s=1.0, run_s=9.0) == []
+    assert of(stored, *ch.ENDS, now_s=1.0, run_s=9.0) == [forged]
+    true = sample(ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, dof=99))
+    stored.take(true, 2.0)
+    stored.take(forged, 3.0)
+    assert of(stored, ch.FINAL_MAP, now_s=3.0, run_s=9.0) == [true]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Sample(ch.FINAL_MAP.key(), b"garbage", 0, 0, 0),
+        sample(ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=False)),
+        sample(ch.FINAL_MAP, "", CONCLUDED),
+        sample(ch.FINAL_MAP, "", FINAL, counter=-1),
+        sample(ch.CONCLUDED, "another", CONCLUDED),
+    ],
+    ids=["garbage", "not final", "another type", "no counter", "of another robot"],
+)
+def test_what_is_no_valid_end_does_not_hide_the_true_one(wrong: Sample) -> None:
+    stored = StoredMessages()
+    true = sample(ch.FINAL_MAP, "", FINAL), sample(ch.CONCLUDED, CONCLUDED.robot, CONCLUDED)
+    for each in true:
+        stored.take(each, 0.0)
+    with pytest.raises(WireError):
+        stored.take(wrong, 1.0)
+    assert of(stored, *ch.ENDS, now_s=1.0, run_s=9.0) == [*true]
+
+
+def test_who_never_announced_its_end_has_missed_the_teams_until_it_does() -> None:
+    """To ask in another node's name takes nothing from that node."""
     stored = StoredMessages()
     for node in ("killed", "well", "late"):
         assert not stored.token(node, alive=True)
     stored.last_word("well")
     gone = [node for node in ("killed", "well", "late") if stored.token(node, alive=False)]
     assert gone == ["killed", "late"]
-    assert stored.answer("killed", 0.0) is None
-    stored.end(b"final", 10.0)
+    final = sample(ch.FINAL_MAP, "", FINAL)
+    stored.take(final, 10.0)
     stored.last_word("late")
-    found = stored.answer("killed", 13.0)
-    assert found is not None
-    assert (found.missed, found.age_ns, found.final) == (True, 3 * 10**9, b"final")
-    for node in ("killed", "well", "late", "stranger", ""):
-        again = stored.answer(node, 13.0)
-        assert again is not None
-        assert not again.missed, node
+    for node, missed in (("killed", True), ("killed", True), ("well", False), ("late", False)):
+        assert of(stored, *ch.ENDS, now_s=13.0, node=node) == [final] * missed, node
+    stored.token("killed", alive=True)
+    stored.last_word("killed")
+    assert of(stored, *ch.ENDS, now_s=13.0, node="killed") == []
 
 
-def test_of_more_orders_than_anyone_gives_the_first_are_kept() -> None:
+def test_an_end_is_sent_to_whose_run_is_older() -> None:
     stored = StoredMessages()
-    for number in range(MOST_ORDERS + 1):
-        stored.order(b"%d" % number)
-    assert (len(stored.orders()), stored.orders()[0]) == (MOST_ORDERS, b"0")
+    final = sample(ch.FINAL_MAP, "", FINAL)
+    stored.take(final, 10.0)
+    assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=2.9) == []
+    assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=3.1) == [final]
 
 
-def test_every_order_of_an_operator_comes_back_on_its_own_key() -> None:
-    """Withdrawals, verdicts and the end of a live team, as `given_up`."""
-    said = {c for c in ch.CHANNELS if c.template.startswith("operator/")}
-    assert said - {ch.ORDER_SIGNATURE} == set(ch.REPLIES[ch.ORDERS_KEPT])
-    for channel in ch.REPLIES[ch.ORDERS_KEPT]:
+def test_of_more_than_a_team_has_the_first_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_module, "MOST_ORDERS", 3)
+    monkeypatch.setattr(stored_module, "MOST_ENDS", 2)
+    stored = StoredMessages()
+    for number in range(4):
+        stored.take(order(number), 0.0)
+        stored.take(sample(ch.TEAM_FINAL, f"r{number}", FINAL), 0.0)
+    assert of(stored, *ch.ORDERS) == [order(number) for number in range(3)]
+    assert [each.key[6:8] for each in of(stored, ch.TEAM_FINAL, run_s=1.0)] == ["r0", "r1"]
+
+
+def test_every_order_of_an_operator_is_stored_with_its_signature() -> None:
+    assert {c for c in ch.CHANNELS if c.template.startswith("operator/")} == set(ch.ORDERS)
+    stored = StoredMessages()
+    for channel in ch.ORDERS:
         message = next(e for e in examples() if isinstance(e, channel.message))
-        found = ch.channel_of(replied(ch.ORDERS_KEPT, "", encoded(message), 0).key)
-        assert found is not None
-        assert found[0] is channel
+        if isinstance(message, m.Withdrawal | m.TeamEnd):
+            message = msgspec.structs.replace(message, by="operator")
+        name = getattr(message, "robot", getattr(message, "node", ""))
+        given = sample(channel, name, message)
+        stored.take(given, 0.0)
+        assert of(stored, channel) == [given]
+
+
+def test_the_router_can_not_be_made_to_reply_with_another_channel() -> None:
+    kept = m.Kept(
+        stamp_ns=0, key="central/end", wall_ns=0, counter=0,
+        payload=encoded(m.TeamEnd(stamp_ns=0, by="operator", reason="so")),
+    )  # fmt: skip
+    with pytest.raises(WireError, match="stores nothing on the key"):
+        replied(ch.KEPT, "", encoded(kept), 0)

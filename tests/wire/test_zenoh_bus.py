@@ -36,7 +36,9 @@ from tests.support import (
     wait_until,
 )
 
-FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
+FINAL = msgspec.structs.replace(
+    next(message for message in examples() if isinstance(message, m.FusedMap)), final=True
+)
 
 
 @pytest.fixture
@@ -601,6 +603,8 @@ def test_who_was_killed_in_a_run_and_begins_after_its_end_is_told_once(
         assert TheEnd(centre, "robot/other").missed() == []
         (sample,) = TheEnd(centre, "robot/alpha").missed()
         assert decoded(sample.payload, m.FusedMap) == FINAL
+    ends(endpoint, "robot/alpha", tally=True)
+    with ZenohBus("t", endpoint) as centre:
         assert TheEnd(centre, "robot/alpha").missed() == [], "the next one is of another run"
 
 
@@ -610,7 +614,7 @@ def test_an_order_outlives_the_operator_and_ends_with_the_team(endpoint: str) ->
     )
 
     def asked(bus: ZenohBus) -> list[m.Message]:
-        bus.request(c.ORDERS_KEPT, "", m.OrdersRequest(stamp_ns=0))
+        bus.request(c.KEPT, "", m.KeptRequest(stamp_ns=0, channels=("given_up",)))
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
             if found := bus.receive(0.1):

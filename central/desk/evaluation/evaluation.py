@@ -146,6 +146,7 @@ class Evaluation:
     scale_by_robot: Mapping[str, float] = field(default_factory=dict)
     arbitrary_frame: bool = False
     peers: Mapping[str, PeerResult] = field(default_factory=dict)
+    disagreement: tuple[str, ...] = ()
     association: AssociationResult | None = None
     decisions: tuple[m.AssociationDecision, ...] = ()
     verdicts: tuple[str, ...] = ()
@@ -189,6 +190,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         notes=(
             *(end.notes if isinstance(end, m.End) else ()),
             *_lost(fused),
+            *log.disagreement,
             *_never_came(log),
             *_set_aside(faults),
         ),
@@ -198,6 +200,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         scale_by_robot=_by_robot(log, "covariance_scale."),
         arbitrary_frame=_is_arbitrary(log),
         peers=peer_results(log),
+        disagreement=log.disagreement,
         association=association,
         decisions=_decisions(log),
         verdicts=verdicts_given(log),
@@ -290,7 +293,10 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "covariance_scale": None if fused is None else fused.covariance_scale,
         "covariance_scale_by_robot": dict(evaluation.scale_by_robot),
         "final_map_digest": None if fused is None else fused.digest,
-        "final_map_sha256": None if fused is None else fused.payload_sha256,
+        "final_map_sha256": (
+            None if fused is None or evaluation.disagreement else fused.payload_sha256
+        ),
+        "peers_that_differ": list(evaluation.disagreement),
         "final_map_frame": None if fused is None else fused.frame,
         "frame_is_arbitrary": evaluation.arbitrary_frame,
         "not_joined": [] if fused is None else list(fused.reasons),

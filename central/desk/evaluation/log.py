@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from central.desk.agreement import as_centre_final
 from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
@@ -88,7 +89,8 @@ class Collected:
 
     samples: by key, as payloads that are decoded on demand. first_ns: the wall clock of the first
     sample that has one. unsound: samples that are no valid message of their channel; they count as
-    traffic only.
+    traffic only. disagreement: of a team without a centre, the peers whose final map differs, in
+    words.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
@@ -96,6 +98,7 @@ class Collected:
     latest: dict[str, Sample] = field(default_factory=dict)
     samples: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
     unsound: int = 0
+    disagreement: tuple[str, ...] = ()
     first_ns: int | None = None
 
     @property
@@ -189,4 +192,8 @@ def collected(samples: Iterable[Sample]) -> Collected:
         counterpart = centre.of(sample)
         if counterpart is not None:
             found.keep(counterpart)
+    found.disagreement = centre.agreement.disagreement
+    largest = centre.agreement.largest
+    if found.last(ch.FINAL_MAP) is None and largest is not None:
+        found.keep(as_centre_final(largest))
     return found

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Collection
 
 import msgspec
 
@@ -17,20 +18,22 @@ from team.wire.messages import FusedMap, Status
 NODE = "viewer"
 
 
-def run_viewer(bus: Bus, stop: threading.Event) -> int:
+def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> int:
     """Publish the views of a team until its final map is shown, or until `stop`; returns their
     number.
 
+    peers: the robots of a team whose robots are peers: the final map is the one on which they
+    agree. Without them it is the centre's.
     Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
     """
     viewing = Viewing()
-    centre = PeersAsCentre()
+    centre = PeersAsCentre(peers)
     for channel in (*viewing.node.listens, *LISTENS):
         bus.subscribe(channel)
     bus.watch_alive()
     bus.declare_alive(NODE)
     published = 0
-    end = TheEnd(bus, NODE)
+    end = TheEnd(bus, NODE, ch.ENDS if peers else (ch.FINAL_MAP,))
     boundary = Boundary(NODE)
     due = 0.0
     final: FusedMap | None = None

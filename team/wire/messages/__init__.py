@@ -31,8 +31,6 @@ from team.wire.messages.estimates import PoseEstimate as PoseEstimate
 from team.wire.messages.estimates import Rendezvous as Rendezvous
 from team.wire.messages.maps import AssociationDecision as AssociationDecision
 from team.wire.messages.maps import BiasEstimate as BiasEstimate
-from team.wire.messages.maps import FinalMapReply as FinalMapReply
-from team.wire.messages.maps import FinalMapRequest as FinalMapRequest
 from team.wire.messages.maps import FusedMap as FusedMap
 from team.wire.messages.maps import Membership as Membership
 from team.wire.messages.maps import Prior as Prior
@@ -55,6 +53,8 @@ from team.wire.messages.measurements import StreamEnd as StreamEnd
 from team.wire.messages.measurements import StreamHead as StreamHead
 from team.wire.messages.nodes import Configuration as Configuration
 from team.wire.messages.nodes import Fault as Fault
+from team.wire.messages.nodes import Kept as Kept
+from team.wire.messages.nodes import KeptRequest as KeptRequest
 from team.wire.messages.nodes import Liveliness as Liveliness
 from team.wire.messages.nodes import Progress as Progress
 from team.wire.messages.nodes import Status as Status
@@ -62,7 +62,6 @@ from team.wire.messages.nodes import Tally as Tally
 from team.wire.messages.orders import GivenUp as GivenUp
 from team.wire.messages.orders import Judgement as Judgement
 from team.wire.messages.orders import LocalLandmark as LocalLandmark
-from team.wire.messages.orders import OrdersRequest as OrdersRequest
 from team.wire.messages.orders import TeamEnd as TeamEnd
 from team.wire.messages.orders import Verdict as Verdict
 from team.wire.messages.orders import Withdrawal as Withdrawal

@@ -214,20 +214,3 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
         check_finite(self.covariances, "covariances", 9 * k)
         for i in range(k):
             check_pose_covariance(self.covariances[72 * i : 72 * (i + 1)], "covariances")
-
-
-class FinalMapRequest(Message, frozen=True, kw_only=True, tag="final_wanted/1"):
-    """A query to the router: the team's final map, if there is one already. node: who asks."""
-
-    node: Text = ""
-
-
-class FinalMapReply(Message, frozen=True, kw_only=True, tag="final_kept/1"):
-    """The router's answer: the payload of the newest final map, and how long ago it came [ns].
-
-    missed: a process of the node that asks was in that run and went without a last word.
-    """
-
-    age_ns: Count
-    final: bytes
-    missed: bool = False

@@ -81,3 +81,28 @@ class Tally(Message, frozen=True, kw_only=True, tag="tally/1"):
     def check(self) -> None:  # noqa: D102
         if len(self.keys) != len(self.counts):
             raise ValueError(f"{len(self.counts)} counts of {len(self.keys)} keys")
+
+
+class KeptRequest(Message, frozen=True, kw_only=True, tag="kept_wanted/1"):
+    """A query to the router for samples that it stores, newest last.
+
+    channels: the names of the channels that are wanted. node: the node that asks. run_ns: how long
+    ago its run began; of the messages that end a team only those are sent that are younger, or that
+    a process of this node missed: it was in that run and left without a `Tally`.
+    """
+
+    channels: tuple[Text, ...]
+    node: Text = ""
+    run_ns: Count = 0
+
+
+class Kept(Message, frozen=True, kw_only=True, tag="kept/1"):
+    """A sample that the router stores, as its author published it: key, payload, and attachment.
+
+    stamp_ns: the sample's team time, wall_ns: its author's wall clock, counter: its author's.
+    """
+
+    key: Text
+    payload: bytes
+    wall_ns: StampNs
+    counter: Count

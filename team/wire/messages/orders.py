@@ -92,7 +92,3 @@ class TeamEnd(Message, frozen=True, kw_only=True, tag="team_end/1"):
 
     by: Text
     reason: Text
-
-
-class OrdersRequest(Message, frozen=True, kw_only=True, tag="orders_wanted/1"):
-    """A query to the router: the orders that hold in this run, from operators who have left."""

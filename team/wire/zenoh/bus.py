@@ -23,7 +23,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
-from team.wire.channels import ALIVE, REPLIES, TALLY, Channel, row_of
+from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel, row_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from team.wire.messages import Liveliness, Message, Tally
 from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
@@ -321,7 +321,7 @@ class ZenohBus:
         """
         self._check_open()
         payloads = self._queries.ask(channel, name, request, timeout_s)
-        if self.tap is not None and channel in REPLIES:
+        if self.tap is not None and channel in REPLIES and channel is not KEPT:
             wall_ns = time.time_ns()
             with suppress(WireError):  # whoever asked opens them, and says what is wrong
                 self.tap([replied(channel, name, payload, wall_ns) for payload in payloads])

@@ -13,19 +13,11 @@ from zenoh.handlers import Callback
 
 from team.keys.roster import Roster
 from team.wire.bus import BusError, Sample
-from team.wire.bus import opened as opened_order
-from team.wire.channels import (
-    ALIVE,
-    FINAL_KEPT,
-    FINAL_MAP,
-    ORDERS_KEPT,
-    REPLIES,
-    TALLY,
-    TEAM_FINAL,
-)
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import FinalMapRequest
+from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel
+from team.wire.codec import WireError, decoded
+from team.wire.messages import KeptRequest
 from team.wire.zenoh.access import access_control
+from team.wire.zenoh.attachment import AttachmentError, unpack
 from team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
 from team.wire.zenoh.stored import StoredMessages
 
@@ -65,7 +57,7 @@ def router(
             f"choose another, or port 0 for any free one"
         ) from error
     with session:
-        _Keeper(session)
+        _Keeper(session, "*" if keys is None else keys[1].team)
         if keys is not None:
             _answer_door(session, keys[1])
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
@@ -76,21 +68,23 @@ def router(
 
 
 class _Keeper:
-    """Stores each team's final map and operators' orders at the router, and answers queries for
-    them.
+    """Stores each team's ends and operators' orders at the router, and answers queries for them.
+
+    team: the only team of a router with keys, whose access control would withhold from publishers
+    that the router subscribes to the keys of all teams; "*": any team.
     """
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, team: str) -> None:
         self._teams: defaultdict[str, StoredMessages] = defaultdict(StoredMessages)
-        for channel in (FINAL_MAP, TEAM_FINAL, TALLY, *REPLIES[ORDERS_KEPT]):
-            key = f"team/*/{channel.key('**')}"
+        for channel in (TALLY, *REPLIES[KEPT]):
+            key = f"team/{team}/{channel.key(_every(channel))}"
             session.declare_subscriber(key, Callback(self._take, indirect=False))
         session.liveliness().declare_subscriber(
-            f"team/*/{ALIVE.key('**')}", Callback(self._token, indirect=False), history=True
+            f"team/{team}/{ALIVE.key('**')}", Callback(self._token, indirect=False), history=True
         )
-        for channel, answer in ((FINAL_KEPT, self._final), (ORDERS_KEPT, self._orders)):
-            key = f"team/*/{channel.key()}"
-            session.declare_queryable(key, Callback(answer, indirect=False))
+        session.declare_queryable(
+            f"team/{team}/{KEPT.key()}", Callback(self._answer, indirect=False)
+        )
 
     def _of(self, key: zenoh.KeyExpr) -> tuple[StoredMessages, str]:
         """The stored messages of a key's team, and the key within the team."""
@@ -99,15 +93,15 @@ class _Keeper:
 
     def _take(self, sample: zenoh.Sample) -> None:
         stored, key = self._of(sample.key_expr)
-        if key == FINAL_MAP.key() or TEAM_FINAL.owner(key) is not None:
-            stored.end(sample.payload.to_bytes(), time.monotonic())
-        elif any(channel.owner(key) is not None for channel in REPLIES[ORDERS_KEPT]):
-            with suppress(WireError):  # what nobody would follow is no order
-                order = Sample(key, sample.payload.to_bytes(), 0, 0, 0)
-                opened_order(order)
-                stored.order(order.payload)
-        elif (node := TALLY.owner(key)) is not None:
+        if (node := TALLY.owner(key)) is not None:
             stored.last_word(node)
+            return
+        beside = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        try:
+            attached = unpack(str(sample.key_expr), beside)
+            stored.take(Sample(key, sample.payload.to_bytes(), *attached), time.monotonic())
+        except (AttachmentError, WireError) as error:  # its receivers drop it, and log that
+            _LOG.debug("%r: not stored: %s", key[:80], error)
 
     def _token(self, sample: zenoh.Sample) -> None:
         stored, key = self._of(sample.key_expr)
@@ -120,17 +114,13 @@ class _Keeper:
                 str(sample.key_expr).split("/", 2)[1],
             )
 
-    def _final(self, query: zenoh.Query) -> None:
+    def _answer(self, query: zenoh.Query) -> None:
         with query:
-            stored, _ = self._of(query.key_expr)
-            found = stored.answer(_asker(query), time.monotonic())
-            if found is not None:
-                query.reply(query.key_expr, encoded(found))
-
-    def _orders(self, query: zenoh.Query) -> None:
-        with query:
-            for order in self._of(query.key_expr)[0].orders():
-                query.reply(query.key_expr, order)
+            request = b"" if query.payload is None else query.payload.to_bytes()
+            with suppress(WireError):
+                stored, _ = self._of(query.key_expr)
+                for reply in stored.answer(decoded(request, KeptRequest), time.monotonic()):
+                    query.reply(query.key_expr, reply)
 
 
 def _answer_door(session: zenoh.Session, roster: Roster) -> None:
@@ -145,12 +135,9 @@ def _answer_door(session: zenoh.Session, roster: Roster) -> None:
     session.declare_queryable(f"team/{roster.team}/{DOOR}/*", Callback(answer, indirect=False))
 
 
-def _asker(query: zenoh.Query) -> str:
-    """The node that requests a final map; empty where the request does not contain it."""
-    with suppress(WireError):
-        request = b"" if query.payload is None else query.payload.to_bytes()
-        return decoded(request, FinalMapRequest).node
-    return ""
+def _every(channel: Channel) -> str:
+    """The part of a key for all names: the name of a node may have two parts."""
+    return "*" if "{robot}" in channel.template else "**"
 
 
 def _router_tls(keys: "Credentials", roster: Roster) -> dict[str, object]:

@@ -1,22 +1,45 @@
-"""What a router stores of a team while it runs: its final map, and orders of operators who have
-left.
+"""The samples of a team that a router stores for processes that were absent: ends and orders.
 
-The final map is stored for processes that were absent when it was published. A starting process can
-not know itself whether it belongs to the run that has ended or to a new one; the router knows the
-nodes of that run that never announced their end (`Tally`): a node of that name missed the end, and
-is sent the map once. Orders (a robot withdrawn or given up, verdicts on landmarks, the end of a
-live team) are valid until the final map is published or no process of the team is present any more.
+A stored sample keeps its key, bytes and attachment, so that its author remains who published it:
+with keys the router's access control has let only that node publish on the key. What a sample
+means is decided where it is received. A sample is decoded and checked before it is stored, and an
+end that another author publishes replaces no end but its own.
+
+Ends (`ENDS`: the centre's final map; without a centre each robot's own final map and conclusion)
+are stored until their author publishes another one. A starting process can not determine by itself
+whether it belongs to the run that has ended or to a new one. The router stores which nodes of that
+run never announced their end (`Tally`): a node of that name missed the end, and is sent it until
+one of its processes announces its end. Orders of operators who have left (a robot withdrawn or
+given up, verdicts on landmarks, the end of a live team) are valid until the centre's final map, or
+until no process of the team is present any more.
 """
 
 import threading
 from dataclasses import dataclass, field
 
-from team.wire.messages import FinalMapReply
+from team.wire.bus import Sample, opened
+from team.wire.channels import ENDS, FINAL_MAP, ORDERS
+from team.wire.codec import WireError, decoded, encoded
+from team.wire.messages import FusedMap, Kept, KeptRequest
 
 MOST_ORDERS = 10_000
-"""Number of orders to a team that are stored; an operator who gives more has to repeat the
-others.
+"""Number of orders to a team that are stored, signatures included; an operator who gives more has
+to repeat the others.
 """
+MOST_ENDS = 400
+"""Number of keys on which ends are stored: two for each robot of the largest team, and others."""
+
+
+@dataclass(frozen=True)
+class _End:
+    """A stored end: its channel, the monotonic time of its arrival [s], its reply, and the nodes
+    that missed it.
+    """
+
+    channel: str
+    since_s: float
+    reply: bytes
+    missed_by: set[str]
 
 
 @dataclass
@@ -27,9 +50,9 @@ class StoredMessages:
 
     _there: set[str] = field(default_factory=set, init=False)
     _silent: set[str] = field(default_factory=set, init=False)
-    _owed: set[str] = field(default_factory=set, init=False)
-    _final: tuple[float, bytes] | None = field(default=None, init=False)
-    _orders: dict[bytes, None] = field(default_factory=dict, init=False)
+    _ends: dict[str, _End] = field(default_factory=dict, init=False)
+    _orders: dict[bytes, str] = field(default_factory=dict, init=False)
+    _named: set[tuple[str, bytes]] = field(default_factory=set, init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def token(self, node: str, *, alive: bool) -> bool:
@@ -43,43 +66,65 @@ class StoredMessages:
                 return False
             self._there.discard(node)
             if not self._there:
-                self._orders.clear()
+                self._forget_orders()
             return node in self._silent
 
     def last_word(self, node: str) -> None:
-        """Records that a process of this node ends in order, so that it does not need the final
-        map.
+        """Records that a process of this node ends in order, so that it does not need the end of
+        the team any more.
         """
         with self._lock:
             self._silent.discard(node)
-            self._owed.discard(node)
+            for end in self._ends.values():
+                end.missed_by.discard(node)
 
-    def end(self, final: bytes, now_s: float) -> None:
-        """Stores the team's final map."""
-        with self._lock:
-            self._final = now_s, final
-            self._owed = set(self._silent)
-            self._orders.clear()
+    def take(self, sample: Sample, now_s: float) -> None:
+        """Stores an end or an order. Raises `WireError` where it is no valid one."""
+        channel, _, message = opened(sample)
+        kept = Kept(
+            stamp_ns=sample.stamp_ns,
+            key=sample.key,
+            payload=sample.payload,
+            wall_ns=sample.wall_ns,
+            counter=sample.counter,
+        )
+        reply = encoded(kept)
+        decoded(reply, Kept)  # its receivers check the attachment, too
+        if channel in ENDS:
+            if isinstance(message, FusedMap) and not message.final:
+                raise WireError("wrong field", f"no final map on the key {sample.key!r}")
+            self._end(sample.key, _End(channel.name, now_s, reply, set()))
+        elif channel in ORDERS:
+            self._order(sample, channel.name, reply)
 
-    def order(self, order: bytes) -> None:
-        """Stores an operator's order; only the first MOST_ORDERS are stored."""
+    def _end(self, key: str, end: _End) -> None:
         with self._lock:
-            if len(self._orders) < MOST_ORDERS:
-                self._orders[order] = None
+            if key not in self._ends and len(self._ends) >= MOST_ENDS:
+                return
+            end.missed_by.update(self._silent)
+            self._ends[key] = end
+            if key == FINAL_MAP.key():
+                self._forget_orders()
 
-    def orders(self) -> list[bytes]:
-        """The valid orders, the oldest first."""
+    def _order(self, sample: Sample, channel: str, reply: bytes) -> None:
+        name = sample.key, sample.payload
         with self._lock:
-            return list(self._orders)
+            if len(self._orders) < MOST_ORDERS and name not in self._named:
+                self._named.add(name)
+                self._orders[reply] = channel
 
-    def answer(self, node: str, now_s: float) -> FinalMapReply | None:
-        """The reply to a node that requests the final map; None while there is no map."""
+    def _forget_orders(self) -> None:
+        self._orders.clear()
+        self._named.clear()
+
+    def answer(self, request: KeptRequest, now_s: float) -> list[bytes]:
+        """The stored samples that a node requests, the oldest first, as payloads of `Kept`."""
         with self._lock:
-            if self._final is None:
-                return None
-            missed = node in self._owed
-            self._owed.discard(node)
-            since_s, final = self._final
-            return FinalMapReply(
-                stamp_ns=0, age_ns=round(1e9 * (now_s - since_s)), final=final, missed=missed
-            )
+            orders = [reply for reply, name in self._orders.items() if name in request.channels]
+            ends = [
+                end
+                for end in self._ends.values()
+                if end.channel in request.channels
+                and (now_s - end.since_s <= 1e-9 * request.run_ns or request.node in end.missed_by)
+            ]
+        return [*orders, *(end.reply for end in sorted(ends, key=lambda end: end.since_s))]

@@ -26,9 +26,15 @@ def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
     network = MemoryNetwork()
     router = MemoryBus(network)
     router.answer(
-        ch.FINAL_KEPT,
+        ch.KEPT,
         "",
-        lambda _: [encoded(m.FinalMapReply(stamp_ns=0, age_ns=0, final=encoded(final)))],
+        lambda _: [
+            encoded(
+                m.Kept(
+                    stamp_ns=0, key="central/final", payload=encoded(final), wall_ns=0, counter=0
+                )
+            )
+        ],
     )
     stop = threading.Event()
     timer = threading.Timer(20.0, stop.set)

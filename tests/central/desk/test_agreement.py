@@ -1,0 +1,161 @@
+"""The final map of a team without a centre is the one on which all its peers agree."""
+
+import hashlib
+
+import msgspec
+import pytest
+
+from central.desk.agreement import Agreement
+from central.desk.evaluation.evaluation import evaluate, to_json
+from central.desk.peers_as_centre import PeersAsCentre
+from central.team_config import TeamConfig
+from sim.launch.watch import Watch
+from team.config import RobotConfig
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from team.wire.codec import encoded
+from team.wire.digest import configured
+from tests.support import examples
+
+ROBOTS = ("r1", "r2", "r3")
+TRUE = msgspec.structs.replace(next(e for e in examples() if isinstance(e, m.FusedMap)), final=True)
+FORGED = msgspec.structs.replace(TRUE, dof=99)
+
+
+def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
+    return Sample(channel.key(name), encoded(message), message.stamp_ns, 0, 0)
+
+
+def final(robot: str, fused: m.FusedMap = TRUE) -> Sample:
+    return sample(ch.TEAM_FINAL, robot, fused)
+
+
+def concluded(robot: str, fused: m.FusedMap = TRUE, serial: int = 1) -> Sample:
+    sha256 = hashlib.sha256(encoded(fused)).digest()
+    return sample(
+        ch.CONCLUDED,
+        robot,
+        m.Concluded(
+            stamp_ns=0, robot=robot, serial=serial, digest=fused.digest, sha256=sha256, submaps=2
+        ),
+    )
+
+
+def scenario(*, peers: bool) -> Sample:
+    robots = tuple(RobotConfig(robot) for robot in ROBOTS)
+    team = TeamConfig(name="t", team="t", robots=robots, peers=peers, centre=not peers)
+    return sample(ch.WORLD_CONFIG, "", configured("world", 0, 0, team))
+
+
+HONEST = [part for robot in ROBOTS for part in (final(robot), concluded(robot))]
+WITHDRAWN = m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="broken")
+GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost")
+
+
+def judged(*samples: Sample) -> Agreement:
+    found = Agreement(ROBOTS)
+    for each in samples:
+        found.take(each)
+    return found
+
+
+def test_all_agree_whatever_one_has_published_before() -> None:
+    found = judged(final("r1", FORGED), *HONEST)
+    assert found.disagreement == ()
+    assert found.agreed is not None
+    assert found.agreed.payload == encoded(TRUE)
+
+
+def test_a_forgery_is_nobodys_map_until_all_have_it() -> None:
+    """Not one robot's word, nor that of all but one."""
+    early = judged(final("r1", FORGED), concluded("r1", FORGED))
+    assert early.agreed is None
+    for robot in ("r1", "r2"):
+        for each in (final(robot, FORGED), concluded(robot, FORGED)):
+            early.take(each)
+    assert early.agreed is None
+
+
+@pytest.mark.parametrize(
+    ("behind", "told"),
+    [
+        ((final("r1", FORGED), concluded("r1", FORGED, 2)), "r1 has another final map"),
+        ((final("r1", FORGED),), "r1 has published another final map"),
+    ],
+)
+def test_who_differs_is_named_and_there_is_no_hash_of_the_teams_map(
+    behind: tuple[Sample, ...], told: str
+) -> None:
+    evaluation = evaluate([scenario(peers=True), *HONEST, *behind])
+    (why,) = evaluation.disagreement
+    assert told in why
+    assert why in evaluation.notes
+    figures = to_json(evaluation)
+    assert (figures["final_map_sha256"], figures["peers_that_differ"]) == (None, [why])
+    assert evaluation.map is not None
+    assert evaluation.map.payload_sha256 == hashlib.sha256(encoded(TRUE)).hexdigest()
+
+
+def test_who_has_no_final_map_is_named_unless_an_operator_has_given_it_up() -> None:
+    two = HONEST[:4]
+    (why,) = judged(*two).disagreement
+    assert "r3 has announced no final map" in why
+    for channel, name, order in (
+        (ch.GIVEN_UP, "robot/r3", GIVEN_UP),
+        (ch.ORDER, "r3", WITHDRAWN),
+    ):
+        found = judged(*two, sample(channel, name, order))
+        assert found.disagreement == ()
+        assert found.agreed is not None
+
+
+def test_a_map_that_calls_the_others_lost_excuses_nobody() -> None:
+    alone = msgspec.structs.replace(FORGED, lost=("r2", "r3"))
+    assert judged(final("r1", alone), concluded("r1", alone)).agreed is None
+
+
+def test_an_older_conclusion_replaces_no_later_one() -> None:
+    found = judged(*HONEST, concluded("r1", TRUE, 3), concluded("r1", FORGED, 2))
+    assert found.disagreement == ()
+
+
+def test_a_robots_own_map_is_nothing_in_a_team_with_a_centre() -> None:
+    attack = [final("r1", FORGED), concluded("r1", FORGED)]
+    evaluation = evaluate([scenario(peers=False), *attack])
+    assert evaluation.map is None
+    assert evaluation.disagreement == ()
+    centre = sample(ch.FINAL_MAP, "", TRUE)
+    evaluation = evaluate([scenario(peers=False), *attack, centre, *attack])
+    assert evaluation.map is not None
+    assert to_json(evaluation)["final_map_sha256"] == hashlib.sha256(encoded(TRUE)).hexdigest()
+
+
+def test_a_viewer_is_given_the_final_map_once_and_when_all_have_it() -> None:
+    centre = PeersAsCentre(ROBOTS)
+    given = [centre.of(each) for each in (final("r1", FORGED), *HONEST)]
+    (found,) = [each for each in given if each is not None]
+    assert given.index(found) == len(given) - 2, (
+        "the last robot's map; its conclusion is nothing new"
+    )
+    assert (found.key, found.payload) == (ch.FINAL_MAP.key(), encoded(TRUE))
+
+
+def test_a_launch_is_over_when_every_peer_has_a_final_map_of_its_own() -> None:
+    network = MemoryNetwork()
+    robot, own = MemoryBus(network), MemoryBus(network)
+    watch = Watch(peers=frozenset(ROBOTS), centre=PeersAsCentre(ROBOTS))
+    for channel in (ch.TEAM_FINAL, ch.CONCLUDED):
+        own.subscribe(channel)
+    for each in (final("r1", FORGED), concluded("r1", FORGED), *HONEST[2:]):
+        assert not watch.is_over
+        robot.publish_raw(each)
+        watch.take(own)
+    assert watch.is_over
+    assert watch.fused is None, "they do not agree"
+    robot.publish(Outgoing(ch.CONCLUDED, "r1", m.Concluded(
+        stamp_ns=0, robot="r1", serial=2, digest=TRUE.digest,
+        sha256=hashlib.sha256(encoded(TRUE)).digest(), submaps=2,
+    )))  # fmt: skip
+    watch.take(own)
+    assert watch.fused == TRUE

@@ -1,0 +1,63 @@
+"""When a peer that comes back alone may leave: every other robot has announced its own end."""
+
+import pytest
+
+from central.config import CentralConfig
+from central.peers.robot import PeerRobot
+from team.config import RobotConfig
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import encoded
+from tests.peers.teams import member
+
+ROBOTS = ("r1", "r2", "r3")
+ORDERS = {
+    "given up": (
+        ch.GIVEN_UP,
+        m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost"),
+    ),
+    "withdrawn": (ch.ORDER, m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="broken")),
+}
+
+
+def ended(robot: str) -> Sample:
+    concluded = m.Concluded(
+        stamp_ns=0, robot=robot, serial=1, digest=bytes(8), sha256=bytes(32), submaps=0
+    )
+    return Sample(ch.CONCLUDED.key(robot), encoded(concluded), 0, 0, 0)
+
+
+@pytest.fixture
+def peer() -> PeerRobot:
+    return PeerRobot(RobotConfig("r2"), CentralConfig(), ROBOTS)
+
+
+def test_the_end_of_one_robot_is_not_the_end_of_the_team(peer: PeerRobot) -> None:
+    assert not peer.is_left_alone
+    peer.take_end([ended("r1")])
+    assert not peer.is_left_alone
+    peer.take_end([ended("r3")])
+    assert peer.is_left_alone
+    assert not peer.peer.replica.concluded, "the set grows by what peers send"
+
+
+def test_an_end_in_another_robots_name_and_garbage_are_nobodys(peer: PeerRobot) -> None:
+    forged = Sample(ch.CONCLUDED.key("r3"), ended("r1").payload, 0, 0, 0)
+    peer.take_end([ended("r1"), forged, Sample(forged.key, b"garbage", 0, 0, 0)])
+    assert not peer.is_left_alone
+
+
+def test_nobody_is_left_alone_while_another_is_there(peer: PeerRobot) -> None:
+    peer.take_end([ended("r1"), ended("r3")])
+    peer.handle(m.Liveliness(stamp_ns=0, node="robot/r3", alive=True), 0)
+    assert not peer.is_left_alone
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_whom_an_operator_has_given_up_or_withdrawn_is_not_waited_for(
+    peer: PeerRobot, order: str
+) -> None:
+    peer.take_end([ended("r1")])
+    peer.keep([member(*ORDERS[order])])
+    assert peer.is_left_alone
