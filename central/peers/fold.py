@@ -15,6 +15,7 @@ from central.config import CentralConfig
 from central.node import CentralNode
 from central.robot_attendance import note
 from team.containment import Boundary
+from team.door import MOST_COUNT
 from team.peers.node import PeerNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -203,7 +204,7 @@ class PeerFold:
         return m.Concluded(
             stamp_ns=final.stamp_ns,
             robot=robot,
-            serial=1 if before is None else before.serial + 1,
+            serial=1 if before is None else min(before.serial + 1, MOST_COUNT),
             digest=final.digest,
             sha256=hashlib.sha256(encoded(final)).digest(),
             submaps=self._peer.replica.submaps,

@@ -14,7 +14,7 @@ from central.peers.fold import FoldWhen
 from central.peers.peer import Peer, member_in
 from team.config import Exchange, RobotConfig
 from team.peers.members import CHANNELS, Member
-from team.peers.proofs import Proofs, Signs
+from team.peers.proofs import Proofs, Signs, signed_by
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -73,13 +73,22 @@ class PeerRobot(Peer):
         return [config, *self._certified(), *self._from_estimator(self.node.begin())]
 
     def _certified(self) -> list[Outgoing]:
-        """With keys: the certificate that verifies its signatures."""
+        """With keys: the certificate that verifies its signatures, and these of its stored members.
+
+        An earlier process has signed them with a key that may be revoked since.
+        """
         proofs = self.peer.proofs
         if proofs is None:
             return []
         certificate = Outgoing(ch.CERTIFICATE, self.robot, proofs.certificate())
+        own = (
+            member
+            for member in self.peer.replica.members()
+            if signed_by(member) == self.robot and not isinstance(member.message, m.Certificate)
+        )
+        signatures = [Outgoing(ch.SIGNATURE, self.robot, proofs.signed(each)) for each in own]
         self.peer.take(member_in(certificate), self.name)
-        return [certificate]
+        return [certificate, *signatures]
 
     def _vouched(self, outgoing: Outgoing) -> list[Outgoing]:
         """Take a member of its own into the set; with keys its signature is published after it."""

@@ -8,6 +8,7 @@ A node is one sender: `robot-<name>`, `source-<name>` (the driver of a robot's s
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -23,6 +24,15 @@ class KeysError(RuntimeError):
     """Keys are missing, do not fit, or can not be created; the text says which, and gives the
     remedy.
     """
+
+
+class Issued(NamedTuple):
+    """A certificate that the authority has issued: its generation, and the Unix time of its end
+    [ns].
+    """
+
+    generation: int
+    ends_ns: int
 
 
 class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

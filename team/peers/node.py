@@ -105,12 +105,20 @@ class PeerNode:
         return True
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
-        """As `take`, for a sample on a member's key."""
+        """As `take`, for a sample on a member's key, which the router lets only its author use; a
+        certificate has to be the authority's, too.
+        """
         try:
-            return self.take(member_of(sample.key, sample.payload), carrier)
+            member = member_of(sample.key, sample.payload)
         except (WireError, ValueError) as error:
             self._refuse(f"{sample.key}: {error}")
             return False
+        if self.proofs is not None and isinstance(member.message, m.Certificate):
+            why = self.proofs.refusal(member, self.replica)
+            if why is not None:
+                self._refuse(f"{sample.key}: {why}")
+                return False
+        return self.take(member, carrier)
 
     def take_carried(self, carried: m.Members) -> list[Member]:
         """Take the members that another node carries; returns the new ones."""
@@ -262,11 +270,11 @@ class PeerNode:
         if asker not in self.known:
             self._refuse(f"a request of {asker[:80]}, not in this team")
             return []
-        if not self._given.allows(asker, self._now_s):
-            self._refuse(f"{asker[:80]} asks for more than {GIVEN_BYTES} bytes a second")
+        if not self._given.allows(self._now_s):
+            self._refuse(f"requests for more than {GIVEN_BYTES} bytes a second")
             return []
         batches = [encoded(batch) for batch in self._answered(query)]
-        self._given.note(asker, sum(map(len, batches)))
+        self._given.note(sum(map(len, batches)))
         return batches
 
     def _answered(self, request: m.MembersRequest) -> list[m.Members]:

@@ -1,13 +1,23 @@
 """Checks by signatures that a member carried by a third node is its author's.
 
-Every robot states its certificate, itself a member, and signs each of its members on a key of its
-own (`robot/r1/signature`), for whoever carries them. An operator leaves at once: it signs its
+Every robot states its certificates, themselves members, and signs each of its members on a key of
+its own (`robot/r1/signature`), for whoever carries them. An operator leaves at once: it signs its
 orders (`operator/signature/r1`) with its certificate in front, so that robots out of its reach can
 check them.
+
+A member is proven by any certificate of its author that the team's authority has issued, that is
+not revoked, and that had not ended at the member's stamp. That stamp is the author's own word, by
+its sensor's clock: whoever has stolen a key can date back what it signs, and only a revocation ends
+what a stolen key can sign. A certificate of a later generation proves that the earlier ones are
+revoked, since the authority issues it only then; a roster beside the own key names revocations
+without a successor. Certificates of revoked generations stay in the set, which is the same for all
+peers; they prove nothing.
 """
 
+from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
+from team.keys.roster import Issued
 from team.peers.members import Member, about
 from team.peers.replica import Replica
 from team.wire import messages as m
@@ -32,8 +42,11 @@ class Signs(Protocol):
     def sign(self, named: bytes) -> bytes:
         """The signature of these bytes."""
 
-    def refusal(self, node: str, certificate: bytes) -> str | None:
-        """Why a certificate is not the node's."""
+    def issued(self, node: str, certificate: bytes) -> Issued | str:
+        """The issued certificate of the node; why it is none, in words."""
+
+    def revoked(self, node: str) -> int:
+        """The last generation that is known to be revoked; 0: none."""
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
         """Whether a certificate's key has signed what the bytes name."""
@@ -46,6 +59,7 @@ class Proofs:
         self._robot = robot
         self._signer = signer
         self._signatures: dict[str, dict[bytes, bytes]] = {}
+        self._operator = 1
 
     def certificate(self) -> m.Certificate:
         """The robot's own certificate, as a member."""
@@ -82,16 +96,19 @@ class Proofs:
             return b""
         publisher = signed_by(member)
         signatures = self._signatures.setdefault(publisher, {})
-        found = member.signature or signatures.get(member.hash, b"")
-        if not found and publisher == self._robot:
-            found = signatures[member.hash] = self._signer.sign(member.hash)
-        return found
+        found = signatures.get(member.hash, b"")
+        if publisher == self._robot:  # an earlier process may have had another key
+            found = found or self._signer.sign(member.hash)
+            signatures[member.hash] = found
+            return found
+        return member.signature or found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:
         """Why a carried member is not believed, in words; None where it is."""
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
-            return self._signer.refusal(f"robot-{robot}", message.certificate)
+            found = self._signer.issued(f"robot-{robot}", message.certificate)
+            return found if isinstance(found, str) else None
         why = (
             self._refused_order(member)
             if isinstance(message, ORDERS)
@@ -102,18 +119,42 @@ class Proofs:
         return why
 
     def _refused_of_robot(self, member: Member, robot: str, replica: Replica) -> str | None:
-        known = replica.statements.get(robot, {}).get(("certificate", 0))
-        if known is None or not isinstance(known.message, m.Certificate):
+        node = f"robot-{robot}"
+        issued = list(self._issued_to(node, replica.certificates_of(robot)))
+        if not issued:
             return f"no certificate of {robot} is here yet"
-        if not self._signer.is_signed(known.message.certificate, member.hash, member.signature):
+        least = max(self._signer.revoked(node) + 1, *(each.generation for each, _ in issued))
+        signed_with = [
+            each
+            for each, certificate in issued
+            if self._signer.is_signed(certificate, member.hash, member.signature)
+        ]
+        if not signed_with:
             return f"not signed by {robot}"
+        if all(each.generation < least for each in signed_with):
+            return f"signed with a certificate of {robot} that is revoked"
+        if all(each.ends_ns < member.message.stamp_ns for each in signed_with):
+            return f"stamped after the certificate of {robot} that signed it had ended"
         return None
+
+    def _issued_to(
+        self, node: str, certificates: Iterator[bytes]
+    ) -> Iterator[tuple[Issued, bytes]]:
+        for certificate in certificates:
+            issued = self._signer.issued(node, certificate)
+            if not isinstance(issued, str):
+                yield issued, certificate
 
     def _refused_order(self, member: Member) -> str | None:
         certificate, signature = _split(member.signature)
-        why = self._signer.refusal(OPERATOR, certificate)
-        if why is not None:
-            return f"an order with {why}"
+        issued = self._signer.issued(OPERATOR, certificate)
+        if isinstance(issued, str):
+            return f"an order with {issued}"
+        self._operator = max(self._operator, issued.generation)
+        if issued.generation < max(self._operator, self._signer.revoked(OPERATOR) + 1):
+            return "an order with an operator's certificate that is revoked"
+        if issued.ends_ns < member.message.stamp_ns:
+            return "an order that is stamped after the operator's certificate had ended"
         if not self._signer.is_signed(certificate, member.hash, signature):
             return "an order that no operator has signed"
         return None

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeVar
 
-from team.door import MOST_LIVES
+from team.door import MOST_COUNT, MOST_LIVES
 from team.peers.members import Member, Stream, about
 from team.wire import messages as m
 
@@ -186,6 +186,11 @@ class Replica:
 
     def _add_stated(self, member: Member, robot: str) -> Outcome:
         name = _stated(member.message)
+        serial = getattr(member.message, "serial", 0)
+        if serial > MOST_COUNT:
+            raise RefusedError(
+                f"conclusion {serial} of {robot}; no peer has more than {MOST_COUNT}"
+            )
         among = self.statements[robot]
         there = among.get(name)
         if there is not None and _rank(there) >= _rank(member):
@@ -225,6 +230,12 @@ class Replica:
             if member is not None and isinstance(member.message, m.Concluded):
                 found[robot] = member.message
         return found
+
+    def certificates_of(self, robot: str) -> Iterator[bytes]:
+        """The certificates that a robot has stated: more than one where it was renewed."""
+        for member in self.statements.get(robot, {}).values():
+            if isinstance(member.message, m.Certificate):
+                yield member.message.certificate
 
     def members(self) -> Iterator[Member]:
         """Every member, in an order in which a fold can take them one by one."""
@@ -335,7 +346,8 @@ def _stated(message: m.Message) -> tuple[str, int]:
         case m.Concluded():
             return "concluded", 0
         case m.Certificate():
-            return "certificate", 0
+            digest = hashlib.blake2b(message.certificate, digest_size=16).digest()
+            return "certificate", int.from_bytes(digest)
         case m.Verdict():
             text = f"{message.judgement} {message.withdrawn}".encode()
             return "verdict", int.from_bytes(hashlib.blake2b(text, digest_size=16).digest())

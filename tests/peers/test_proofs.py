@@ -1,10 +1,14 @@
 """What a third robot carries is believed by the signature of who said it, where there are keys."""
 
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from central.config import CentralConfig
+from central.peers.robot import PeerRobot
+from team.config import RobotConfig
 from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
 from team.keys.roster import nodes_of
@@ -121,6 +125,143 @@ def test_a_certificate_of_another_robot_is_nobodys_proof(nodes: dict[str, PeerNo
     )
     refused = proofs_of(nodes["r3"]).refusal(as_r1, nodes["r3"].replica)
     assert refused == "a certificate of robot-r2 of t, not of robot-r1 of t"
+
+
+class Renewed:
+    """r1 in a running team, with each of its certificates in turn; r2 hears it, r3 only r2."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        make_keys(folder, "t", nodes_of(ROBOTS))
+        self.r2, self.r3 = self.peer("r2"), self.peer("r3")
+        self.now_s = 100.0
+
+    def peer(self, robot: str) -> PeerNode:
+        signer = Signer(credentials_of(self.folder, f"robot-{robot}", "t"))
+        return PeerNode(ch.robot_node(robot), ROBOTS, Proofs(robot, signer))
+
+    def own(self) -> Proofs:
+        """r1's proofs with its present key."""
+        return Proofs("r1", Signer(credentials_of(self.folder, "robot-r1", "t")))
+
+    def say(self, proofs: Proofs, *members: Member) -> None:
+        """r1 publishes its certificate and members; r2 hears both and the signatures."""
+        self.r2.take(member(ch.CERTIFICATE, proofs.certificate()), "robot/r1")
+        for each in members:
+            self.r2.take(each, "robot/r1")
+            proofs_of(self.r2).hear(proofs.signed(each), "r1")
+
+    def submaps_of_r3(self) -> int:
+        """The submaps of r1 at r3 after some exchanges with r2 alone."""
+        for _ in range(3):
+            self.now_s += 10.0
+            self.r2.tick(self.now_s)
+            summary = self.r2.replica.summary(self.r2.node, 0, 0)
+            for out in (*self.r3.tick(self.now_s), *self.r3.hear(summary)):
+                if out.channel is ch.MEMBERS:
+                    for reply in self.r2.answer(encoded(out.message)):
+                        self.r3.take_carried(decoded(reply, m.Members))
+        return len(self.r3.replica.share_of(("r1", 1)).complete)
+
+
+def test_a_certificate_that_is_renewed_while_the_team_runs_splits_nothing(tmp_path: Path) -> None:
+    team = Renewed(tmp_path)
+    team.say(team.own(), start("r1"), *parcel("r1", 0), *parcel("r1", 1))
+    make_keys(tmp_path, "t", [], renew=["robot-r1"])
+    team.say(team.own(), *parcel("r1", 2))
+    assert team.submaps_of_r3() == 3
+    assert team.r3.replica.digest == team.r2.replica.digest
+    make_keys(tmp_path, "t", [], renew=["robot-r1"])
+    team.say(team.own(), *parcel("r1", 3))
+    assert team.submaps_of_r3() == 4, "after r3 had the earlier ones"
+
+
+def test_what_a_revoked_key_has_signed_is_refused_until_its_author_signs_it_anew(
+    tmp_path: Path,
+) -> None:
+    """The next generation's certificate is the proof of the revocation: no roster is needed."""
+    team = Renewed(tmp_path)
+    stolen = team.own()
+    make_keys(tmp_path, "t", [], revoke=["robot-r1"])
+    make_keys(tmp_path, "t", nodes_of(ROBOTS))
+    (tmp_path / "roster.json").unlink()
+    team.say(stolen, start("r1"), *parcel("r1", 0))
+    team.say(team.own(), *parcel("r1", 1))
+    team.submaps_of_r3()
+    assert sorted(team.r3.replica.share_of(("r1", 1)).submaps) == [1]
+    assert "signed with a certificate of r1 that is revoked" in team.r3.last_refused
+    team.say(team.own(), start("r1"), *parcel("r1", 0))
+    assert team.submaps_of_r3() == 2
+
+
+def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(
+    tmp_path: Path,
+) -> None:
+    team = Renewed(tmp_path)
+    stolen = team.own()
+    make_keys(tmp_path, "t", [], revoke=["robot-r1"])
+    team.say(stolen, start("r1"), *parcel("r1", 0))
+    assert team.submaps_of_r3() == 1, "its process was started before the revocation"
+    team.r3 = team.peer("r3")
+    assert team.submaps_of_r3() == 0
+    assert "revoked" in team.r3.last_refused
+
+
+def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_it_is_not(
+    tmp_path: Path,
+) -> None:
+    """Whatever the time is at which it is checked: the certificate of r1 ended a day ago."""
+    now = datetime.now(UTC)
+    make_keys(tmp_path, "t", nodes_of(ROBOTS), now=now - timedelta(days=3))
+    team = Renewed(tmp_path)
+    make_keys(tmp_path, "t", [], renew=["robot-r1"], days=1.0, now=now - timedelta(days=2))
+    then = now - timedelta(days=1.5)
+    old = Proofs("r1", Signer(credentials_of(tmp_path, "robot-r1", "t", now=then)))
+    day_ns = 86_400 * 10**9
+    late, early = (
+        msgspec.structs.replace(
+            start("r1").message,
+            incarnation=k,
+            stamp_ns=int(now.timestamp()) * 10**9 - k * day_ns // 2,
+        )
+        for k in (1, 3)
+    )
+    team.say(old, member(ch.START, late), member(ch.START, early))
+    team.submaps_of_r3()
+    assert [*team.r3.replica.streams] == [("r1", 3)]
+    assert "stamped after the certificate of r1" in team.r3.last_refused
+
+
+def test_a_certificate_that_is_not_the_authoritys_takes_no_place_of_the_true_one(
+    tmp_path: Path,
+) -> None:
+    team = Renewed(tmp_path / "own")
+    make_keys(tmp_path / "strange", "t", nodes_of(ROBOTS))
+    strange = Proofs("r1", Signer(credentials_of(tmp_path / "strange", "robot-r1", "t")))
+    forged = member(ch.CERTIFICATE, strange.certificate())
+    assert not team.r2.take_sample(forged.as_sample(0), "robot/r1")
+    assert "the team's authority has not issued" in team.r2.last_refused
+    true = member(ch.CERTIFICATE, team.own().certificate())
+    assert team.r2.take_sample(true.as_sample(0), "robot/r1")
+
+
+def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present_key(
+    tmp_path: Path,
+) -> None:
+    team = Renewed(tmp_path)
+    said = [start("r1"), *parcel("r1", 0)]
+    make_keys(tmp_path, "t", [], revoke=["robot-r1"])
+    make_keys(tmp_path, "t", nodes_of(ROBOTS))
+    robot = PeerRobot(
+        RobotConfig("r1"), CentralConfig(), ROBOTS,
+        signer=Signer(credentials_of(tmp_path, "robot-r1", "t")),
+    )  # fmt: skip
+    robot.keep(Member(each.key, each.payload, each.message, b"of the key before") for each in said)
+    signatures = [each.message for each in robot.begin() if isinstance(each.message, m.Signature)]
+    own = team.own()
+    for each in said:
+        (found,) = [s.signature for s in signatures if s.member == each.hash]
+        assert own._signer.is_signed(own.certificate().certificate, each.hash, found)
 
 
 def test_a_robot_that_signs_anothers_member_does_not_take_the_others_signature(

@@ -5,6 +5,9 @@ import random
 import msgspec
 import pytest
 
+from central.config import CentralConfig
+from central.peers.fold import PeerFold
+from team.door import MOST_COUNT
 from team.peers.exchange import MOST_ASKED, answered, request_for
 from team.peers.given import GIVEN_BYTES
 from team.peers.members import LARGEST_MEMBER, Member, member_of
@@ -14,6 +17,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
 from tests.peers.teams import done, member, parcel, said, start
+from tests.support import examples
 
 ROBOTS = ("r1", "r2")
 
@@ -78,11 +82,41 @@ def test_questions_without_end_are_given_so_many_bytes_a_second() -> None:
     want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=39)
     request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", requested=(want,)))
     one = sum(map(len, node.answer(request)))
-    node._given.note("robot/r2", GIVEN_BYTES)
+    node._given.note(GIVEN_BYTES)
     assert one > 0
     assert node.answer(request) == []
     node.tick(2.0)
     assert sum(map(len, node.answer(request))) == one
+
+
+def test_questions_in_another_nodes_name_take_nothing_from_that_node() -> None:
+    """Nothing proves the name in a request: what r3 asks for as r2 is not counted against r2."""
+    node = PeerNode("robot/r1", ("r1", "r2", "r3"))
+    for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
+        node.take(each, "robot/r2")
+    want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=39)
+    request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", requested=(want,)))
+    while node._given._bytes < GIVEN_BYTES // 4:  # more than one node was given in a second
+        assert node.answer(request)
+        node._given.note(GIVEN_BYTES // 16)
+    assert node.answer(request)
+
+
+def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_is_valid() -> None:
+    replica = Replica(("r1", "r2"))
+    last = m.Concluded(
+        stamp_ns=0, robot="r1", serial=2**63 - 1, digest=bytes(8), sha256=bytes(32), submaps=0
+    )
+    with pytest.raises(RefusedError, match="no peer has more than"):
+        replica.add(member(ch.CONCLUDED, last))
+    node = PeerNode("robot/r1", ("r1", "r2"))
+    node.take(member(ch.CONCLUDED, msgspec.structs.replace(last, serial=MOST_COUNT)), "robot/r1")
+    fold = PeerFold(CentralConfig(), ("r1", "r2"), node)
+    fold.final = next(each for each in examples() if isinstance(each, m.FusedMap))
+    concluded = fold.conclusion("r1")
+    assert concluded is not None
+    assert decoded(encoded(concluded)) == concluded
+    replica.add(member(ch.CONCLUDED, concluded))
 
 
 def test_the_order_of_arrival_and_duplicates_change_nothing() -> None:
