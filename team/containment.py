@@ -8,7 +8,6 @@ counted, and not handled again when it is delivered once more; the node goes on 
 """
 
 import hashlib
-import logging
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,18 +19,15 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import WireError, decoded, encoded
+from team.wire.logs import LOG
+from team.wire.text import cut, one_line
 
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000
 """Most attempts of a node to continue behind one message, where it raises again and again."""
-MOST_LOGGED = 100
-"""Refused messages, and faults, that are logged one by one; then one of so many, so that whoever
-sends them without end does not fill the log.
-"""
 LONGEST_TEXT = 1000
 """Characters of an exception's text, or of a key, that are kept."""
 _OURS = ("team.", "central.", "sim.")
-_LOG = logging.getLogger("teamslam")
 
 
 @runtime_checkable
@@ -148,11 +144,8 @@ class Boundary:
     def refuse(self, sample: Sample, why: str) -> None:
         """Count and log a message that is refused."""
         self.refused += 1
-        self.last_refused = f"{_cut(sample.key, 80)}: {_cut(why, 200)}"
-        if _is_logged(self.refused):
-            _LOG.warning("%s: dropped %s", self.name, self.last_refused)
-        if self.refused == MOST_LOGGED:
-            _LOG.warning("%s: from now on one of %d is logged", self.name, MOST_LOGGED)
+        self.last_refused = one_line(f"{cut(sample.key, 80)}: {cut(why, 200)}")
+        LOG.warning("%s: dropped %s (%d so far)", self.name, self.last_refused, self.refused)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
         """Count and log a fault; returns its message. Raises KeyboardInterrupt again."""
@@ -160,13 +153,12 @@ class Boundary:
             raise KeyboardInterrupt from error
         self.faults += 1
         place = place_of(error.__traceback__)
-        text = _cut(str(error), LONGEST_TEXT)
-        key = _cut(sample.key, LONGEST_TEXT)
+        text = one_line(cut(str(error), LONGEST_TEXT))
+        key = one_line(cut(sample.key, LONGEST_TEXT))
         what = f"{tag} " if tag else ""
-        self.last = f"{what}{_cut(key, 80)}: {type(error).__name__} at {place}: {_cut(text, 200)}"
-        if _is_logged(self.faults):
-            _LOG.error("set aside: %s", self.last)
-        _LOG.debug("%s", "".join(traceback.format_exception(error)))
+        self.last = f"{what}{cut(key, 80)}: {type(error).__name__} at {place}: {cut(text, 200)}"
+        LOG.error("set aside: %s", self.last)
+        LOG.debug("%s", "".join(traceback.format_exception(error)))
         digest = _name(sample)[1]
         stamp_ns = min(max(sample.stamp_ns, -(2**62)), 2**62 - 1)
         name = type(error).__name__
@@ -226,7 +218,7 @@ def place_of(trace: TracebackType | None) -> str:
               for f, line in traceback.walk_tb(trace)]  # fmt: skip
     ours = [frame for frame in frames if f"{frame[0]}.".startswith(_OURS)]
     module, function, line = (ours or [("?", "?", 0), *frames])[-1]
-    return _cut(f"{module}:{function}:{line}", LONGEST_TEXT)
+    return cut(f"{module}:{function}:{line}", LONGEST_TEXT)
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
@@ -234,14 +226,6 @@ def _is_interrupt(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
-
-
-def _cut(text: str, length: int) -> str:
-    return text if len(text) <= length else f"{text[: length - 1]}…"
-
-
-def _is_logged(count: int) -> bool:
-    return count <= MOST_LOGGED or count % MOST_LOGGED == 0
 
 
 def _name(sample: Sample) -> tuple[str, bytes]:

@@ -29,6 +29,9 @@ install_import_hook(["team", "central", "sim"], f"{tests.shapes.__name__}.checke
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before a test's own fixtures; those of a module are checked with its first test."""
     tests.shapes.begin_test()
+    from team.wire.logs import LIMITS  # behind the import hook
+
+    LIMITS.forget()
     if "PYTEST_XDIST_WORKER" in os.environ and not item.nodeid.startswith(SYSTEM):
         os.setpriority(os.PRIO_PROCESS, 0, max(BESIDE, os.getpriority(os.PRIO_PROCESS, 0)))
 

@@ -9,7 +9,7 @@ from statistics import median
 from central.desk.names import in_order
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, opened
+from team.wire.bus import Bus, shown
 from team.wire.codec import WireError
 from team.wire.newer import later_head
 
@@ -79,7 +79,7 @@ class Presence:
         while time.monotonic() < until:
             for sample in bus.receive(LOOK_S):
                 try:
-                    _, _, message = opened(sample)
+                    _, _, message = shown(sample)
                 except WireError:
                     continue
                 self._hear(message, sample.wall_ns)

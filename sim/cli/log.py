@@ -14,13 +14,13 @@ from sim.cli.options import (
     LogArgument,
     counted,
     fail,
-    one_line,
     refuse_existing,
     tell_holes,
     warn_of_holes,
 )
 from sim.cli.recorded import repair
 from team.extras import install_command
+from team.wire.text import one_line
 
 if TYPE_CHECKING:
     from rich.table import Table

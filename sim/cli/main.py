@@ -106,11 +106,13 @@ def main() -> None:
     try:
         command()()
     except Exception as error:
+        from team.wire.text import lines
+
         advice = _advice(error)
         if advice is None:
             raise
         status, text = advice
-        typer.secho(f"error: {text}", fg="red", err=True)
+        typer.secho(f"error: {lines(text)}", fg="red", err=True)
         sys.exit(status)
 
 

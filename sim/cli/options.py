@@ -14,6 +14,7 @@ from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario, load, loads
 from sim.world.config import UnlabelledWorld
 from team.config import Estimator, FusionRule
+from team.wire.text import lines, one_line
 
 if TYPE_CHECKING:
     from team.keys.credentials import Credentials
@@ -161,7 +162,7 @@ def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
 
 def fail(message: str, status: int) -> NoReturn:
     """Print an error and end with its status."""
-    typer.secho(f"error: {message}", fg="red", err=True)
+    typer.secho(f"error: {lines(message)}", fg="red", err=True)
     raise typer.Exit(status)
 
 
@@ -197,11 +198,6 @@ def set_aside(file: Path) -> Path:
     file.rename(aside)
     typer.echo(f"{file} was there already: it is now {aside}", err=True)
     return aside
-
-
-def one_line(text: str) -> str:
-    """A text of an untrusted file as one line without control characters for a terminal."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
 
 
 def counted(count: int, what: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sim.launch.processes import Starter, Used
+from team.wire.text import one_line
 
 LAST_LINES = 12
 """Lines of a failed process's output that are shown."""
@@ -118,7 +119,7 @@ class Child:
     def last_lines(self) -> tuple[str, ...]:
         """The last lines of its output."""
         text = self.output.read_bytes()[self._before :].decode("utf-8", "replace")
-        return tuple(text.splitlines()[-LAST_LINES:])
+        return tuple(one_line(line) for line in text.splitlines()[-LAST_LINES:])
 
 
 @dataclass

@@ -10,7 +10,7 @@ from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, Sample, opened
+from team.wire.bus import Bus, Sample, shown
 from team.wire.codec import WireError
 from team.wire.newer import is_newer_map
 
@@ -135,7 +135,7 @@ class Watch:
         if found is None or not self.errors.wants(*found, sample):
             return
         try:
-            channel, _, message = opened(sample)
+            channel, _, message = shown(sample)
         except WireError:
             return
         if isinstance(message, m.Status):

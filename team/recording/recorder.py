@@ -22,6 +22,7 @@ from team.recording.schemas import declaration_of
 from team.wire.bus import Sample
 from team.wire.channels import channel_of
 from team.wire.codec import tag_in
+from team.wire.messages import tag_of
 
 METADATA = "teamslam"
 CHUNK_NS = 500_000_000
@@ -30,6 +31,8 @@ costs a chunk …
 """
 CHUNK_LEAST = 16
 """… unless the chunk has fewer messages than this."""
+MOST_CHANNELS = 60_000
+"""Number of keys in a log; MCAP numbers them by 16 bits."""
 FLUSH_S = 0.5
 """Seconds between flushes: what a killed recorder can lose."""
 
@@ -62,6 +65,8 @@ class Recorder:
         self._in_chunk = 0
         self._span = (2**63, 0)
         self._closed = False
+        self.dropped = 0
+        """Number of samples that were not written, since the log has MOST_CHANNELS keys already."""
         try:
             self._file: IO[bytes] = self.path.open("xb")
             self._writer = _opened_writer(self._file, {**metadata, "team": team})
@@ -150,11 +155,14 @@ class Recorder:
         self._span = (first, last)
 
     def _write(self, sample: Sample) -> None:
-        self._bound_chunk(sample)
         of = sample.key, self._tag(sample)
         channel = self._channels.get(of)
         if channel is None:
+            if len(self._channels) >= MOST_CHANNELS:
+                self.dropped += 1
+                return
             channel = self._channels[of] = self._register(*of)
+        self._bound_chunk(sample)
         self._writer.add_message(
             channel_id=channel,
             log_time=max(sample.stamp_ns, 0),
@@ -167,12 +175,12 @@ class Recorder:
 
     def _tag(self, sample: Sample) -> str:
         """The tag of the message, on a key with several types of messages: each type is
-        declared.
+        declared. A tag that is none of the channel's counts as that of its first type.
         """
         found = channel_of(sample.key)
         if found is None or not found[0].alternatives:
             return ""
-        return tag_in(sample.payload)
+        return tag_of(found[0].kind_of(tag_in(sample.payload)))
 
     def _register(self, key: str, tag: str) -> int:
         declaration = declaration_of(key, tag)

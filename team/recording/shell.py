@@ -33,6 +33,7 @@ from team.wire.channels import (
     WORLD_CONFIG,
     channel_of,
     robot_of,
+    row_of,
 )
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import (
@@ -102,6 +103,7 @@ class RecordLoop:
         self._has_map = False
         self._messages = 0
         self._statuses = 0
+        self._dropped = 0
         for channel in CHANNELS:
             if channel.recorded and channel is not ALIVE:
                 bus.subscribe(channel, whole=True)
@@ -131,7 +133,8 @@ class RecordLoop:
         A new submap is reported at once: its robot does not leave before it is in the log. Progress
         is credit: while the writing thread is far behind, nothing is reported.
         """
-        noted = [(sample, self._noted(sample)) for sample in samples]
+        noted = [(each, self._noted(each)) for each in samples if row_of(each.key) is not None]
+        self._dropped += len(samples) - len(noted)
         self._write([own for sample, own in noted if self._inventory.is_new(sample)])
         if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
             return
@@ -281,6 +284,9 @@ class RecordLoop:
         """
         waiting = 0 if self._recorder is None else self._recorder.waiting()
         figures = {"messages": float(self._messages), "waiting": float(waiting)}
+        dropped = 0 if self._recorder is None else self._recorder.dropped
+        if dropped := dropped + self._dropped + self._bus.dropped:
+            figures["dropped_samples"] = float(dropped)
         failure = () if self._failure is None else (f"nothing is recorded: {self._failure}",)
         absent = tuple(f"{node} has not appeared yet" for node in sorted(self._missing))
         lacking = tuple(f"{MISSING}{what}" for what in self.lacking) if last else ()

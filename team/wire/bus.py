@@ -5,7 +5,6 @@ publisher's wall clock and the publisher's counter of this key. A node never use
 shell receives the samples, decodes them, and publishes the messages that the node returns.
 """
 
-import logging
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -18,11 +17,13 @@ import msgspec
 
 from team.wire.channels import ALIVE, END_ORDER, KEPT, ORDER, REPLIES, VIEW, Channel, channel_of
 from team.wire.codec import WireError, decoded, encoded
+from team.wire.logs import LOG
 from team.wire.messages import (
     Configuration,
     Fault,
     FusedMap,
     Kept,
+    GivenUp,
     Liveliness,
     MapEstimate,
     Members,
@@ -33,10 +34,14 @@ from team.wire.messages import (
     SetSummary,
     Status,
     TeamEnd,
+    Verdict,
     Withdrawal,
+    WithdrawalHeard,
 )
+from team.wire.text import readable
 
-_LOG = logging.getLogger("teamslam")
+_IN_WORDS = (Status, Fault, FusedMap, GivenUp, TeamEnd, Verdict, Withdrawal, WithdrawalHeard)
+"""Messages with texts for people."""
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
@@ -148,7 +153,7 @@ class Bus(Protocol):
     def declare_alive(self, node: str) -> None:
         """Holds a liveliness token until the bus is closed."""
 
-    def watch_alive(self, node: str = "**") -> None:
+    def watch_alive(self, node: str = "*") -> None:
         """Receives `Liveliness` of others' tokens as they appear and disappear, the present ones
         first.
         """
@@ -182,17 +187,23 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     return channel, name, message
 
 
+def shown(sample: Sample) -> tuple[Channel, str, Message]:
+    """As `opened`, for a reader that shows the message to people: its texts are printable."""
+    channel, name, message = opened(sample)
+    return channel, name, readable(message) if isinstance(message, _IN_WORDS) else message
+
+
 def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
     """The sound ones of some samples, each as `opened` returns it; the others are left out.
 
     For a reader that only observes: an unsound sample is no message of the team, whoever has sent
-    it.
+    it. Texts are as `shown` returns them.
     """
     for sample in samples:
         try:
-            yield opened(sample)
+            yield shown(sample)
         except WireError as error:
-            _LOG.debug("dropped %s: %s", sample.key[:80], error)
+            LOG.debug("dropped %s: %s", sample.key[:80], error)
 
 
 def _sender_of(channel: Channel, message: Message) -> str | None:
@@ -413,7 +424,7 @@ class MemoryBus:
         """Holds a token."""
         self._token(node, alive=True)
 
-    def watch_alive(self, node: str = "**") -> None:
+    def watch_alive(self, node: str = "*") -> None:
         """Receives changes of tokens, the present ones first."""
         self._network.want(self, ALIVE, node)
         for source, sample in self._network.alive.values():
@@ -446,4 +457,4 @@ class MemoryBus:
 
 def _is_of(channel: Channel, name: str, key: str) -> bool:
     owner = channel.owner(key)
-    return owner is not None and (owner == "" or name in ("*", "**", owner))
+    return owner is not None and (owner == "" or name in ("*", owner))

@@ -29,7 +29,7 @@ all: a late joiner, and a receiver after a cut link, receives every message.
 
 _PLACE = re.compile(r"\{(robot|node|view)\}")
 _NAME = "[a-z][a-z0-9_]{0,31}"
-_PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": ".+"}
+_PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": f"{_NAME}(?:/{_NAME})?"}
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,14 @@ class Channel:
         """The key for one robot or node."""
         before, after = self._around
         return before + name + after if after is not None else before
+
+    def selectors(self, name: str = "*") -> tuple[str, ...]:
+        """The key expressions of one name; `*`: of all, where nodes and views have up to two parts.
+
+        They match keys of a fixed depth only.
+        """
+        two = name == "*" and self._around[1] is not None and "{robot}" not in self.template
+        return (self.key(name), self.key("*/*")) if two else (self.key(name),)
 
     def publisher(self, name: str) -> str:
         """The node that publishes the key for one robot or node."""

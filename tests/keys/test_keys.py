@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+import zenoh
 from typer.testing import CliRunner
 
 from sim.cli.main import app
@@ -128,10 +129,8 @@ def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors() ->
 
     def owners(key: str) -> list[str]:
         def owns(node: str) -> bool:
-            return any(
-                key == each or (each.endswith("/**") and key.startswith(each[:-2]))
-                for each in owned(node)
-            )
+            of_team = zenoh.KeyExpr(key)
+            return any(zenoh.KeyExpr(each).includes(of_team) for each in owned(node))
 
         return [node for node in nodes if owns(node)]
 
@@ -143,6 +142,8 @@ def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors() ->
     assert owners(ch.ODOMETRY.key("r1")) == ["world", "source-r1"]
     assert owners(ch.ORDER.key("r1")) == ["operator"]
     assert owners(ch.WITHDRAWALS_HEARD.key("r2")) == ["robot-r2"]
+    for key in ("robot/r1/x1/status", "robot/r1/x1", "world/x/status", "view/a/b/c", "truth/r1/x"):
+        assert owners(key) == [], "a key of no channel is nobody's, and dies at the router"
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from team.recording import recorder as recorder_module
 from team.recording.check import holes
 from team.recording.reader import open_log
 from team.recording.recorder import Recorder
@@ -59,6 +60,31 @@ def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path
                 [message.measurements for message in got if isinstance(message, m.Progress)]
             )
     assert told == [[], [PROGRESS_EVERY], [], [PROGRESS_EVERY + 10], []]
+
+
+def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """MCAP numbers a log's keys by 16 bits: more of them ended the recorder."""
+    monkeypatch.setattr(recorder_module, "MOST_CHANNELS", 10)
+    network = MemoryNetwork()
+    robot, bus = MemoryBus(network), MemoryBus(network)
+    with Recorder(path, "t", {}) as recorder:
+        loop = RecordLoop(bus, recorder, ())
+        loop.take([Sample(f"robot/r1/x{k}/status", b"", 0, 0, 0) for k in range(20)])
+        for k in range(20):
+            forged = b"\x95\xaa" + f"forged/{k:03}".encode() + bytes(3)
+            robot.publish_raw(Sample(c.ODOMETRY.key("r1"), forged, 0, 0, k))
+            status = m.Status(stamp_ns=0, node=f"robot/r{k}", state="x", figures={})
+            robot.publish(Outgoing(c.STATUS, f"robot/r{k}", status))
+        loop.take(bus.receive())
+        wait_until(lambda: recorder.waiting() == 0 and recorder.dropped > 0)
+        figures = loop.status().figures
+    counts = {key: count.messages for key, count in recorder.counts().items()}
+    assert counts[c.ODOMETRY.key("r1")] == 20
+    assert sum(key.endswith("/status") for key in counts) == 9
+    assert figures["dropped_samples"] == 20 + 11
+    assert holes(open_log(path)) == []
 
 
 def test_a_new_incarnation_counts_from_zero(path: Path) -> None:

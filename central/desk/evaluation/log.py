@@ -1,7 +1,7 @@
 """Collects from a log's samples, in one pass, what an evaluation needs.
 
 Most of a log is sensor measurements; only their head (robot, incarnation, measurement) is decoded,
-to count them. All other messages are decoded and checked by `opened`.
+to count them. All other messages are decoded and checked by `shown`.
 """
 
 from collections import defaultdict
@@ -15,7 +15,7 @@ from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Sample, opened
+from team.wire.bus import Sample, shown
 from team.wire.channels import Channel, channel_of
 from team.wire.codec import WireError
 
@@ -135,7 +135,7 @@ class Collected:
         if sample is None:
             return None
         try:
-            return opened(sample)[2]
+            return shown(sample)[2]
         except WireError:
             self.unsound += 1
             return None

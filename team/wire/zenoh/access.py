@@ -2,45 +2,66 @@
 
 Zenoh's rules select by message, direction (as the router sees it) and key; a subject is the common
 name of a certificate. There are no templates, so each node has a rule. Beside its own keys a node
-needs those of the caches and heartbeats of its advanced publishers, `…/@adv/**`.
+needs those of the caches and heartbeats of its advanced publishers, `…/@adv/pub/*/*/*`.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 from team.keys.roster import REPLAY, Roster
+from team.wire.channels import (
+    CHANNELS,
+    TRUTH,
+    TRUTH_LABELS,
+    TRUTH_LANDMARKS,
+    TRUTH_POSITIONS,
+    Channel,
+)
 from team.wire.zenoh.session import DOOR
 
 _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
 _LISTENS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 _HEARS = ("put", "reply", "liveliness_token", "declare_subscriber", "query")
-TRUTH = ("truth/**", "truth_landmarks", "truth_labels/**", "truth_positions/**")
-"""Keys that no estimator may receive."""
+TRUTHS = (TRUTH, TRUTH_LANDMARKS, TRUTH_LABELS, TRUTH_POSITIONS)
+"""Channels that no estimator may receive."""
 
 
 def owned(node: str) -> tuple[str, ...]:
     """The keys, relative to the team, that only this node may publish, answer and hold tokens on.
 
-    The world is the driver of every robot's sensors, so it shares those with each `source-…`.
+    They are those of the table of channels, of a fixed depth: what no channel has, the router
+    drops. The world is the driver of every robot's sensors, so it shares those with each
+    `source-…`.
     """
     kind, _, name = node.partition("-")
+    if node == REPLAY:
+        return tuple(key for channel in CHANNELS for key in channel.selectors())
+    found = [key for channel in CHANNELS for key in _keys_of(channel, kind, name)]
+    return tuple(dict.fromkeys(found))
+
+
+def _keys_of(channel: Channel, kind: str, name: str) -> tuple[str, ...]:
+    """The keys of one channel that a node publishes, answers or holds a token on."""
+    first, _, rest = channel.template.partition("/")
+    if first == "{node}":
+        return channel.selectors(f"{kind}/{name}" if name else kind)
     if name:
-        return (f"{kind}/{name}/**",)
-    if node == "world":
-        return ("world/**", "source/**", *TRUTH)
-    if node == "viewer":
-        return ("viewer/**", "view/**")
-    return ("**",) if node == REPLAY else (f"{node}/**",)
+        is_own = first == kind and rest.startswith("{robot}")
+        return channel.selectors(name) if is_own else ()
+    is_own = first == {"viewer": "view"}.get(kind, kind)
+    is_worlds = kind == "world" and (first == "source" or channel in TRUTHS)
+    return channel.selectors() if is_own or is_worlds else ()
 
 
 def access_control(roster: Roster) -> dict[str, Any]:
     """Zenoh's `access_control` for a team: whatever no rule allows is refused."""
     prefix = f"team/{roster.team}/"
-    every = _keys(prefix, ("**",))
+    every = [f"{prefix}**", f"{prefix}**/@adv/**"]
+    truths = [key for channel in TRUTHS for key in channel.selectors()]
     rules = [
         _rule("listen", "ingress", _LISTENS, every),
         _rule("hear", "egress", _HEARS, every),
-        _rule("no truth", "egress", ("put", "reply"), _keys(prefix, TRUTH), allow=False),
+        _rule("no truth", "egress", ("put", "reply"), _keys(prefix, truths), allow=False),
     ]
     door = [f"{prefix}{DOOR}/*"]
     rules += [
@@ -67,10 +88,8 @@ def access_control(roster: Roster) -> dict[str, Any]:
 
 
 def _keys(prefix: str, keys: Sequence[str]) -> list[str]:
-    """The keys and those of their publishers' caches; `**` does not match a part that begins with
-    @.
-    """
-    return [f"{prefix}{key}{rest}" for key in keys for rest in ("", "/@adv/**")]
+    """The keys and those of their publishers' caches and heartbeats."""
+    return [f"{prefix}{key}{rest}" for key in keys for rest in ("", "/@adv/pub/*/*/*")]
 
 
 def _rule(

@@ -9,7 +9,6 @@ there is no thread of ours, the order of arrival is preserved across subscriptio
 never blocks the link (the team's credit bounds the queue). A bus does not receive its own samples.
 """
 
-import logging
 import threading
 import time
 from collections.abc import Collection
@@ -25,7 +24,9 @@ from zenoh.handlers import Callback
 from team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
 from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel, row_of
 from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
+from team.wire.logs import LOG
 from team.wire.messages import Liveliness, Message, Tally
+from team.wire.text import cut
 from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
 from team.wire.zenoh.queries import Queries, Question, Reply
@@ -43,9 +44,8 @@ MOST_WAITING = 1_000
 
 Each sample keeps the buffer alive that it arrived in: some 10 kB.
 """
-MOST_LOGGED = 100
-"""Number of dropped samples that are logged one by one; then one of so many is."""
-_LOG = logging.getLogger(__name__)
+MOST_KEYS = 16_384
+"""Number of keys of which a bus receives samples; a team of 100 robots has 4,500."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,14 @@ class ZenohBus:
         self.tap: Tap | None = None
         """Receives all samples that this bus publishes and receives."""
         self.dropped = 0
-        """Number of received samples without a sound attachment, or under another key than their
-        publisher's."""
+        """Number of received samples on keys of no channel, without a sound attachment, or under
+        another key than their publisher's."""
+        self._keys_received: set[str] = set()
+        self._counting = threading.Lock()
         self._closed = threading.Event()
         self._keys = keys
         self._session = client(connect, patience_s, keys)
-        self._recovery = Recovery(self._session, self._prefix, self._queue.put)
+        self._recovery = Recovery(self._session, self._prefix, self._admit)
         self._queries = Queries(self._session, self._prefix, self._queue.put)
         self._link = RouterLink(self._session, connect, keys)
 
@@ -210,11 +212,36 @@ class ZenohBus:
         self._requested.add((channel.name, name))
         if whole:
             self._recovery.take_whole(channel.name)
-        key = self._prefix + channel.key(_every(channel, name))
-        put = self._shed if channel.name in self._sheds else self._queue.put
-        subscribe(self._session, key, channel, put, whole=whole)
-        if channel.delivery != "stream" and channel.name not in self._sheds:
-            self._recovery.watch(key)
+        put = self._shed if channel.name in self._sheds else self._admit
+        for selector in channel.selectors(name):
+            key = self._prefix + selector
+            subscribe(self._session, key, channel, put, whole=whole)
+            if channel.delivery != "stream" and channel.name not in self._sheds:
+                self._recovery.watch(key)
+
+    def _admit(self, item: _Item) -> None:
+        """Queue what was received, but for samples on keys of no channel, or of too many keys.
+
+        Called on Zenoh's receiving threads, before anything is stored.
+        """
+        if isinstance(item, zenoh.Sample | _Token):
+            sample = item.sample if isinstance(item, _Token) else item
+            key = str(sample.key_expr).removeprefix(self._prefix)
+            if key not in self._keys_received:
+                if row_of(key) is None:
+                    self._drop(key, "no channel has this key")
+                    return
+                if len(self._keys_received) >= MOST_KEYS:
+                    self._drop(key, f"samples of {MOST_KEYS} other keys came before")
+                    return
+                self._keys_received.add(key)
+        self._queue.put(item)
+
+    def _drop(self, key: str, why: str) -> None:
+        """Count and log a sample that is dropped."""
+        with self._counting:
+            self.dropped += 1
+        LOG.warning("%s: dropped, %s (%d so far)", cut(key, 80), why, self.dropped)
 
     def _can_do_without(self, key: str) -> bool:
         row = row_of(key) if self._sheds else None
@@ -225,7 +252,7 @@ class ZenohBus:
         behind.
         """
         if self._queue.qsize() < MOST_WAITING:
-            self._queue.put(item)
+            self._admit(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """All samples received since the last call, in order; waits at most `timeout_s` for the
@@ -280,12 +307,8 @@ class ZenohBus:
         whole = str(item.key_expr)
         try:
             beside = unpack(whole, b"" if item.attachment is None else item.attachment.to_bytes())
-        except (
-            AttachmentError
-        ) as error:  # it has not arrived: its publisher's cache is asked for it
-            self.dropped += 1
-            if self.dropped <= MOST_LOGGED or self.dropped % MOST_LOGGED == 0:
-                _LOG.warning("%r: dropped, %s (%d so far)", whole[:80], error, self.dropped)
+        except AttachmentError as error:  # has not arrived: its publisher's cache is asked for it
+            self._drop(whole, str(error))
             return
         key = whole.removeprefix(self._prefix)
         sample = Sample(key, item.payload.to_bytes(), *beside)
@@ -343,18 +366,19 @@ class ZenohBus:
             key = self._prefix + ALIVE.key(node)
             self._tokens[node] = self._session.liveliness().declare_token(key)
 
-    def watch_alive(self, node: str = "**") -> None:
+    def watch_alive(self, node: str = "*") -> None:
         """Receives `Liveliness` samples when others' tokens appear and disappear, present ones
         first.
         """
         self._check_open()
 
         def notice(sample: zenoh.Sample) -> None:
-            self._queue.put(_Token(sample))
+            self._admit(_Token(sample))
 
-        self._session.liveliness().declare_subscriber(
-            self._prefix + ALIVE.key(node), Callback(notice, indirect=False), history=True
-        )
+        for selector in ALIVE.selectors(node):
+            self._session.liveliness().declare_subscriber(
+                self._prefix + selector, Callback(notice, indirect=False), history=True
+            )
 
     def is_alive(self, node: str) -> bool:
         """Whether anyone holds the node's liveliness token, as far as the router knows."""
@@ -366,9 +390,14 @@ class ZenohBus:
     def other_teams(self) -> list[str]:
         """The teams whose processes are at this router, but for the bus's own."""
         self._check_open()
-        key = f"team/*/{ALIVE.key('**')}"
-        replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
-        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        keys = [
+            str(reply.ok.key_expr)
+            for selector in ALIVE.selectors()
+            for reply in self._session.liveliness().get(
+                f"team/*/{selector}", timeout=_ALIVE_TIMEOUT_S
+            )
+            if reply.ok is not None
+        ]
         return sorted({each.split("/")[1] for each in keys if not each.startswith(self._prefix)})
 
     def _check_open(self) -> None:
@@ -380,8 +409,3 @@ class ZenohBus:
                 f"it by `teamslam keys {self._keys.team} -o DIR --renew {self._keys.node}`, copy "
                 "it, and start this process again"
             )
-
-
-def _every(channel: Channel, name: str) -> str:
-    """The key for all names: the name of a node or a view may have several parts."""
-    return "**" if name == "*" and "{robot}" not in channel.template else name

@@ -14,7 +14,7 @@ from team.wire.codec import WireError, encoded
 from team.wire.messages import Message
 
 _ANSWER_S = 10.0
-_LOG = logging.getLogger(__name__)
+_LOG = logging.getLogger("teamslam")
 
 
 @dataclass(frozen=True, repr=False)

@@ -11,7 +11,6 @@ for each robot, and a process that is started again is a new publisher, so that 
 robots, each started again thirty times, is within the bounds.
 """
 
-import logging
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from zenoh.handlers import Callback
 
 from team.wire.bus import Sample
 from team.wire.channels import row_of
+from team.wire.logs import LOG
 from team.wire.zenoh.arrivals import Arrivals
 
 ADVANCED = "/@adv/pub/"
@@ -41,9 +41,6 @@ LONGEST_KEY = 512
 """Longest key, in characters, on which missing samples are requested."""
 MOST_ASKED = 256
 """Largest number of requests to caches in one look."""
-MOST_LOGGED = 100
-"""Log lines of one kind that are written one by one; then one of so many is."""
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,6 @@ class Recovery:
         self._incomplete: set[tuple[str, str]] = set()
         self._tracked: Counter[str] = Counter()
         self._keys: dict[str, str] = {}
-        self._asked = 0
         self._look_due = 0.0
         self.untracked = 0
         """Number of samples and heartbeats of publishers beyond the bounds."""
@@ -179,9 +175,8 @@ class Recovery:
 
     def _note_untracked(self, key: str) -> None:
         self.untracked += 1
-        if _is_logged(self.untracked):
-            text = "%.80r: too many publishers there, what is missing is not requested (%d so far)"
-            _LOG.warning(text, key, self.untracked)
+        text = "%.80s: too many publishers there, what is missing is not requested (%d so far)"
+        LOG.warning(text, key, self.untracked)
 
     def overdue(self, now_s: float) -> list[Sample]:
         """Requests what has been missing for a while; returns samples that no longer wait for
@@ -218,9 +213,7 @@ class Recovery:
                 self._put(reply.ok)
 
         until = "" if last is None else str(last)
-        self._asked += 1
-        if _is_logged(self._asked):
-            _LOG.info("%.80s: %d to %s are missing, asked for", key, first, until or "the newest")
+        LOG.info("%.80s: %d to %s are missing, asked for", key, first, until or "the newest")
         self._session.get(
             f"{self._prefix}{key}{ADVANCED}{publisher}/**?_anyke;_sn={first}..{until}",
             Callback(take, drop=lambda: self._put(answer), indirect=False),
@@ -255,10 +248,6 @@ def _node_of(key: str) -> str:
     """The node on whose keys a key is: no process publishes on keys of another node."""
     first, _, rest = key.partition("/")
     return f"{first}/{rest.partition('/')[0]}" if first in ("robot", "source") else first
-
-
-def _is_logged(count: int) -> bool:
-    return count <= MOST_LOGGED or count % MOST_LOGGED == 0
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # a router without keys needs none of it
 
 REFUSALS = "error,zenoh_link_tls=warn"
 """The part of Zenoh's log that a router with keys shows: refused connections, with the reasons."""
-_LOG = logging.getLogger(__name__)
+_LOG = logging.getLogger("teamslam")
 
 
 @contextmanager

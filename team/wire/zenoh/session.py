@@ -6,7 +6,6 @@ watched.
 """
 
 import json
-import logging
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from zenoh.handlers import Callback
 
 from team.wire.bus import BusError
 from team.wire.codec import LARGEST_PAYLOAD
+from team.wire.logs import LOG
 
 if TYPE_CHECKING:  # a node without keys needs none of it
     from team.keys.credentials import Credentials
@@ -35,7 +35,6 @@ ANSWER_S = 5.0
 DOOR = "router/door"
 """Key below which a router with keys answers whether it accepts a certificate, by common name."""
 ACCEPTED, REVOKED = b"accepted", b"revoked"
-_LOG = logging.getLogger("teamslam")
 
 
 def opened(settings: dict[str, object]) -> zenoh.Session:
@@ -147,7 +146,7 @@ class RouterLink:
     def _connected(self, router: str, now_s: float) -> None:
         if self._logged_s is not None and self._away_since is not None:
             away_s = now_s - self._away_since
-            _LOG.warning("connected to the router at %s again, after %.0f s", self._connect, away_s)
+            LOG.warning("connected to the router at %s again, after %.0f s", self._connect, away_s)
         self._away_since = self._logged_s = None
         if self._keys is None:
             return
@@ -169,7 +168,7 @@ class RouterLink:
         self._examine(now_s)
         if self._waits_for and (self._logged_s is None or now_s - self._logged_s >= REPEAT_S):
             self._logged_s = now_s
-            _LOG.warning(
+            LOG.warning(
                 "waiting for the router at %s: %s, no link for %.0f s",
                 self._connect, self._waits_for, away_s,
             )  # fmt: skip

@@ -1,0 +1,53 @@
+"""The log of a process: what others send can neither fill it nor forge a line of it.
+
+Every record of the logger `teamslam` passes one filter. Each place in the program may log AT_ONCE
+lines, and regains PER_S of a line each second; the next line after a gap counts those left out.
+Control characters are escaped, so that a record is one line, of at most LONGEST characters.
+"""
+
+import logging
+import time
+
+from team.wire.text import cut, one_line
+
+AT_ONCE = 50
+"""Number of lines that one place in the program may log at once."""
+PER_S = 0.5
+"""Number of lines that it regains each second."""
+LONGEST = 4_000
+"""Characters of a line that are logged."""
+
+
+class Limits(logging.Filter):
+    """Limits the rate of records by the place that logs them, and escapes their texts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._sites: dict[tuple[str, int], tuple[float, float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is logged; its message is then one printable line."""
+        now = time.monotonic()
+        site = (record.pathname, record.lineno)
+        allowance, since, left_out = self._sites.get(site, (float(AT_ONCE), now, 0))
+        allowance = min(float(AT_ONCE), allowance + PER_S * max(0.0, now - since))
+        if allowance < 1.0:
+            self._sites[site] = (allowance, now, left_out + 1)
+            return False
+        self._sites[site] = (allowance - 1.0, now, 0)
+        text = cut(one_line(record.getMessage()), LONGEST)
+        if left_out:
+            text += f" ({left_out} more like this were left out)"
+        elif allowance < 2.0:
+            text += " (of more like this some are left out)"
+        record.msg, record.args = text, ()
+        return True
+
+    def forget(self) -> None:
+        """Forget what was logged."""
+        self._sites.clear()
+
+
+LIMITS = Limits()
+LOG = logging.getLogger("teamslam")
+LOG.addFilter(LIMITS)

@@ -1,0 +1,57 @@
+r"""Makes texts of others safe to print: they may hold terminal escapes or forge lines.
+
+C0 and C1 control characters (line ends among them), bidirectional overrides and other invisible
+format characters are written as `\x1b` or `\u202e`. What is stored keeps its bytes.
+"""
+
+import unicodedata
+from collections.abc import Mapping
+from typing import Any, TypeVar, cast
+
+import msgspec
+
+T = TypeVar("T")
+
+
+def one_line(text: str) -> str:
+    """A text as one line without control characters, for a terminal, a log or a report."""
+    return text if text.isprintable() else "".join(map(_printable, text))
+
+
+def lines(text: str) -> str:
+    """As `one_line`, for each line of a text of this program."""
+    return "\n".join(one_line(line) for line in text.split("\n"))
+
+
+def cut(text: str, length: int) -> str:
+    """At most so many characters of a text, with an ellipsis in place of the rest."""
+    return text if len(text) <= length else f"{text[: length - 1]}…"
+
+
+def readable(value: T) -> T:
+    """A message, or part of one, with all its texts as `one_line`; itself where nothing changes."""
+    return cast("T", _readable(value))
+
+
+def _readable(value: Any) -> Any:
+    if isinstance(value, str):
+        return one_line(value)
+    if isinstance(value, tuple | list):
+        parts = [_readable(part) for part in value]
+        same = all(new is old for new, old in zip(parts, value, strict=True))
+        return value if same else type(value)(parts)
+    if isinstance(value, Mapping):
+        found = {_readable(key): _readable(part) for key, part in value.items()}
+        return value if found == value else found
+    if isinstance(value, msgspec.Struct):
+        fields = {name: getattr(value, name) for name in value.__struct_fields__}
+        changed = {name: new for name, old in fields.items() if (new := _readable(old)) is not old}
+        return msgspec.structs.replace(value, **changed) if changed else value
+    return value
+
+
+def _printable(character: str) -> str:
+    if character.isprintable() or unicodedata.category(character) == "Zs":
+        return character
+    number = ord(character)
+    return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}"

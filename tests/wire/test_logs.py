@@ -1,0 +1,88 @@
+"""What others send can neither fill a log nor forge a line of it."""
+
+import logging
+
+import pytest
+
+from sim.launch.watch import Watch
+from team.wire import channels as ch
+from team.wire import logs
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, shown
+from team.wire.codec import encoded
+from team.wire.text import lines, one_line, readable
+
+HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\r\n[  1.0 s] forged line"
+PRINTABLE = r"\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\x0d\x0a[  1.0 s] forged line"
+
+
+def test_a_hostile_text_is_one_printable_line() -> None:
+    assert one_line(HOSTILE) == PRINTABLE
+    assert one_line("σ = 0.1 m, 12 %, “a” – b…") == "σ = 0.1 m, 12 %, “a” – b…"
+    assert lines("one\ntwo\x1b") == "one\ntwo\\x1b"
+
+
+def test_a_log_line_is_escaped_whoever_formats_it(caplog: pytest.LogCaptureFixture) -> None:
+    logging.getLogger("teamslam").warning("%s: dropped", HOSTILE + "x" * 100_000)
+    assert len(caplog.messages) == 1
+    assert caplog.messages[0].startswith(PRINTABLE)
+    assert len(caplog.messages[0]) <= logs.LONGEST
+
+
+def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(logs.time, "monotonic", lambda: now[0])
+    for k in range(30_000):
+        if k == 29_999:
+            now[0] += 1.0 / logs.PER_S
+        logging.getLogger("teamslam").warning("flood %d", k)
+    logging.getLogger("teamslam").warning("another place")
+    assert len(caplog.messages) == logs.AT_ONCE + 2
+    assert "some are left out" in caplog.messages[logs.AT_ONCE - 1]
+    assert "flood 29999 (29949 more like this were left out)" in caplog.messages[-2]
+    assert caplog.messages[-1] == "another place"
+
+
+def hostile_status() -> m.Status:
+    return m.Status(
+        stamp_ns=0, node="robot/r1", state=HOSTILE, figures={HOSTILE: 1.0}, warnings=(HOSTILE,) * 2
+    )
+
+
+def hostile_fault() -> m.Fault:
+    text = HOSTILE
+    return m.Fault(
+        stamp_ns=0, node="robot/r1", origin=text, count=1, message=text, error=text, text=text,
+        place=text, digest=bytes(8),
+    )  # fmt: skip
+
+
+def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message_without() -> None:
+    sample = Sample(ch.STATUS.key("robot/r1"), encoded(hostile_status()), 0, 0, 0)
+    _, _, message = shown(sample)
+    assert isinstance(message, m.Status)
+    texts = [message.state, *message.figures, *message.warnings]
+    assert texts == [PRINTABLE] * 4
+    assert readable(message) is message
+    json = '{\n  "a": 1}'
+    configured = m.Configuration(
+        stamp_ns=0, node="robot/r1", incarnation=0, digest=bytes(8), configuration=json
+    )
+    key = ch.ROBOT_CONFIG.key("r1")
+    assert shown(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, "is data, not words"
+
+
+def test_a_launch_keeps_no_control_character_of_others_for_its_terminal() -> None:
+    network = MemoryNetwork()
+    robot, bus, watch = MemoryBus(network), MemoryBus(network), Watch()
+    bus.subscribe(ch.STATUS)
+    bus.subscribe(ch.FAULT)
+    robot.publish(Outgoing(ch.STATUS, "robot/r1", hostile_status()))
+    robot.publish(Outgoing(ch.FAULT, "robot/r1", hostile_fault()))
+    watch.take(bus)
+    status = watch.statuses["robot/r1"]
+    kept = [status.state, *status.figures, *status.warnings, *watch.failures]
+    assert len(kept) == 5
+    assert all(text.isprintable() for text in kept)
