@@ -1,7 +1,6 @@
 """The router of a team, and the messages that it stores for late joiners."""
 
 import json
-import logging
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -13,8 +12,9 @@ from zenoh.handlers import Callback
 
 from team.keys.roster import Roster
 from team.wire.bus import BusError, Sample
-from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel
+from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY
 from team.wire.codec import WireError, decoded
+from team.wire.logs import LOG
 from team.wire.messages import KeptRequest
 from team.wire.zenoh.access import access_control
 from team.wire.zenoh.attachment import AttachmentError, unpack
@@ -26,7 +26,8 @@ if TYPE_CHECKING:  # a router without keys needs none of it
 
 REFUSALS = "error,zenoh_link_tls=warn"
 """The part of Zenoh's log that a router with keys shows: refused connections, with the reasons."""
-_LOG = logging.getLogger("teamslam")
+MOST_TEAMS = 1_000
+"""Number of teams of which a router without keys stores messages."""
 
 
 @contextmanager
@@ -77,11 +78,13 @@ class _Keeper:
     def __init__(self, session: zenoh.Session, team: str) -> None:
         self._teams: defaultdict[str, StoredMessages] = defaultdict(StoredMessages)
         for channel in (TALLY, *REPLIES[KEPT]):
-            key = f"team/{team}/{channel.key(_every(channel))}"
-            session.declare_subscriber(key, Callback(self._take, indirect=False))
-        session.liveliness().declare_subscriber(
-            f"team/{team}/{ALIVE.key('**')}", Callback(self._token, indirect=False), history=True
-        )
+            for selector in channel.selectors():
+                key = f"team/{team}/{selector}"
+                session.declare_subscriber(key, Callback(self._take, indirect=False))
+        for selector in ALIVE.selectors():
+            session.liveliness().declare_subscriber(
+                f"team/{team}/{selector}", Callback(self._token, indirect=False), history=True
+            )
         session.declare_queryable(
             f"team/{team}/{KEPT.key()}", Callback(self._answer, indirect=False)
         )
@@ -89,6 +92,8 @@ class _Keeper:
     def _of(self, key: zenoh.KeyExpr) -> tuple[StoredMessages, str]:
         """The stored messages of a key's team, and the key within the team."""
         _, team, rest = str(key).split("/", 2)
+        if team not in self._teams and len(self._teams) >= MOST_TEAMS:
+            return StoredMessages(), rest  # which nobody keeps
         return self._teams[team], rest
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -101,13 +106,13 @@ class _Keeper:
             attached = unpack(str(sample.key_expr), beside)
             stored.take(Sample(key, sample.payload.to_bytes(), *attached), time.monotonic())
         except (AttachmentError, WireError) as error:  # its receivers drop it, and log that
-            _LOG.debug("%r: not stored: %s", key[:80], error)
+            LOG.debug("%r: not stored: %s", key[:80], error)
 
     def _token(self, sample: zenoh.Sample) -> None:
         stored, key = self._of(sample.key_expr)
         node = ALIVE.owner(key)
         if node is not None and stored.token(node, alive=sample.kind == zenoh.SampleKind.PUT):
-            _LOG.warning(
+            LOG.warning(
                 "%s of %s has gone without a last word: it was killed or cut off, or its "
                 "certificate has ended or is revoked",
                 node,
@@ -133,11 +138,6 @@ def _answer_door(session: zenoh.Session, roster: Roster) -> None:
             query.reply(query.key_expr, ACCEPTED if accepted else REVOKED)
 
     session.declare_queryable(f"team/{roster.team}/{DOOR}/*", Callback(answer, indirect=False))
-
-
-def _every(channel: Channel) -> str:
-    """The part of a key for all names: the name of a node may have two parts."""
-    return "*" if "{robot}" in channel.template else "**"
 
 
 def _router_tls(keys: "Credentials", roster: Roster) -> dict[str, object]:

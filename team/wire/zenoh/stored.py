@@ -29,6 +29,9 @@ to repeat the others.
 MOST_ENDS = 400
 """Number of keys on which ends are stored: two for each robot of the largest team, and others."""
 
+MOST_NODES = 1_000
+"""Number of nodes of a team whose last words are awaited."""
+
 
 @dataclass(frozen=True)
 class _End:
@@ -62,7 +65,8 @@ class StoredMessages:
         with self._lock:
             if alive:
                 self._there.add(node)
-                self._silent.add(node)
+                if len(self._silent) < MOST_NODES:
+                    self._silent.add(node)
                 return False
             self._there.discard(node)
             if not self._there:
