@@ -1,6 +1,6 @@
 """How fast a log is computed again, against how fast it can be read at all.
 
-    python benchmarks/rerun_rate.py LOG … [--json FILE]
+    python -m benchmarks.rerun_rate LOG … [--json FILE]
 
 For each log: `rerun --verify` in measurements per second and as a multiple of real time, and the
 rate at which the mcap library alone reads the same file's messages (one core each, file in the

@@ -1,4 +1,4 @@
-"""Hostile traffic through real processes; `benchmarks/hostile.py` is the storm."""
+"""Hostile traffic through real processes; `tests/trials/hostile.py` is the storm."""
 
 import time
 from itertools import islice

@@ -11,7 +11,6 @@ import pytest
 import zenoh
 from zenoh.handlers import Callback
 
-from benchmarks.late_joins import storm
 from team import the_end
 from team.the_end import TheEnd
 from team.wire import channels as c
@@ -35,6 +34,7 @@ from tests.support import (
     submap,
     wait_until,
 )
+from tests.trials.late_joins import storm
 
 FINAL = msgspec.structs.replace(
     next(message for message in examples() if isinstance(message, m.FusedMap)), final=True

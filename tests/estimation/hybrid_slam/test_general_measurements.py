@@ -1,10 +1,10 @@
-"""Submaps of all forms of measurements are consistent; `benchmarks/general_measurements.py` has
+"""Submaps of all forms of measurements are consistent; `tests/trials/general_measurements.py` has
 the tight bounds over hundreds of runs, these are a few seeds of it.
 """
 
 import pytest
 
-from benchmarks.general_measurements import CASES, mean_nees
+from tests.trials.general_measurements import CASES, mean_nees
 
 SEEDS = 8
 LOUD = {

@@ -1,6 +1,6 @@
 """Late joiners under load: does each get every message of delivery `all`, once and in order?
 
-    python benchmarks/late_joins.py [--joins 1000] [--publishers 3] [--busy 4] [--seed 2]
+    python -m tests.trials.late_joins [--joins 1000] [--publishers 3] [--busy 4] [--seed 2]
 
 Publishers send on their keys while one more process of the team joins; what it receives is compared
 with what was sent. Busy loops load the machine meanwhile. Prints how many keys would have stayed

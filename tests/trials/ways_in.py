@@ -1,6 +1,6 @@
 """One data set by seven ways into the program: one final map, or how far apart the maps are.
 
-    python benchmarks/ways_in.py UTIAS.zip [--seconds 240] [--speed 8] [--keep FOLDER] [--only …]
+    python -m tests.trials.ways_in UTIAS.zip [--seconds 240] [--speed 8] [--keep FOLDER] [--only …]
 
 zip      the data set as it is
 csv      a folder of tables
@@ -36,7 +36,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import zenoh
-from kills import PROGRAM
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from sim.datasets.folder_writer import write_folder
@@ -51,6 +50,7 @@ from team.ros2.definitions import types
 from team.wire import channels as ch
 from team.wire.bus import opened
 from team.wire.messages import FusedMap
+from tests.trials.kills import PROGRAM
 
 EXACT = ("zip", "csv")
 BY_POINTS = ("mcap", "db3", "rmw", "bridge", "log")
@@ -297,7 +297,7 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
             for robot, start in at.items()
         ]  # fmt: skip
         publisher = begin(
-            [sys.executable, __file__, "--publish", way, str(place / "mcap"), str(port),
+            [sys.executable, "-m", "tests.trials.ways_in", "--publish", way, str(place / "mcap"), str(port),
              str(speed)],
             "publisher.log", stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         )  # fmt: skip

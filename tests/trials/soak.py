@@ -1,6 +1,6 @@
 """What a long run costs each process: memory, descriptors and threads over time.
 
-    python benchmarks/soak.py [--scenario random-3] [--minutes 60] [--speed 100] [--fusion join]
+    python -m tests.trials.soak [--scenario random-3] [--minutes 60] [--speed 100] [--fusion join]
                               [--json FILE]
 
 Launches the team as real processes on a simulated world that is long enough for the given wall

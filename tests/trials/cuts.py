@@ -1,6 +1,6 @@
 """Whole teams whose links are cut at random: each process in a network namespace of its own.
 
-    python benchmarks/cuts.py --runs 10 --cuts 5 [--longest 12] [--json FILE]
+    python -m tests.trials.cuts --runs 10 --cuts 5 [--longest 12] [--json FILE]
 
 Needs root and `ip` (Linux). The router, the world, the recorder, the centre and the robots hang on
 one bridge; a cut takes one process's link down for a while, for less or for more than the lease of
@@ -26,9 +26,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
-
 from sim.scenarios.scenario import load
+from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
 
 NET = "10.213.77"
 PORT = 7447

@@ -1,6 +1,6 @@
 """Whether the consistency monitor sees a factor of two, profile by profile.
 
-    python benchmarks/monitor_power.py [--seeds FIRST-LAST] [--dataset ZIP …] [--profiles NAME …]
+    python -m tests.trials.monitor_power [--seeds FIRST-LAST] [--dataset ZIP …] [--profiles NAME …]
 
 A team runs in memory; its final map is solved again with all submaps' covariances as they are, and
 as a team would have them that claims half and twice: the monitor is to be silent of the first and

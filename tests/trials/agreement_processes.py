@@ -1,8 +1,8 @@
-"""As `benchmarks.agreement`, over Zenoh with real processes under `launch`.
+"""As `tests.trials.agreement`, over Zenoh with real processes under `launch`.
 
-    python -m benchmarks.agreement_processes thesis --way dies
-    python -m benchmarks.agreement_processes thesis --storm --deaths 30
-    python -m benchmarks.agreement_processes utias-6 --way with --utias ../shared/utias
+    python -m tests.trials.agreement_processes thesis --way dies
+    python -m tests.trials.agreement_processes thesis --storm --deaths 30
+    python -m tests.trials.agreement_processes utias-6 --way with --utias ../shared/utias
 
 A way: with a centre as one more peer, without, or with one that is killed half way and, started
 again by launch, comes back. --storm: a radio that loses 20 %, with 2 s of delay and partitions.
@@ -27,8 +27,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.agreement import WAYS, central_map, order_of, scenario_of
-from benchmarks.kills import PROGRAM, await_text, children
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, dumps
 from sim.scenarios.source import streams_of
@@ -37,6 +35,8 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded
 from team.wire.zenoh.bus import ZenohBus
+from tests.trials.agreement import WAYS, central_map, order_of, scenario_of
+from tests.trials.kills import PROGRAM, await_text, children
 
 
 @dataclass

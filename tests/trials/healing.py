@@ -1,6 +1,6 @@
 """What it takes until all have everything again, after two halves of a team have been apart.
 
-`python -m benchmarks.healing [--teams 2 5] [--topologies all line]`: the peers of
+`python -m tests.trials.healing [--teams 2 5] [--topologies all line]`: the peers of
 `benchmarks.peers`, which close their submaps one after the other, each one every 10 s; two
 halves are apart from 100 s to 200 s. From the healing on by steps of 0.05 s: the seconds until
 everyone has all that there was when it healed, and per robot what was said and heard meanwhile (new

@@ -1,6 +1,6 @@
 """What communication buys: error of each robot's own map and pose, by the range of its radio.
 
-`python -m benchmarks.comm_range [--steps N] [--picture docs/static/comm_range.png]`: `random-10`
+`python -m tests.trials.comm_range [--steps N] [--picture docs/static/comm_range.png]`: `random-10`
 without a centre, in memory, with radios that reach 5, 10, 20, 40 m and everyone. Against the truth,
 over team time: the error of the position that each robot believes (`team/pose`; its own pose where
 it has none yet), that of the landmarks of its own map of the team, and how many these are.

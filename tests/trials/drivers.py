@@ -1,6 +1,6 @@
 """Two robots' drivers at real-time pace: processes killed, links cut, and the final map.
 
-    python benchmarks/drivers.py [--runs 1] [--seconds 60] [--kills 5] [--cuts 5] [--json FILE]
+    python -m tests.trials.drivers [--runs 1] [--seconds 60] [--kills 5] [--cuts 5] [--json FILE]
 
 Needs root and `ip` (Linux). Each process (router, recorder, centre, each robot's, each robot's
 driver, which is examples/robot.py on the tables of examples/own_data.py) has a network namespace of
@@ -22,14 +22,13 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from cuts import NET, ONE_THREAD, PORT, ip, network
-from kills import PROGRAM, await_text, expected_of, final_in
-
 from sim.scenarios.scenario import load, with_options
 from team.recording.check import holes
 from team.recording.reader import open_log
+from tests.trials.cuts import NET, ONE_THREAD, PORT, ip, network
+from tests.trials.kills import PROGRAM, await_text, expected_of, final_in
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 ROBOTS = ("r1", "r2")
 STEP_S = 0.1
 CUTS_S = (0.3, 1.0, 3.0, 12.0)

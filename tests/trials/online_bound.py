@@ -1,6 +1,6 @@
 """What online poses could be: everything that the whole team has measured by then, at once.
 
-    python benchmarks/online_bound.py [SCENARIO …] [--seeds FIRST-LAST]
+    python -m tests.trials.online_bound [SCENARIO …] [--seeds FIRST-LAST]
 
 The batch smoother of all robots' measurements up to t, marginalised to the poses at t, linearised
 at the truth: an extended Kalman filter over all robots' poses and all landmarks whose Jacobians are

@@ -1,6 +1,6 @@
 """Robots that keep their own logs, without recorder and centre: what each log proves.
 
-`python -m benchmarks.own_logs [--scenario waypoints] [--reach 12] [--deaths 2] [--keep FOLDER]`:
+`python -m tests.trials.own_logs [--scenario waypoints] [--reach 12] [--deaths 2] [--keep FOLDER]`:
 router, world and robots with a set on disk and a log of their own, started by hand; robots reach
 each other within --reach metres, and some are killed on the way and started again. Then every log
 is computed again alone (`teamslam rerun --verify`), all are merged, the merged log is computed
@@ -19,14 +19,14 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from benchmarks.agreement_processes import Watch
-from benchmarks.kills import PROGRAM, await_text, expected_of
 from sim.scenarios.scenario import load
 from team.recording.reader import LogError, open_log
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded
 from team.wire.zenoh.bus import ZenohBus
+from tests.trials.agreement_processes import Watch
+from tests.trials.kills import PROGRAM, await_text, expected_of
 
 
 def judged(folder: Path, *words: str) -> tuple[bool, str]:

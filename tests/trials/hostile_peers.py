@@ -1,6 +1,6 @@
 """A stranger among peers: can what it sends fill a robot, or keep it from its final map?
 
-    python -m benchmarks.hostile_peers [--steps 200] [--speed 10] [--rate 2000] [--json FILE]
+    python -m tests.trials.hostile_peers [--steps 200] [--speed 10] [--rate 2000] [--json FILE]
 
 `thesis` under `launch --without-centre`, as real processes, without keys. A stranger says in the
 names of the robots and of others: summaries that claim submaps without end, and answers the
@@ -29,13 +29,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.kills import PROGRAM, await_text, children, expected_of, shortened
 from sim.scenarios.scenario import load
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import BusError, Sample
 from team.wire.codec import encoded
 from team.wire.zenoh.bus import ZenohBus
+from tests.trials.kills import PROGRAM, await_text, children, expected_of, shortened
 
 ROBOTS = ("r1", "r2")
 LARGE = 3 * 2**20

@@ -1,6 +1,6 @@
 """Storms on a team without a centre: does every peer end with the central run's map, to the bit?
 
-`python -m benchmarks.agreement [CASE…] [--utias FOLDER] [--json FILE]`, in memory. Each case runs
+`python -m tests.trials.agreement [CASE…] [--utias FOLDER] [--json FILE]`, in memory. Each case runs
 once with a centre; then as peers, three ways: with a centre that is one more peer, without, and
 with one that dies half way and comes back at the end. Meanwhile 20 % of what robots say to each
 other is lost, 10 % comes twice, up to 2 s late, so out of order; partitions by chance; 30 deaths,

@@ -1,6 +1,6 @@
 """Hostile traffic: mutated payloads at the door, and valid hostile messages into running nodes.
 
-    python benchmarks/hostile.py [--mutated 1000000] [--messages 100000] [--through 20000]
+    python -m tests.trials.hostile [--mutated 1000000] [--messages 100000] [--through 20000]
                                  [--keys] [--json FILE]
 
 Door: mutated payloads of every message are opened as a receiver opens them; what raises anything
@@ -26,10 +26,6 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from kills import PROGRAM, await_text, children, expected_of, final_in, shortened
-
 from sim.scenarios.scenario import load
 from team.keys.authority import make_keys
 from team.keys.credentials import credentials_of
@@ -39,6 +35,7 @@ from team.wire.bus import BusError, Sample, opened
 from team.wire.codec import WireError
 from team.wire.zenoh.bus import ZenohBus
 from tests.hostile_team import OF_THE_RUN, PAIR, mutated, payloads
+from tests.trials.kills import PROGRAM, await_text, children, expected_of, final_in, shortened
 
 PATIENCE_S = 600.0
 """Of a process to begin: kernels may have to be compiled."""
@@ -178,7 +175,7 @@ def main() -> int:
         found |= after
         print(json.dumps(after, indent=1), flush=True)
         bad |= any(after[what] for what in ("deaths", "faults", "left", "waits", "tracebacks"))
-        bad |= bool(options.keys) and (after["equal"] is not True or after["exit"] != 0)
+        bad |= bool(options.keys) and (not after["equal"] or after["exit"] != 0)
     if options.json:
         options.json.write_text(json.dumps(found | {"load": os.getloadavg()[0]}, indent=1))
     return int(bad)

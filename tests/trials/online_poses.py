@@ -1,6 +1,6 @@
 """How right the robots' running poses in the team's map are, over many runs in memory.
 
-    python benchmarks/online_poses.py [SCENARIO …] [--seeds FIRST-LAST] [--json FILE]
+    python -m tests.trials.online_poses [SCENARIO …] [--seeds FIRST-LAST] [--json FILE]
 
 For each scenario: the mean NEES per degree of freedom of the online poses (1 is right), the median
 and the worst RMSE of a robot in a run, and who is silent: more than a window of poses in a row with
@@ -21,7 +21,6 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from online_bound import FAR, bounds, longest_s
 
 from central.desk.evaluation.evaluation import evaluate
 from sim.in_memory.team import run_team
@@ -32,6 +31,7 @@ from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import opened
+from tests.trials.online_bound import FAR, bounds, longest_s
 
 SCENARIOS = ("thesis", "thesis-b")
 GOALS = {"nees_per_dof": 1.15, "worst_over_median": 3.0, "over_bound": 1.25, "silent": 0.0}

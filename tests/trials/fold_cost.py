@@ -1,6 +1,6 @@
 """What a peer's fold costs: CPU of a robot that folds always, on request, or at the end only.
 
-`python -m benchmarks.fold_cost [SCENARIO] [--steps N]`, in memory, everyone in reach. The first
+`python -m tests.trials.fold_cost [SCENARIO] [--steps N]`, in memory, everyone in reach. The first
 robot folds as the set grows; the second when it is asked to, once a third of the way and once two
 thirds; the others when everything is there. Of each, CPU of everything that it does, of its fold
 until the streams end, and of its fold in all. Then what a small computer has left to do: keep the

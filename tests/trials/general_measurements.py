@@ -1,6 +1,6 @@
 """Are submaps consistent, whatever the form of the measurements? NEES over seeds, and mutants.
 
-    python benchmarks/general_measurements.py [--seeds 200] [--only NAME]
+    python -m tests.trials.general_measurements [--seeds 200] [--only NAME]
 
 Worlds whose robots tell odometry as increments on SE(2) with a lateral part and a correlated
 covariance, or as a car's encoders; that see landmarks as points or as range and bearing, each with

@@ -1,6 +1,6 @@
 """Frames per second of the page, headless, with many robots and landmarks.
 
-    python -m benchmarks.page [--robots 10] [--landmarks 1000] [--seconds 600] [--picture FILE]
+    python -m tests.trials.page [--robots 10] [--landmarks 1000] [--seconds 600] [--picture FILE]
 
 Needs Chromium. Without a GPU the processor paints, so a machine with other work shows less.
 """
