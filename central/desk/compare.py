@@ -21,6 +21,8 @@ def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
     """(figure, one cell per run); "–" where a run has none."""
     every = list(runs.values())
     rows = [(name, tuple(of(run) for run in every)) for name, of in _TEAM]
+    matched = tuple(run.matched_by for run in every)
+    rows += [("landmark errors by", matched)] if any(matched) else []
     for robot in in_order({name for run in every for name in run.robots}):
         results = [run.robots.get(robot) for run in every]
         rows += [

@@ -43,6 +43,8 @@ def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
         ("final map, its bytes", lambda e: "–" if e.map is None else e.map.payload_sha256[:16]),
     )
     rows = [(name, of(recorded), of(changed)) for name, of in of_the_team]
+    matched = recorded.matched_by, changed.matched_by
+    rows += [("landmark errors by", *matched)] if any(matched) else []
     for name in in_order(recorded.robots.keys() | changed.robots.keys()):
         a, b = (
             None if run.arbitrary_frame else run.robots.get(name) for run in (recorded, changed)

@@ -88,7 +88,7 @@ class AssociationResult:
 def association_result(log: Collected) -> AssociationResult | None:
     """The scores of a run; None where all detections had identities, or none was labelled."""
     labels = _labels(log)
-    if not labels:
+    if all(label == UNKNOWN for label in labels.values()):
         return None
     detections = list(_detections(log, labels))
     places = [place for _, place, _ in detections]

@@ -33,12 +33,14 @@ from central.desk.evaluation.errors import (
 from central.desk.evaluation.gospa import Gospa, gospa, half_spacing
 from central.desk.evaluation.gps import gps_median
 from central.desk.evaluation.log import Collected, Traffic, collected
+from central.desk.evaluation.matching import Matching, nearest
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.desk.evaluation.verdicts import verdicts_given
 from central.desk.names import in_order, not_joined
 from central.team_config import TeamConfig, team_config
 from team import translate
+from team.config import UNNAMED
 from team.estimation.gaussian import Matrix
 from team.pairs import PAIRS
 from team.recording.check import holes
@@ -63,7 +65,8 @@ class MapResult:
     payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
     covariance_scale: the factor by which the submaps' covariances should be multiplied; None:
     unknown. withdrawn: robots left out of the map. lost: robots that are not completely in it.
-    gospa: of all landmarks against all true ones, after truth_from_map; None without it.
+    gospa: of all landmarks against all true ones, after truth_from_map; None without it. matching:
+    how the landmarks without identities have got their true positions; None: by identity or label.
     """
 
     rule: str
@@ -84,6 +87,7 @@ class MapResult:
     covariance_scale: float | None = None
     lost: tuple[str, ...] = ()
     gospa: Gospa | None = None
+    matching: Matching | None = None
 
 
 TeamMotion = tuple[Float[np.ndarray, "3"], str]
@@ -152,6 +156,11 @@ class Evaluation:
     verdicts: tuple[str, ...] = ()
     gps_median_m: float | None = None
 
+    @property
+    def matched_by(self) -> str:
+        """How landmarks without identities were matched to true ones; empty where none were."""
+        return "" if self.map is None or self.map.matching is None else str(self.map.matching)
+
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
     """Compute the figures of one run, from its log's samples in the order of the log."""
@@ -165,9 +174,11 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     )
     association = association_result(log)
     label_of = {} if association is None else association.label_of
-    fused = _map_result(log, ids, positions, label_of)
-    uplink = None if scenario is None else _uplink(scenario)
     logs = {robot: robot_log(log, robot) for robot in log.robots}
+    arbitrary_frame = _is_arbitrary(log)
+    truth_from_map = _motion(logs.values()) if arbitrary_frame else np.zeros(3)
+    fused = _map_result(log, ids, positions, label_of, truth_from_map)
+    uplink = None if scenario is None else _uplink(scenario)
     motion = _team_motion(fused, logs.values())
     robots = {
         robot: _robot_result(
@@ -198,7 +209,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         cost_by_robot=_by_robot(log, "joint_cost_per_dof."),
         faults=len(faults),
         scale_by_robot=_by_robot(log, "covariance_scale."),
-        arbitrary_frame=_is_arbitrary(log),
+        arbitrary_frame=arbitrary_frame,
         peers=peer_results(log),
         disagreement=log.disagreement,
         association=association,
@@ -279,6 +290,9 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "fusion": None if scenario is None else scenario.fusion,
         "landmarks": None if fused is None else len(fused.ids),
         "landmarks_with_truth": None if errors is None else errors.count,
+        "landmark_matching": None
+        if fused is None or fused.matching is None
+        else asdict(fused.matching),
         "landmark_rmse_m": None if errors is None else errors.rmse_m,
         "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
         "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
@@ -387,7 +401,13 @@ def _map_result(
     true_ids: UInt32[np.ndarray, " T"],
     positions: Float[np.ndarray, "T 2"],
     label_of: Mapping[int, int],
+    truth_from_map: Float[np.ndarray, "3"] | None,
 ) -> MapResult | None:
+    """The final map and its errors.
+
+    truth_from_map: the motion after which landmarks without identities and labels are matched to
+    the nearest true ones; None: unknown.
+    """
     sample = log.last(ch.FINAL_MAP)
     message = log.sound(sample)
     if sample is None or not isinstance(message, m.FusedMap):
@@ -396,6 +416,10 @@ def _map_result(
     covariance = translate.landmark_covariance_of(message)
     labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
     truth, known = _truth_of(labels, true_ids, positions)
+    matching = None
+    if not label_of and truth_from_map is not None:
+        at = moved(truth_from_map, means)
+        matching = _match_unnamed(ids, at, true_ids, positions, truth, known)
     errors = _errors(means, covariance, truth, known)
     return MapResult(
         rule=message.rule,
@@ -416,7 +440,31 @@ def _map_result(
         covariance_scale=message.covariance_scale or None,
         lost=message.lost,
         gospa=_gospa(means, errors, positions),
+        matching=matching,
     )
+
+
+def _match_unnamed(
+    ids: UInt32[np.ndarray, " L"],
+    means: Float[np.ndarray, "L 2"],
+    true_ids: UInt32[np.ndarray, " T"],
+    positions: Float[np.ndarray, "T 2"],
+    truth: Float[np.ndarray, "L 2"],
+    known: Bool[np.ndarray, " L"],
+) -> Matching | None:
+    """Fill in the true positions of landmarks without identities from the nearest true landmarks
+    that no identity names; None where there are none of either.
+    """
+    unnamed = np.flatnonzero((ids >= UNNAMED) & ~known)
+    free = positions[~np.isin(true_ids, ids)]
+    found = nearest(means[unnamed], free) if len(unnamed) else None
+    if found is None:
+        return None
+    rows, matching = found
+    near = rows >= 0
+    truth[unnamed[near]] = free[rows[near]]
+    known[unnamed[near]] = True
+    return matching
 
 
 def _gospa(

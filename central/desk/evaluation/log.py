@@ -100,6 +100,7 @@ class Collected:
     unsound: int = 0
     disagreement: tuple[str, ...] = ()
     first_ns: int | None = None
+    _refused: set[int] = field(default_factory=set)
 
     @property
     def robots(self) -> list[str]:
@@ -131,14 +132,18 @@ class Collected:
         return [fault for fault in found if isinstance(fault, m.Fault)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
-        """The sample's message; None, and counted as unsound, if it is invalid."""
+        """The sample's message; None, and counted once as unsound, if it is invalid."""
         if sample is None:
             return None
         try:
             return shown(sample)[2]
         except WireError:
-            self.unsound += 1
+            self._refuse(sample)
             return None
+
+    def _refuse(self, sample: Sample) -> None:
+        self.unsound += id(sample) not in self._refused
+        self._refused.add(id(sample))
 
     def take(self, sample: Sample, channel: str, robot: str) -> None:
         """Count a sample, and store it if its channel is collected."""
@@ -171,7 +176,7 @@ class Collected:
     def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
         head = head_of(sample)
         if head is None:
-            self.unsound += 1
+            self._refuse(sample)
             return
         of_robot = self.measurements[robot]
         of_robot.all.add((head.incarnation, head.number))

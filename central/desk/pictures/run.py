@@ -322,5 +322,7 @@ def _title(evaluation: Evaluation) -> list[str]:
         text = f"landmark RMSE {errors.rmse_m:.3g} m"
         if errors.aligned_rmse_m is not None:
             text += f" ({errors.aligned_rmse_m:.3g} m aligned)"
+        if fused.matching is not None:
+            text += f", {fused.matching.by}"
         second += [text, f"NEES/dof {errors.nees_per_dof:.3g}"]
     return [_heading(evaluation), " · ".join(second)]

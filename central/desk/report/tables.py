@@ -105,10 +105,12 @@ def team_rows(evaluation: Evaluation) -> Rows:
         return [("final map", f"empty: {'; '.join(fused.reasons)}")]
     rows = [("landmarks", f"{len(fused.ids)} in the final map")]
     if errors is None:
-        rows.append(("landmark errors", "can not be computed: no true landmarks"))
+        rows.append(("landmark errors", f"can not be computed: {_without_truth(evaluation)}"))
     else:
+        by = "" if fused.matching is None else f", {fused.matching.by}"
+        rows += [] if fused.matching is None else [("landmark errors", f"by {fused.matching}")]
         rows += [
-            ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m"),
+            ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m{by}"),
             ("after rigid alignment", shown(errors.aligned_rmse_m, ".3f", " m")),
         ]
         if not arbitrary:
@@ -135,6 +137,15 @@ def team_rows(evaluation: Evaluation) -> Rows:
     if evaluation.unsound:
         rows.append(("unsound messages", str(evaluation.unsound)))
     return rows
+
+
+def _without_truth(evaluation: Evaluation) -> str:
+    """The reason why a map has no errors."""
+    if evaluation.map is not None and evaluation.map.matching is not None:
+        return str(evaluation.map.matching)
+    if not len(evaluation.true_landmarks):
+        return "no true landmarks"
+    return "no true landmark can be matched to one of the map's"
 
 
 def in_words(errors: MapErrors, *, joint: bool) -> str:

@@ -10,16 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.desk.compare import compare_picture
+from central.desk.compare import compare_picture, compare_rows
 from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
 from central.desk.evaluation.evaluation import evaluate, to_json
+from central.desk.report.tables import team_rows
 from central.desk.side_by_side import comparison_rows
 from sim.scenarios.scenario import Scenario
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.translate import joint_bytes
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing, Sample
 from tests.sim.logs import (
     final_map,
@@ -450,3 +451,108 @@ def test_a_comparison_of_maps_in_an_arbitrary_frame_has_aligned_errors_only() ->
     assert rows["landmark RMSE [m]"] == rows["map NEES per dof"] == "–"
     assert rows["r1: smoothed position RMSE [m]"] == "–"
     assert rows["… after rigid alignment [m]"] != "–"
+
+
+UNNAMED_IDS = [2**31 + k for k in range(9)]
+
+
+def unnamed_log(
+    means: np.ndarray, *, initial_poses: bool = True, named: int = 0, labels: bool = False
+) -> list[Sample]:
+    """A world whose final map has landmarks without identities, the first `named` excepted."""
+    of = scenario()
+    world = streams(of)
+    ids = [*world.landmark_ids.tolist()[:named], *UNNAMED_IDS[: len(means) - named]]
+    said = [final_map(ids, means, 0.01 * np.eye(2 * len(means)))]
+    if labels:  # of a scan none of whose detections has a label
+        unknown = m.TruthLabels(
+            robot="r1",
+            stamp_ns=5,
+            stamps=from_stamps([5]),
+            counts=from_ids([1]),
+            labels=from_ids([m.NO_LABEL]),
+        )
+        said.append(Outgoing(ch.TRUTH_LABELS, "r1", unknown))
+    log = world_log(of)
+    if not initial_poses:
+        log = [each for each in log if each.key != ch.START.key("r1")]
+        poses = world.streams[0].truth
+        stamps_ns = world.streams[0].intervals.end_ns
+        assert poses is not None
+        turned = np.column_stack((moved(ROTATED, poses[1:, :2]), poses[1:, 2] + ROTATED[2]))
+        said.append(trajectory("r1", stamps_ns.tolist(), turned, 0.1))
+        unknown_start = m.InitialPose(
+            stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b""
+        )
+        said.append(Outgoing(ch.START, "r1", unknown_start))
+    return log + samples(said)
+
+
+ROTATED = np.array([30.0, -20.0, 2.0])
+
+
+@pytest.mark.parametrize(("named", "labels"), [(0, False), (3, False), (0, True)])
+def test_landmarks_without_identities_have_their_errors_by_the_nearest_true_ones(
+    named: int, labels: bool
+) -> None:
+    true = streams(scenario()).landmarks
+    means = true + 0.1
+    means[-1] += 40.0
+    run = evaluate(unnamed_log(means, named=named, labels=labels))
+    assert run.map is not None
+    assert run.map.errors is not None
+    assert run.map.errors.rmse_m == pytest.approx(0.1 * np.sqrt(2.0))
+    assert run.map.known.tolist() == [True] * 7 + [False]
+    matching = run.map.matching
+    assert matching is not None
+    assert (matching.matched, matching.of) == (7 - named, 8 - named)
+    words = f"nearest neighbour within {matching.gate_m:.3g} m, {7 - named} of {8 - named} matched"
+    rows = dict(team_rows(run))
+    assert rows["landmark errors"] == f"by {words}"
+    assert rows["landmark RMSE"] == "0.141 m, nearest neighbour"
+    assert "association" not in rows
+    assert to_json(run)["landmark_matching"] == {
+        "gate_m": matching.gate_m, "matched": 7 - named, "of": 8 - named,
+        "by": "nearest neighbour",
+    }  # fmt: skip
+    assert ("landmark errors by", words, words) in comparison_rows(run, run)
+    assert ("landmark errors by", (words,)) in compare_rows({"a": run})
+
+
+def test_a_map_far_from_all_true_landmarks_has_no_errors_and_says_within_which_gate() -> None:
+    run = evaluate(unnamed_log(streams(scenario()).landmarks + 100.0))
+    assert run.map is not None
+    assert run.map.errors is None
+    assert run.map.matching is not None
+    assert dict(team_rows(run))["landmark errors"] == (
+        f"can not be computed: nearest neighbour within {run.map.matching.gate_m:.3g} m, "
+        "0 of 8 matched"
+    )
+
+
+def test_no_true_landmark_has_two_of_the_map() -> None:
+    true = streams(scenario()).landmarks
+    run = evaluate(unnamed_log(np.vstack((true + 0.1, true[:1] + 0.02))))
+    assert run.map is not None
+    assert run.map.matching is not None
+    assert (run.map.matching.matched, run.map.matching.of) == (8, 9)
+    assert run.map.known.tolist() == [False] + [True] * 8
+
+
+def test_in_an_arbitrary_frame_the_paths_move_the_map_before_it_is_matched() -> None:
+    true = streams(scenario()).landmarks
+    run = evaluate(unnamed_log(moved(ROTATED, true), initial_poses=False))
+    assert run.arbitrary_frame
+    assert run.map is not None
+    assert run.map.matching is not None
+    assert run.map.matching.matched == 8
+    assert run.map.errors is not None
+    assert run.map.errors.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_landmarks_with_identities_are_matched_by_nothing_else() -> None:
+    run = evaluate(joined_log(scenario(), 0.1))
+    assert run.map is not None
+    assert run.map.matching is None
+    assert to_json(run)["landmark_matching"] is None
+    assert "landmark errors" not in dict(team_rows(run))
