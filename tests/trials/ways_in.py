@@ -297,8 +297,8 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
             for robot, start in at.items()
         ]  # fmt: skip
         publisher = begin(
-            [sys.executable, "-m", "tests.trials.ways_in", "--publish", way, str(place / "mcap"), str(port),
-             str(speed)],
+            [sys.executable, "-m", "tests.trials.ways_in", "--publish", way,
+             str(place / "mcap"), str(port), str(speed)],
             "publisher.log", stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         )  # fmt: skip
         assert publisher.stdin is not None
