@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from team.recording.counters import Counters, TallyCount
+from team.recording.counters import Counters
 from team.recording.cut import CUT
 from team.recording.declared import declared, misdeclared
 from team.recording.inventory import Inventory
@@ -87,13 +87,14 @@ class _Evidence:
     """The evidence about missing samples in the samples of a log.
 
     part: it is a cut of another log. repaired: it was made of one that its recorder did not finish.
+    totals: by key, the final number of publications of each process, by the process's beginning.
     """
 
     part: bool
     repaired: bool
     inventory: Inventory = field(default_factory=Inventory)
     counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
-    tallies: dict[str, list[TallyCount]] = field(default_factory=lambda: defaultdict(list))
+    totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
     last_words: LastWords = field(default_factory=LastWords)
     last_word: tuple[str, ...] = ()
     channels: set[ch.Channel] = field(default_factory=set)
@@ -115,24 +116,24 @@ class _Evidence:
         elif isinstance(message, m.Status):
             self.last_words.take_status(row[1], sample)
         elif isinstance(message, m.Tally):
-            self.last_words.take_tally(message, sample.wall_ns)
+            self.last_words.take_tally(message)
             for key, count in zip(message.keys, message.counts, strict=True):
-                self.tallies[key].append(TallyCount(message.since_ns, sample.wall_ns, count))
+                self.totals[key][message.since_ns] = count
 
     def findings(self) -> Iterator[Finding]:
         """The findings by key; for a part of a log only the gaps between two messages of a
         publisher.
         """
-        for key in sorted(self.counters.keys() | self.tallies.keys()):
+        for key in sorted(self.counters.keys() | self.totals.keys()):
             row = ch.channel_of(key)
             if row is not None and (row[0] is ch.ALIVE or row[1] == "recorder"):
                 continue
             if row is not None and not row[0].recorded:
                 continue
             numbered = not self.part and row is not None and row[0] in _NUMBERED
-            counts = self.tallies.get(key, ())
+            totals = tuple(self.totals.get(key, {}).values())
             for line in self.counters[key].findings(
-                part=self.part, numbered=numbered, tallies=counts
+                part=self.part, numbered=numbered, totals=totals
             ):
                 yield Finding(key, line + (DRAWN if ch.VIEW.owner(key) is not None else ""))
         if self.repaired and not self.part and not self.channels & _FINAL:

@@ -9,8 +9,10 @@ process.
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
+import numpy as np
+
+from team.recording.counters import match_totals, split_lives
 from team.wire import channels as ch
 from team.wire.bus import NO_COUNTER, Sample
 from team.wire.messages import Tally
@@ -19,56 +21,47 @@ MISSING = "missing: "
 """Beginning of the recorder's last note, which lists what it lacks."""
 
 
-class _Spoke(NamedTuple):
-    """One status: the publisher's wall clock [ns], its counter, the team time [ns]."""
-
-    wall_ns: int
-    counter: int
-    stamp_ns: int
-
-
 @dataclass
 class LastWords:
     """The statuses and final totals of each process of a log; 24 bytes a status and more."""
 
-    _spoke: dict[str, list[_Spoke]] = field(default_factory=lambda: defaultdict(list))
-    _ended: dict[str, list[tuple[int, int]]] = field(default_factory=lambda: defaultdict(list))
+    _statuses: dict[str, list[tuple[int, int, int]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    """By node, in the order of arrival: counter, wall clock [ns], team time [ns]."""
+    _totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
+    """By node, the numbers of statuses in its processes' final totals, by their beginnings."""
 
     def take_status(self, node: str, sample: Sample) -> None:
         """Adds a status of a node."""
         if sample.counter != NO_COUNTER:
-            self._spoke[node].append(_Spoke(sample.wall_ns, sample.counter, sample.stamp_ns))
+            status = sample.counter, min(sample.wall_ns, 2**63 - 1), sample.stamp_ns
+            self._statuses[node].append(status)
 
-    def take_tally(self, tally: Tally, wall_ns: int) -> None:
-        """Adds the final totals of a process; wall_ns: their wall clock [ns]."""
-        self._ended[tally.node].append((tally.since_ns, wall_ns))
+    def take_tally(self, tally: Tally) -> None:
+        """Adds the final totals of a process."""
+        totals = dict(zip(tally.keys, tally.counts, strict=True))
+        count = totals.get(ch.STATUS.key(tally.node), 0)
+        self._totals[tally.node][tally.since_ns] = count
 
     def findings(self) -> Iterator[tuple[str, str]]:
         """A key, and what is unknown about its process; empty where no process published totals.
 
         A log of nodes in memory has no such totals.
         """
-        if not self._ended:
+        if not self._totals:
             return
-        for node, spoke in sorted(self._spoke.items()):
-            for life in _lives(sorted(spoke)):
-                last = life[-1]
-                if any(since <= last.wall_ns <= until for since, until in self._ended[node]):
-                    continue
-                yield (
-                    ch.TALLY.key(node),
-                    f"no last word of the process that spoke until {last.stamp_ns * 1e-9:.1f} s: "
-                    "it was killed or cut off, and what it said after that may be missing",
-                )
-
-
-def _lives(spoke: list[_Spoke]) -> Iterator[list[_Spoke]]:
-    """The statuses of one process after the other: each counts from 0."""
-    life: list[_Spoke] = []
-    for each in spoke:
-        if life and each.counter <= life[-1].counter:
-            yield life
-            life = []
-        life.append(each)
-    if life:
-        yield life
+        for node, statuses in sorted(self._statuses.items()):
+            counters, walls, stamps_ns = np.array(statuses, np.int64).T
+            lives = split_lives(counters, walls)
+            published = [int(counters[life[-1]]) + 1 for life in lives]
+            totals = tuple(self._totals.get(node, {}).values())
+            ended = {life for _, life in match_totals(published, totals)}
+            for k, life in enumerate(lives):
+                if k not in ended:
+                    last_s = stamps_ns[life[-1]] * 1e-9
+                    yield (
+                        ch.TALLY.key(node),
+                        f"no last word of the process that spoke until {last_s:.1f} s: "
+                        "it was killed or cut off, and what it said after that may be missing",
+                    )

@@ -305,19 +305,108 @@ def test_a_message_that_is_there_twice_is_named_and_one_that_came_late_is_sound(
 def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(
     lives: list[set[int]], rng: random.Random
 ) -> None:
-    """Each life of a publisher is known by its message 0."""
+    """One life of a publisher after the other, each with its message 0 first."""
     samples = [
         Sample("source/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
         for life, kept in enumerate(lives)
-        for counter in sorted({0, *kept})
+        for counter in (0, *rng.sample(sorted(kept), len(kept)))
     ]
     lost = sum(max(kept, default=0) - len(kept) for kept in lives)
-    rng.shuffle(samples)
     counters = Counters()
     for sample in samples:
         counters.take(sample)
     lines = counters.findings(part=False)
     assert [line.split(" missing")[0].split()[0] for line in lines] == ([str(lost)] if lost else [])
+
+
+def set_back(samples: list[Sample], after: int, seconds: int) -> list[Sample]:
+    """The samples as of a machine whose clock is set back once, behind so many samples."""
+    return [
+        msgspec.structs.replace(s, wall_ns=s.wall_ns - (k >= after) * seconds * 10**9)
+        for k, s in enumerate(samples)
+    ]
+
+
+def spoken(node: str, count: int, since_s: int) -> list[Sample]:
+    """A process that publishes a status a second, a fault, and its totals at its end."""
+    said: list[Sample] = []
+    for k in range(count):
+        status = m.Status(stamp_ns=k * 10**9, node=node, state="mapping", figures={})
+        one = sampled(c.STATUS, node, status, k)
+        said.append(msgspec.structs.replace(one, wall_ns=(since_s + k) * 10**9))
+    until_ns = said[-1].wall_ns + 1
+    done = m.Liveliness(stamp_ns=0, node=node, alive=False)
+    said.append(Sample(f"{node}/config", encoded(done), 0, until_ns, 0))
+    keys = (c.STATUS.key(node), f"{node}/config")
+    tally = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count, 1))
+    return [*said, Sample(c.TALLY.key(node), encoded(tally), 0, until_ns + 1, 0)]
+
+
+def missing_in(path: Path, samples: list[Sample]) -> list[str]:
+    """The findings about counters and last words alone."""
+    return [line for line in found(recorded(path, samples)) if "unsound" not in line]
+
+
+@pytest.mark.parametrize("after", [1, 30, 99])
+@pytest.mark.parametrize("seconds", [1, 10, 3_600, -3_600])
+def test_a_clock_that_is_set_in_a_run_makes_nothing_missing(
+    path: Path, after: int, seconds: int
+) -> None:
+    """Ten seconds back made 495 messages missing of 100 that were all there."""
+    run = set_back(spoken("robot/alpha", 100, 10**6), after, seconds)
+    assert missing_in(path, run) == []
+    lost = [s for k, s in enumerate(run) if k not in (40, 41)]
+    assert missing_in(path.with_name("lost.mcap"), lost) == [
+        "robot/alpha/status: 2 messages missing: 40–41"
+    ]
+    tail = [s for k, s in enumerate(run) if k != 99]
+    assert missing_in(path.with_name("tail.mcap"), tail) == [
+        "robot/alpha/status: 1 message missing: 99"
+    ]
+
+
+def test_a_clock_that_is_set_between_two_lives_hides_no_loss_in_either(path: Path) -> None:
+    first = set_back(spoken("robot/alpha", 60, 10**6), 20, 15)
+    second = spoken("robot/alpha", 50, 10**6 + 30)
+    assert missing_in(path, [*first, *second]) == []
+    killed = [*first[:50], *second]
+    (named,) = missing_in(path.with_name("killed.mcap"), killed)
+    assert named.startswith("robot/alpha/tally: no last word of the process that spoke until 49.0")
+    lost = [*first, *second[:10], *second[12:]]
+    assert missing_in(path.with_name("lost.mcap"), lost) == [
+        "robot/alpha/status: 2 messages missing: 10–11"
+    ]
+
+
+@settings(deadline=None, max_examples=300)
+@given(
+    st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4),
+    st.integers(0, 60),
+    st.integers(-100, 100),
+)
+def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(
+    lives: list[set[int]], after: int, seconds: int
+) -> None:
+    """A message a second, in the order of arrival; each life is known by its message 0."""
+    samples = [
+        Sample("robot/alpha/status", b"", 0, (40 * life + counter) * 10**9, counter)
+        for life, kept in enumerate(lives)
+        for counter in sorted({0, *kept})
+    ]
+    lost = sum(max(kept, default=0) - len(kept) for kept in lives)
+    counters = Counters()
+    for k, sample in enumerate(set_back(samples, after, seconds)):
+        counters.take(msgspec.structs.replace(sample, wall_ns=sample.wall_ns + k))
+    lines = counters.findings(part=False)
+    assert [line.split(" missing")[0].split()[0] for line in lines] == ([str(lost)] if lost else [])
+
+
+def test_a_publication_that_came_as_a_reply_is_not_missing() -> None:
+    """Which one it is, its missing counter does not tell; that it is there, its contents do."""
+    counters = Counters()
+    counters.take(Sample("central/final", b"", 0, 5, NO_COUNTER))
+    assert counters.findings(part=False, totals=(1,)) == []
+    assert counters.findings(part=False, totals=(2,)) == ["2 messages missing: 0–1"]
 
 
 def test_unsound_messages_are_counted_and_the_first_is_explained(path: Path) -> None:
