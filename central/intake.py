@@ -95,9 +95,6 @@ class Intake(ABC, Generic[I]):
         """The last input of each stream that ends up to a time, as a map names it."""
         return {}
 
-    def admit(self, robot: str) -> None:
-        """Add a robot to the team."""
-
     def dealt(self, done: m.Done) -> bool:
         """True once all messages announced in the robot's `Done` have arrived."""
         return True
@@ -115,11 +112,6 @@ class Intake(ABC, Generic[I]):
     def submaps(self) -> int:
         """Number of submaps that were dealt with."""
         return 0
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """Warnings about the inputs, for readers of the map."""
-        return ()
 
     def refuse(self, message: m.Message, why: str, now_ns: int) -> list[Outgoing]:
         """Count a message whose handling raised as refused; returns the credit that this gives."""

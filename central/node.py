@@ -227,7 +227,6 @@ class CentralNode:
             *given_up,
             *admitted,
             *self._rule.findings,
-            *self._intake.findings,
             *self.warnings[-3:],
         )
         now_ns = self._attendance.now_ns

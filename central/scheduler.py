@@ -44,7 +44,6 @@ class Scheduler:
     def admit(self, robot: str) -> None:
         """Add a robot to the team."""
         self.rule.admit(robot)
-        self.intake.admit(robot)
 
     def advance(self, attendance: TeamAttendance) -> list[Outgoing]:
         """The maps that are due at the instants until now."""

@@ -9,7 +9,6 @@ from central.intake import Inputs, Instant, Intake
 from central.reach import Reach
 from central.submap_set import SubmapSet
 from central.unnamed_landmarks import verdict_of
-from central.withdrawal_witnesses import WithdrawalWitnesses
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.association.landmarks import Verdict
 from team.wire import channels as ch
@@ -46,21 +45,16 @@ class SubmapInputs(Inputs):
 class SubmapIntake(Intake[SubmapInputs]):
     """Collects a set of submaps; every submap is acknowledged when nobody need send it any more."""
 
-    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.WITHDRAWALS_HEARD, ch.VERDICT)
+    listens = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR, ch.ORDER, ch.VERDICT)
 
     def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
         super().__init__(config, robots)
-        self._withdrawal_witnesses = WithdrawalWitnesses(robots)
         self._set = SubmapSet()
         self._starts: dict[Stream, m.InitialPose] = {}
         self._reach = Reach()
         self._refusals: dict[Stream, set[int]] = {}
         self._verdicts: set[Verdict] = set()
         self._no_more: set[Verdict] = set()
-
-    def admit(self, robot: str) -> None:
-        """Add a robot to the team."""
-        self._withdrawal_witnesses.admit(robot)
 
     # What goes into a map.
 
@@ -116,9 +110,6 @@ class SubmapIntake(Intake[SubmapInputs]):
                 return self._follow(message)
             case m.Verdict():
                 self._judge_landmarks(message)
-            case m.WithdrawalHeard():
-                order = self._withdrawal_witnesses.take(message)
-                return [] if order is None else self._follow(order)
             case _:
                 pass
         return []
@@ -177,11 +168,6 @@ class SubmapIntake(Intake[SubmapInputs]):
         known = self.withdrawn
         self.take_withdrawal(order)
         return [] if order.robot in known else [Outgoing(ch.WITHDRAWAL, order.robot, order)]
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """Warnings of orders that are not believed."""
-        return self._withdrawal_witnesses.unconfirmed(self.withdrawn)
 
     # What is refused.
 

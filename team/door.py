@@ -88,8 +88,6 @@ def _robots(message: m.Message) -> Iterator[str]:
             yield from (message.robot, message.teammate)
         case m.End():
             yield from (stream.robot for stream in message.streams)
-        case m.WithdrawalHeard():
-            yield from (message.robot, message.withdrawn)
         case m.Withdrawal():
             yield message.robot
         case m.Verdict():

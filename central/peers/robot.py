@@ -63,8 +63,7 @@ class PeerRobot(Peer):
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
         """The channels to subscribe to under every name."""
-        own = (each for each in self.node.overhears if each is not ch.WITHDRAWAL)
-        return tuple(dict.fromkeys((*super().overhears, *own)))
+        return tuple(dict.fromkeys((*super().overhears, *self.node.overhears)))
 
     def begin(self) -> list[Outgoing]:
         """The first messages: its configuration, and that of its fold."""
@@ -160,7 +159,7 @@ class PeerRobot(Peer):
             # a reply of the source: it has no key
             out = self._vouched(Outgoing(ch.START, self.robot, message)) + self.grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
-        if own or isinstance(message, m.KnownMap | m.Rendezvous | m.Withdrawal):
+        if own or isinstance(message, m.KnownMap | m.Rendezvous):
             out = self._to_estimator(message, sample) + out
         return out
 

@@ -111,7 +111,6 @@ class RobotNode:
         self._done = False
         self._has_sent_done = False
         self._dones: list[m.Done] = []
-        self._withdrawn: set[str] = set()
         self.finished = False
         self.final: m.FusedMap | None = None
         self.withheld = 0
@@ -135,9 +134,8 @@ class RobotNode:
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """Channels to subscribe to for all robots: orders, and teammates' encounters."""
-        orders = (ch.ORDER, ch.WITHDRAWAL)
-        return (*orders, ch.RENDEZVOUS) if self._outbox.buffers else orders
+        """Channels to subscribe to for all robots: teammates' encounters, if they matter."""
+        return (ch.RENDEZVOUS,) if self._outbox.buffers else ()
 
     def request(self) -> m.MeasurementsRequest | None:
         """The measurements that are missing and must be asked for at their source."""
@@ -332,8 +330,6 @@ class RobotNode:
                     self._pace.acknowledged = acknowledged
             case m.Rendezvous():
                 return self._release(()) if self.robot in message.teammates else []
-            case m.Withdrawal():
-                return self._repeated(message)
             case _:
                 self._hear_of_the_end(message)
         return []
@@ -358,20 +354,6 @@ class RobotNode:
                 self._stream_end.is_ordered = True
             case _:
                 self.warnings.append(f"no use for a {type(message).__name__}")
-
-    def _repeated(self, order: m.Withdrawal) -> list[Outgoing]:
-        """Repeat an order once, so that a centre that is started again receives it."""
-        if order.robot in self._withdrawn:
-            return []
-        self._withdrawn.add(order.robot)
-        received = m.WithdrawalHeard(
-            stamp_ns=order.stamp_ns,
-            robot=self.robot,
-            withdrawn=order.robot,
-            by=order.by,
-            reason=order.reason,
-        )
-        return [Outgoing(ch.WITHDRAWALS_HEARD, self.robot, received)]
 
     # The stream.
 

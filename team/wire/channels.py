@@ -166,8 +166,8 @@ VERDICT = Channel(name="verdict", template="operator/verdict/{robot}", message=m
 WITHDRAWAL = Channel(name="withdrawal", template="central/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all", recorded=True, recomputable=False,
                      meaning="the team goes on without the robot; one for each order that the centre carries out")  # fmt: skip
 WITHDRAWALS_HEARD = Channel(name="withdrawals_heard", template="robot/{robot}/withdrawals", message=m.WithdrawalHeard,
-                            rate="once per order", delivery="all", recorded=True, recomputable=False,
-                            meaning="an order that the robot has received, for a centre that is restarted")  # fmt: skip
+                            rate="in earlier versions", delivery="all", recorded=True, recomputable=False,
+                            meaning="in logs of earlier versions: an order that the robot had received; nothing publishes or receives it")  # fmt: skip
 GIVEN_UP = Channel(name="given_up", template="operator/given_up/{node}", message=m.GivenUp, rate="once", delivery="all", recorded=True, recomputable=False,
                    meaning="an operator's order: no process waits for the node any more")  # fmt: skip
 END_ORDER = Channel(name="end_order", template="operator/end", message=m.TeamEnd, rate="once", delivery="all", recorded=True, recomputable=False,

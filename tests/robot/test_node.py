@@ -533,24 +533,6 @@ def test_measurements_far_from_their_predictions_are_said_with_what_to_configure
     assert all("front_end.outlier_share" in each for each in said)
 
 
-@pytest.mark.parametrize("exchange", ["continuous", "rendezvous"])
-def test_an_order_to_withdraw_a_robot_is_repeated_once_for_a_centre_that_comes_later(exchange):
-    node = RobotNode(config(), exchange)
-    assert {ch.ORDER, ch.WITHDRAWAL} <= set(node.overhears)
-    orders = [
-        m.Withdrawal(stamp_ns=0, robot=name, by="operator", reason="a flat wheel")
-        for name in ("r2", "r3", "r2")
-    ]
-    heard = [
-        m.WithdrawalHeard(stamp_ns=0, robot="r1", withdrawn=o.robot, by=o.by, reason=o.reason)
-        for o in orders
-    ]
-    assert [of(node.handle(order, 0), ch.WITHDRAWALS_HEARD) for order in orders] == [
-        [heard[0]], [heard[1]], [],
-    ]  # fmt: skip
-    assert not node.warnings
-
-
 def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
     first, sent = RobotNode(config()), []
     for measurement in MEASUREMENTS[: len(MEASUREMENTS) // 2]:

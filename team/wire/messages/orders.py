@@ -22,10 +22,11 @@ class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
 
 
 class WithdrawalHeard(Message, frozen=True, kw_only=True, tag="withdrawal_heard/1"):
-    """A robot repeats an order to withdraw `withdrawn`, for a centre that is started again.
+    """In logs of earlier versions: a robot repeats an order to withdraw `withdrawn`.
 
-    The centre believes it only from enough robots (`central.withdrawal_witnesses`). robot: the one
-    that repeats it. by, reason: as in the order.
+    Now a centre that is started again reads the order from its own file, or from the router, which
+    stores it as its operator published it. robot: the one that repeats it. by, reason: as in the
+    order.
     """
 
     robot: Name
