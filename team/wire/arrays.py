@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from team.config import UNNAMED
+
 if TYPE_CHECKING:
     import numpy as np
 else:
@@ -122,6 +124,15 @@ def check_ranges(data: Floats, what: str, count: int | None = None) -> None:
     few = _few(data)
     if min(floats(data, what).tolist() if few is None else few, default=0.0) < 0.0:
         raise ValueError("out of bounds: a range is negative")
+
+
+def check_named(data: Ids, what: str) -> None:
+    """Raise ValueError where an id is one of a landmark without identity: 2³¹ or larger.
+
+    A window numbers such landmarks itself, so that the two would collide.
+    """
+    if ids(data, what).max(initial=0) >= UNNAMED:
+        raise ValueError(f"out of bounds: {what} from 2³¹ on are of landmarks without identities")
 
 
 def check_ascending(data: Ids, what: str) -> None:

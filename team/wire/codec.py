@@ -35,7 +35,17 @@ class WireError(ValueError):
 
 def encoded(message: Message) -> bytes:
     """The message's payload bytes: a MessagePack array [tag, field, …]."""
-    return msgspec.msgpack.encode(message)
+    return _ENCODER.encode(message)
+
+
+def _plain(value: object) -> float:
+    """A number of NumPy that is a `float`, as the float that it is."""
+    if isinstance(value, float):
+        return float(value)
+    raise TypeError(f"no field of a message takes a {type(value).__name__}")
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def decoded(payload: bytes, *expected: type[M]) -> M:

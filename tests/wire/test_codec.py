@@ -7,6 +7,7 @@ import time
 import tracemalloc
 
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -86,6 +87,10 @@ def test_observations_from_before_their_covariances_have_the_sensors() -> None:
         ("points/1", -1, from_floats([1.0, 2.0, 1.0] * 2), "not positive definite"),
         ("observations/1", -1, from_floats([1.0, 0.0, 1.0]), "wrong length"),
         ("observations/1", -1, from_floats([1.0, 0.0, -1.0] * 2), "not positive definite"),
+        ("observations/1", -4, from_ids([1, UNNAMED]), "out of bounds"),
+        ("points/1", -3, from_ids([1, 2**32 - 1]), "out of bounds"),
+        ("known_map/1", -2, from_ids([1, UNNAMED]), "out of bounds"),
+        ("truth_landmarks/1", -2, from_ids([1, UNNAMED]), "out of bounds"),
     ],
 )
 def test_a_general_measurement_that_can_not_be_is_refused(
@@ -101,6 +106,15 @@ def test_a_motion_may_be_exact_in_some_direction(matrix: np.ndarray) -> None:
     fields = fields_of(EXAMPLES["increment/1"])
     fields[-1] = from_floats(matrix)
     assert decoded(msgpack.packb(fields), m.Increment).covariance == from_floats(matrix)
+
+
+def test_a_number_of_numpy_is_encoded_as_the_float_that_it_is() -> None:
+    """An estimate computed of arrays is one; a valid increment of huge numbers gave it."""
+    plain = EXAMPLES["innovation/1"]
+    computed = msgspec.structs.replace(plain, squared=np.float64(plain.squared))
+    assert encoded(computed) == encoded(plain)
+    with pytest.raises(TypeError, match="no field of a message takes a ndarray"):
+        encoded(msgspec.structs.replace(plain, squared=np.zeros(2)))
 
 
 def test_a_submap_from_before_the_pose_nodes_has_none() -> None:
@@ -205,7 +219,7 @@ def test_odometry_comes_back_as_it_went(
 @given(
     st.lists(
         st.tuples(
-            st.integers(0, 2**32 - 1), st.floats(0, 1e300), st.floats(-float(np.pi), float(np.pi))
+            st.integers(0, UNNAMED - 1), st.floats(0, 1e300), st.floats(-float(np.pi), float(np.pi))
         )
     )
 )

@@ -12,6 +12,7 @@ from team.wire.arrays import (
     check_angles,
     check_blocks,
     check_finite,
+    check_named,
     check_pose_covariance,
     check_ranges,
     check_semidefinite,
@@ -106,6 +107,7 @@ class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1")
     covariances: Floats = b""
 
     def check(self) -> None:  # noqa: D102
+        check_named(self.ids, "ids")
         n = len(ids(self.ids, "ids"))
         check_ranges(self.ranges, "ranges", n)
         check_angles(self.bearings, "bearings", n)
@@ -125,6 +127,7 @@ class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
     covariances: Floats = b""
 
     def check(self) -> None:  # noqa: D102
+        check_named(self.ids, "ids")
         n = len(ids(self.ids, "ids"))
         check_finite(self.positions, "positions", 2 * n)
         if self.covariances:

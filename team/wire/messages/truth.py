@@ -1,6 +1,15 @@
 """What only an evaluator, a robot that localises itself, or a simulated radio is told."""
 
-from team.wire.arrays import Floats, Ids, Stamps, check_ascending, check_finite, ids, stamps
+from team.wire.arrays import (
+    Floats,
+    Ids,
+    Stamps,
+    check_ascending,
+    check_finite,
+    check_named,
+    ids,
+    stamps,
+)
 from team.wire.messages.base import Message, Name, StampNs, check_counts
 
 
@@ -23,6 +32,7 @@ class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
+        check_named(self.ids, "ids")
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
@@ -69,6 +79,7 @@ class KnownMap(Message, frozen=True, kw_only=True, tag="known_map/1"):
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
+        check_named(self.ids, "ids")
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
 
 
