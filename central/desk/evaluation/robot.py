@@ -14,6 +14,9 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
 
+REJECTED = "rejected: "
+"""The beginning of the disposition of a measurement that was rejected."""
+
 
 @dataclass(frozen=True)
 class RobotLog:
@@ -45,6 +48,34 @@ class Consumption:
     submaps: int
     ledger: Mapping[str, int]
     each_once: bool | None
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """The number of rejected measurements by reason, the most frequent first."""
+        found = [
+            (count, disposition.removeprefix(REJECTED))
+            for disposition, count in self.ledger.items()
+            if disposition.startswith(REJECTED) and count
+        ]
+        return {reason: count for count, reason in sorted(found, key=lambda each: -each[0])}
+
+    @property
+    def used(self) -> int | None:
+        """The number of measurements in a submap or factor, or known to be the initial pose."""
+        if not self.ledger:
+            return None
+        return sum(self.ledger.values()) - sum(self.rejected.values())
+
+    @property
+    def open(self) -> int | None:
+        """The number of published measurements that are neither used nor rejected."""
+        return None if self.consumed is None else self.published - self.consumed
+
+    @property
+    def not_used(self) -> str:
+        """The numbers of rejected and open measurements with the reasons; empty without any."""
+        parts = [f"{count} rejected ({reason})" for reason, count in self.rejected.items()]
+        return ", ".join([*parts, f"{self.open} open"] if self.open else parts)
 
 
 def robot_log(log: Collected, robot: str) -> RobotLog:

@@ -206,11 +206,20 @@ def robot_note(evaluation: Evaluation) -> str:
     online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
     star = ", * of online ones" if online else ""
     frame = "; positions as aligned with the map" if evaluation.arbitrary_frame else ""
-    return f"a step is one odometry interval; errors of smoothed poses{star}{frame}"
+    words = f"a step is one odometry interval; errors of smoothed poses{star}{frame}"
+    left_out = [
+        f"{name}: {robot.consumption.not_used}"
+        for name, robot in evaluation.robots.items()
+        if robot.consumption.not_used
+    ]
+    more = f"; … and {len(left_out) - NOTED} robots more" if len(left_out) > NOTED else ""
+    return words + "".join(f"; {each}" for each in left_out[:NOTED]) + more
 
 
+NOTED = 5
+"""Most robots whose measurements that were not used are named below the table."""
 ROBOT_HEADINGS = (
-    "robot", "steps", "measure-\nments\nused or\nrejected", "sub-\nmaps", "position\nRMSE [m]",
+    "robot", "steps", "measure-\nments\nused", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
 )  # fmt: skip
 
@@ -219,16 +228,13 @@ def robot_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tupl
     """The cells under ROBOT_HEADINGS; in an arbitrary frame only the aligned errors."""
     used = robot.consumption
     errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
-    measurements = f"all {used.published}"
-    if used.consumed != used.published:
-        measurements = f"{'–' if used.consumed is None else used.consumed}/{used.published}"
     position = None if errors is None else errors.position_rmse_m
     if arbitrary:
         errors, mark, position = None, "", robot.aligned_rmse_m
     return (
         name,
         str(used.steps),
-        measurements,
+        f"{'–' if used.used is None else used.used} of {used.published}",
         str(used.submaps),
         shown(position, ".3f", mark),
         shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),

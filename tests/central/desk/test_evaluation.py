@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from central.desk.compare import compare_picture, compare_rows
 from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
 from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.report.tables import team_rows
+from central.desk.report.tables import robot_note, robot_row, team_rows
 from central.desk.side_by_side import comparison_rows
 from sim.scenarios.scenario import Scenario
 from team.estimation.consistency import chi2_interval, nees, state_error
@@ -556,3 +556,25 @@ def test_landmarks_with_identities_are_matched_by_nothing_else() -> None:
     assert run.map.matching is None
     assert to_json(run)["landmark_matching"] is None
     assert "landmark errors" not in dict(team_rows(run))
+
+
+def test_the_table_tells_used_from_rejected_and_open_measurements() -> None:
+    published = evaluate(world_log(scenario())).robots["r1"].consumption.published
+    ledger = (("in a submap", published - 6), ("rejected: no pose node near it", 3))
+    run = evaluate(world_log(scenario()) + samples([done(published - 3, ledger)]))
+    used = run.robots["r1"].consumption
+    assert (used.used, used.rejected, used.open) == (
+        published - 6, {"no pose node near it": 3}, 3
+    )  # fmt: skip
+    assert robot_row("r1", run.robots["r1"])[2] == f"{published - 6} of {published}"
+    assert robot_note(run).endswith("; r1: 3 rejected (no pose node near it), 3 open")
+    figures = to_json(run)["robots"]["r1"]
+    assert figures["measurements_rejected"] == {"no pose node near it": 3}
+    assert (figures["measurements_used"], figures["measurements_open"]) == (published - 6, 3)
+    every = evaluate(
+        world_log(scenario()) + samples([done(published, (("in a submap", published),))])
+    )
+    assert robot_row("r1", every.robots["r1"])[2] == f"{published} of {published}"
+    assert "rejected" not in robot_note(every)
+    without = evaluate(world_log(scenario()))
+    assert robot_row("r1", without.robots["r1"])[2] == f"– of {published}"
