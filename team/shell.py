@@ -20,9 +20,9 @@ from team.containment import Boundary
 from team.spare_time import SpareTime
 from team.the_end import TheEnd
 from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
-from team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, STATUS, Channel
+from team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, RECORDED, STATUS, Channel
 from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import FusedMap, Liveliness, Message, Status, tag_of
+from team.wire.messages import FusedMap, Liveliness, Message, Status, Tally, tag_of
 
 STATUS_S = 0.5
 """Wall time [s] between two statuses of a node."""
@@ -31,11 +31,11 @@ REMIND_S = 10.0
 WAIT_S = 0.05
 """Time [s] that a shell waits for input before it turns to its other duties."""
 RECORDER_S = 30.0
-"""A process leaves this long [s] after its end, even if the recorder still lacks some of its
-messages."""
+"""Time [s] for which a process that has ended stays for a recorder that is away, or one that has
+reported what it lacks and gets no further."""
 BACK_S = 1.5
 """Time [s] that a recorder which has come back needs to fetch missed messages from the
-publishers' caches."""
+publishers' caches, where nothing else reports what it has."""
 RECORDER = "recorder"
 PARENT = "TEAMSLAM_PARENT"
 """Environment variable: the process whose end ends this one."""
@@ -110,6 +110,9 @@ class Shell:
         """Takes the samples that end the team, which this node has missed."""
         self._recorder_is_there: bool | None = None
         self._recorder_since = 0.0
+        self._totals: Tally | None = None
+        self._lacking: dict[str, int] | None = None
+        self._missing_least = 0
         self._messages = 0
         self._bytes = 0
         self._since = time.monotonic()
@@ -239,28 +242,75 @@ class Shell:
             with suppress(WireError):
                 there = decoded(sample.payload, Liveliness).alive
                 came_back = there and self._recorder_is_there is False
-                self._recorder_since = time.monotonic() if came_back else self._recorder_since
+                if came_back or not there:
+                    self._recorder_since = time.monotonic()
+                    self._lacking = None
                 self._recorder_is_there = there
+        elif sample.key == RECORDED.key(self._name) and self._totals is not None:
+            with suppress(WireError):
+                self._note_recorded(decoded(sample.payload, Tally), self._totals)
+
+    def _note_recorded(self, has: Tally, totals: Tally) -> None:
+        """Note the recorder's report of what it lacks; `_recorder_since` is its last step."""
+        if has.since_ns != totals.since_ns:
+            return
+        published = dict(zip(totals.keys, totals.counts, strict=True))
+        counted = zip(has.keys, has.counts, strict=True)
+        lacking = {key: published.get(key, 0) - count for key, count in counted}
+        missing = sum(lacking.values())
+        if self._lacking is None or missing < self._missing_least:
+            self._recorder_since, self._missing_least = time.monotonic(), missing
+        self._lacking = lacking
 
     def wait_for_recorder(self, lacks: Callable[[], bool], take: Take | None = None) -> None:
-        """Stay, at most RECORDER_S, while a recorder of the run is absent or lacks messages.
+        """Stay until a recorder of the run has reported that it has what this process published.
 
-        Only the publisher can repeat its messages. lacks: whether the recorder says that it lacks
-        some. take: handles what arrives meanwhile; without it only the recorder's messages are
+        Only the publisher can repeat its messages. Without a report a process stays as long as a
+        recorder is there; it leaves where none has been there for RECORDER_S, or where one has got
+        no further for RECORDER_S since its report. lacks: whether the recorder lacks something
+        else. take: handles what arrives meanwhile; without it only the recorder's messages are
         read.
         """
-        deadline = time.monotonic() + RECORDER_S
-        while self._recorder_is_there is not None and not self._stop.is_set():
+        if self._recorder_is_there is None:
+            return
+        self.bus.subscribe(RECORDED, self._name)
+        self._totals = self.bus.publish_totals()
+        now = time.monotonic()
+        away = not self._recorder_is_there
+        self._recorder_since = now if away else max(self._recorder_since, now - BACK_S)
+        due = now + REMIND_S
+        while not self._stop.is_set() and not self._is_recorded(lacks):
             now = time.monotonic()
-            settled = self._recorder_is_there and now - self._recorder_since >= BACK_S
-            if (settled and not lacks()) or now >= deadline:
-                break
+            reports = self._recorder_is_there and self._totals is not None
+            if (
+                self._lacking is not None or not reports
+            ) and now - self._recorder_since >= RECORDER_S:
+                _LOG.warning("the recorder lacks something of this process: %s", self._lacks())
+                return
+            if now >= due:
+                due = now + REMIND_S
+                _LOG.info("waiting for the recorder: %s", self._lacks())
             samples = self.bus.receive(WAIT_S)
             self.note(samples)
             if take is not None:
-                take(samples)
-        if self._recorder_is_there is not None and lacks() and not self._stop.is_set():
-            _LOG.warning("the recorder lacks something of this process")
+                take([sample for sample in samples if sample.key != RECORDED.key(self._name)])
+
+    def _is_recorded(self, lacks: Callable[[], bool]) -> bool:
+        """Whether the recorder has what this process has published."""
+        if not self._recorder_is_there or lacks():
+            return False
+        if self._totals is not None:
+            return self._lacking == {}
+        return time.monotonic() - self._recorder_since >= BACK_S
+
+    def _lacks(self) -> str:
+        """What the recorder lacks, in words."""
+        if not self._recorder_is_there:
+            return "it is away"
+        if not self._lacking:
+            return "it has not reported what it has"
+        missing, keys = sum(self._lacking.values()), list(self._lacking)
+        return f"it lacks {missing} messages on {len(keys)} keys, as {keys[0]}"
 
     def sample_of(self, out: Outgoing) -> Sample:
         """A message to this node itself, as a sample from the bus."""

@@ -5,10 +5,12 @@ import signal
 import threading
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from team import shell
 from team.shell import BACK_S, RECORDER, RECORDER_S, Shell, process
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 
@@ -91,6 +93,42 @@ def test_a_process_stays_while_who_records_may_still_ask_for_something(
     stayed = clock[0] - 100.0
     expected = {"lacks": 4.0, "away": RECORDER_S, "back": 2.0 + BACK_S}
     assert stayed == expected.get(case, 0.0)
+
+
+@pytest.mark.parametrize("case", ["no report", "gets on", "gets no further", "an earlier life's"])
+def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_not(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a report a recorder has not read it yet: that ends nothing."""
+    clock = [100.0]
+    monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
+    network = MemoryNetwork()
+    bus, recorder = Slow(network, clock), MemoryBus(network)
+    key = ch.TRAJECTORY.key("r1")
+    totals = m.Tally(stamp_ns=0, node="central", since_ns=7, keys=(key,), counts=(9,))
+    bus.publish_totals = lambda: totals  # type: ignore[method-assign]
+    recorder.declare_alive(RECORDER)
+    bus.watch_alive(RECORDER)
+    turning = Shell(bus, Waiting(), "central", threading.Event())
+    turning.take(MemoryBus.receive(bus))
+
+    def reports(has: int | None, since_ns: int = 7) -> Callable[[], None]:
+        lacking = {} if has is None else {"keys": (key,), "counts": (has,)}
+        empty = m.Tally(stamp_ns=0, node="central", since_ns=since_ns, keys=(), counts=())
+        said = msgspec.structs.replace(empty, **lacking)
+        return lambda: recorder.publish(Outgoing(ch.RECORDED, "central", said)) and None
+
+    if case == "gets on":
+        bus.at |= {100.0 + 20.0 * k: reports(k) for k in range(9)}
+    if case == "gets no further":
+        bus.at |= {110.0 + k: reports(3) for k in range(100)}
+    bus.at[400.0] = reports(None)
+    if case == "an earlier life's":
+        bus.at[110.0] = reports(None, since_ns=3)
+    turning.wait_for_recorder(lambda: False)
+    stayed = clock[0] - 100.0
+    expected = {"gets on": 160.0 + RECORDER_S, "gets no further": 10.0 + RECORDER_S}
+    assert stayed == expected.get(case, 300.0)
 
 
 def test_who_has_to_deliver_is_ended_by_the_second_signal_only() -> None:

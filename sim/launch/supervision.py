@@ -32,7 +32,8 @@ MEASURE_S = 2.0
 END_DELAY_S = 1.0
 """Time [s] after a process's end within which the final map may still arrive here."""
 LEAVING_S = 60.0
-"""A process that still runs this long [s] after the final map is ended, and named."""
+"""A process that still runs after the final map is ended, and named, when for this long [s] no
+other one has ended and the recorder has received nothing."""
 _NODES = {"router": "router", "world": "world", "central": "central"}
 _WITHOUT_IT_NO_MAP = frozenset(_NODES)
 
@@ -60,7 +61,7 @@ def supervise(
     again.
     """
     silence, memory = Silence(end_silent_s), Memory()
-    over_at: float | None = None
+    leaving: Leaving | None = None
     while True:
         _receive(bus, watch)
         is_final = watch.is_over
@@ -73,8 +74,8 @@ def supervise(
         show(watch)
         if not any(service.is_watched for service in services[1:]):
             return
-        over_at = over_at or (time.monotonic() if is_final else None)
-        if over_at is not None and time.monotonic() - over_at > LEAVING_S:
+        leaving = leaving or (Leaving() if is_final else None)
+        if leaving is not None and leaving.stands_still(services, watch):
             _end_who_stays(services[1:], watch)
             return
 
@@ -125,6 +126,22 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
             ordered(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
 
 
+class Leaving:
+    """The end of a run: processes leave, and the recorder receives what they still have."""
+
+    def __init__(self) -> None:
+        self._reached = (-1, -1.0)
+        self._since_s = 0.0
+
+    def stands_still(self, services: Sequence[Supervised], watch: Watch) -> bool:
+        """Whether nothing has moved for LEAVING_S."""
+        now_s = time.monotonic()
+        reached = sum(not service.is_watched for service in services), watch.progress("recorder")
+        if reached != self._reached:
+            self._reached, self._since_s = reached, now_s
+        return now_s - self._since_s > LEAVING_S
+
+
 def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
     for service in services:
         if service.is_watched:
@@ -132,7 +149,8 @@ def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
             name = f"{service.name} (pid {service.child.pid})"
             stopped = ", since it was stopped" if service.child.is_stopped else ""
             watch.failures.append(
-                f"{name} had not left {LEAVING_S:g} s after the final map{stopped}: it was ended"
+                f"{name} had not left after the final map, and nothing moved for {LEAVING_S:g} s"
+                f"{stopped}: it was ended"
             )
 
 

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 import msgpack
 
+from team.recording.received import Received
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import NO_COUNTER, Sample, opened
@@ -88,18 +89,21 @@ class Inventory:
 
     has_earlier_parts: bool = False
     streams: dict[NumberedStream, Numbered] = field(default_factory=dict)
+    received: Received = field(default_factory=Received, init=False)
     _earlier: set[int] = field(default_factory=set, init=False)
     _contents: set[int] = field(default_factory=set, init=False)
 
     def remember(self, sample: Sample) -> None:
         """Adds a sample of an earlier part of the log, which may be repeated."""
         self._earlier.add(_name(sample))
+        self.received.take(sample)
         self.take(sample)
 
     def is_new(self, sample: Sample) -> bool:
         """Adds a sample; returns False where it is in the log already, or in an earlier part of
         it.
         """
+        self.received.take(sample)
         if self.has_earlier_parts:
             name = _name(sample)
             if name in self._earlier and sample.counter != NO_COUNTER:

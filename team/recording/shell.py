@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 
 import msgspec
 
@@ -13,7 +13,7 @@ from team.recording.last_words import MISSING
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.replayer import schedule
 from team.the_end import TheEnd
-from team.wire.bus import Bus, Outgoing, Sample
+from team.wire.bus import Bus, Outgoing, Sample, opened
 from team.wire.channels import (
     ALIVE,
     CHANNELS,
@@ -25,11 +25,13 @@ from team.wire.channels import (
     MEASUREMENTS,
     ORDER,
     ORDERS,
+    RECORDED,
     RECORDER_PROGRESS,
     SENSORS,
     SENT,
     STATUS,
     SUBMAP,
+    TALLY,
     WORLD_CONFIG,
     channel_of,
     robot_of,
@@ -45,6 +47,7 @@ from team.wire.messages import (
     Progress,
     Status,
     SubmapsRequest,
+    Tally,
 )
 from team.wire.patience import Patience
 
@@ -104,6 +107,7 @@ class RecordLoop:
         self._messages = 0
         self._statuses = 0
         self._dropped = 0
+        self._leaving: dict[str, Tally] = {}
         for channel in CHANNELS:
             if channel.recorded and channel is not ALIVE:
                 bus.subscribe(channel, whole=True)
@@ -136,8 +140,11 @@ class RecordLoop:
         noted = [(each, self._noted(each)) for each in samples if row_of(each.key) is not None]
         self._dropped += len(samples) - len(noted)
         self._write([own for sample, own in noted if self._inventory.is_new(sample)])
-        if self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND:
+        leaving = [tally for each, _ in noted if (tally := self._noted_tally(each)) is not None]
+        if self._is_far_behind:
             return
+        for tally in leaving:
+            self._report_lacking(tally)
         every = PROGRESS_EVERY if samples else 1
         for (robot, incarnation), (measurements, submaps) in self._inventory.counts().items():
             before = self._reported.get((robot, incarnation), (0, 0))
@@ -152,6 +159,27 @@ class RecordLoop:
                 )
                 self._bus.publish(Outgoing(RECORDER_PROGRESS, robot, progress))
                 self._reported[robot, incarnation] = (measurements, submaps)
+
+    @property
+    def _is_far_behind(self) -> bool:
+        return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
+
+    def _noted_tally(self, sample: Sample) -> Tally | None:
+        """Notes the totals of a process that is leaving; None for other samples."""
+        if TALLY.owner(sample.key) is None:
+            return None
+        with suppress(WireError):
+            message = opened(sample)[2]
+            if isinstance(message, Tally):
+                self._leaving[message.node] = message
+                return message
+        return None
+
+    def _report_lacking(self, tally: Tally) -> None:
+        """Reports to a process that is leaving what the log lacks of its messages."""
+        found = self._inventory.received.lacking(tally, self._bus.awaited())
+        has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
+        self._bus.publish(Outgoing(RECORDED, tally.node, has))
 
     def _write(self, samples: list[Sample]) -> None:
         """Writes to the log, if that is possible: the run goes on without it."""
@@ -264,6 +292,8 @@ class RecordLoop:
             _LOG.warning("%.80s: %s", sample.key, error)
             return msgspec.structs.replace(sample, stamp_ns=self._newest_ns)
         (self._alive.add if came else self._alive.discard)(node)
+        if not came:
+            self._leaving.pop(node, None)
         self._missing.discard(node)
         message = Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
         return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
@@ -282,6 +312,8 @@ class RecordLoop:
         """Publishes and logs the recorder's status; returns it. The last one lists what the log
         lacks.
         """
+        for tally in [] if last or self._is_far_behind else self._leaving.values():
+            self._report_lacking(tally)
         waiting = 0 if self._recorder is None else self._recorder.waiting()
         figures = {"messages": float(self._messages), "waiting": float(waiting)}
         dropped = 0 if self._recorder is None else self._recorder.dropped

@@ -33,6 +33,7 @@ from team.wire.messages import (
     Progress,
     SetSummary,
     Status,
+    Tally,
     TeamEnd,
     Verdict,
     Withdrawal,
@@ -148,6 +149,14 @@ class Bus(Protocol):
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
         """Samples that are known to exist and were not received: by key, intervals of a publisher's
         counters.
+        """
+
+    def awaited(self) -> set[str]:
+        """Keys with missing samples that their publisher may still have."""
+
+    def publish_totals(self) -> Tally | None:
+        """Publishes how many samples of each key this process has published; None where nothing can
+        get lost.
         """
 
     def declare_alive(self, node: str) -> None:
@@ -419,6 +428,14 @@ class MemoryBus:
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
         """Nothing is lost in memory: an empty table."""
         return {}
+
+    def awaited(self) -> set[str]:
+        """Nothing is lost in memory: an empty set."""
+        return set()
+
+    def publish_totals(self) -> Tally | None:
+        """Nothing is lost in memory: nothing is published."""
+        return None
 
     def declare_alive(self, node: str) -> None:
         """Holds a token."""

@@ -203,6 +203,9 @@ ALIVE = Channel(name="alive", template="{node}/alive", message=m.Liveliness, rat
 
 TALLY = Channel(name="tally", template="{node}/tally", message=m.Tally, rate="once, at its end", delivery="latest", recorded=True, recomputable=False,
                 meaning="how many messages the node's process has published on each key")  # fmt: skip
+RECORDED = Channel(name="recorded", template="recorder/recorded/{node}", message=m.Tally, rate="1 Hz, once the node's process has ended", delivery="latest",
+                   recorded=False, recomputable=False,
+                   meaning="the keys of the node's tally of which the recorder lacks messages, and how many it has: with none, the process may leave")  # fmt: skip
 
 MEASUREMENTS = Channel(name="readings", template="source/{robot}/readings", message=m.MeasurementsRequest, rate="query", delivery="stream", recorded=False,
                    recomputable=False, meaning="a query; the replies are the measurements")  # fmt: skip

@@ -112,7 +112,7 @@ class ZenohBus:
         """Leaves: publishes what is pending, withdraws the tokens, wakes a waiting receiver."""
         if not self._closed.is_set():
             with suppress(BusError):
-                self._tell_tally()
+                self.publish_totals()
             self._closed.set()
             self._flush()
             self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
@@ -134,22 +134,23 @@ class ZenohBus:
             ):
                 pass
 
-    def _tell_tally(self) -> None:
+    def publish_totals(self) -> Tally | None:
         """Reports to a recorder the number of samples of each key: the last ones may have been
-        lost.
+        lost. None for a process without a token.
         """
-        if self._tokens:
-            node = next(iter(self._tokens))
-            counts = dict(sorted(self._published.items()))
-            keys = tuple(counts)
-            tally = Tally(
-                stamp_ns=self._newest_ns,
-                node=node,
-                since_ns=self._since_ns,
-                keys=keys,
-                counts=tuple(counts.values()),
-            )
-            self.publish(Outgoing(TALLY, node, tally))
+        if not self._tokens:
+            return None
+        node = next(iter(self._tokens))
+        counts = dict(sorted(self._published.items()))
+        tally = Tally(
+            stamp_ns=self._newest_ns,
+            node=node,
+            since_ns=self._since_ns,
+            keys=tuple(counts),
+            counts=tuple(counts.values()),
+        )
+        self.publish(Outgoing(TALLY, node, tally))
+        return tally
 
     def publish(self, out: Outgoing) -> int:
         """Encodes and publishes, stamped with this machine's wall clock; returns the payload's size
@@ -328,6 +329,10 @@ class ZenohBus:
         It includes samples that their publisher no longer has.
         """
         return self._recovery.lacking()
+
+    def awaited(self) -> set[str]:
+        """Keys with missing samples that their publisher may still have."""
+        return self._recovery.awaited()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answers the queries of `channel`, within `receive`; a ValueError's text is sent to the

@@ -231,6 +231,14 @@ class Recovery:
         self._incomplete.clear()
         self._beats.clear()  # so that the next heartbeats are news
 
+    def awaited(self) -> set[str]:
+        """Keys with missing samples that their publisher may still have."""
+        return {
+            key
+            for key, publisher in self._incomplete
+            if self._arrivals[key, publisher].missing is not None
+        }
+
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
         """Samples that are known to exist and were not received: by key, intervals of a publisher's
         counters.

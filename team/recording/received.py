@@ -1,0 +1,73 @@
+"""Counts what a recorder has of each key, separately for each process that publishes on it.
+
+A process counts its publications on a key from 0, so a process that was started again begins anew.
+Consecutive samples are one run; a gap that is filled later is a run of its own.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import NO_COUNTER, Sample
+
+NUMBERED = (*ch.SENSORS, ch.SUBMAP)
+"""Channels whose messages have numbers of their own, which the recorder reports as progress."""
+
+
+@dataclass
+class _Run:
+    """Samples with the counters first … end − 1, whose wall clocks [ns] are first_ns … last_ns."""
+
+    first: int
+    end: int
+    first_ns: int
+    last_ns: int
+
+
+class Received:
+    """The samples of each key that is cached by its publisher, by their counters."""
+
+    def __init__(self) -> None:
+        self._runs: dict[str, list[_Run]] = defaultdict(list)
+
+    def take(self, sample: Sample) -> None:
+        """Note a sample; one that came before changes nothing."""
+        found = ch.channel_of(sample.key)
+        if sample.counter == NO_COUNTER or found is None or not _is_acknowledged(found[0]):
+            return
+        runs, counter, wall_ns = self._runs[sample.key], sample.counter, sample.wall_ns
+        if any(
+            run.first <= counter < run.end and run.first_ns <= wall_ns <= run.last_ns
+            for run in runs
+        ):
+            return
+        if runs and runs[-1].end == counter and runs[-1].last_ns <= wall_ns:
+            runs[-1].end, runs[-1].last_ns = counter + 1, wall_ns
+        else:
+            runs.append(_Run(counter, counter + 1, wall_ns, wall_ns))
+
+    def of_process(self, key: str, since_ns: int) -> tuple[int, int]:
+        """The number of samples on a key of the process that began then, and its next counter."""
+        runs = [run for run in self._runs.get(key, ()) if run.first_ns >= since_ns]
+        return sum(run.end - run.first for run in runs), max((run.end for run in runs), default=0)
+
+    def lacking(self, tally: m.Tally, awaited: set[str]) -> dict[str, int]:
+        """The keys of a process of which samples are lacking, each with the number that is there.
+
+        awaited: keys with samples that their publisher may still have. Of the others the newest one
+        is enough: what came before it is gone.
+        """
+        found = {}
+        for key, count in zip(tally.keys, tally.counts, strict=True):
+            row = ch.channel_of(key)
+            if row is None or not _is_acknowledged(row[0]):
+                continue
+            number, end = self.of_process(key, tally.since_ns)
+            if number < count and (end < count or key in awaited):
+                found[key] = number
+        return found
+
+
+def _is_acknowledged(channel: ch.Channel) -> bool:
+    return channel.recorded and channel.delivery != "stream" and channel not in NUMBERED
