@@ -12,7 +12,6 @@ from central.config import CentralConfig
 from central.fused import JOINT_LANDMARKS, version_entry
 from central.monitor import miscalibrations
 from central.rule import Tail
-from central.sent_priors import SentPriors
 from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
@@ -66,7 +65,7 @@ def team_map(
         stamp_ns=fold.contributions[-1].end_ns if fold.contributions else 0,
         rule="join",
         digest=digest,
-        frame="" if frame is None else f"{frame[0]}/{frame[1]}",
+        frame="" if frame is None else translate.frame_name(*frame),
         final=tail == "final",
         provisional=tail == "provisional",
         exchange=0,
@@ -199,33 +198,57 @@ def _listed(names: Sequence[str], most: int) -> str:
 
 
 def priors(
-    fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: SentPriors | Collection[str]
+    fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: Collection[Stream]
 ) -> list[Outgoing]:
-    """The prior of the latest stream of every robot in the team's frame for which it has new
-    information by what was sent, or which is named.
+    """The priors of these streams with a map: of those in the team's map their estimate in its
+    frame, of the others a message that withdraws the priors before it.
+
+    With the final map robots need no estimate any more: those named are withdrawn.
     """
-    if not fold.contributions:
-        return []
-    latest: dict[str, int] = {}
-    for robot, incarnation in fold.home:
-        latest[robot] = max(latest.get(robot, 0), incarnation)
-    streams = [s for s in sorted(fold.main.graph.streams) if s[1] == latest[s[0]]]
-    if isinstance(requested, SentPriors):
-        streams = requested.worth(fold, streams, shown)
-    else:
-        streams = [each for each in streams if each[0] in requested]
-    if not streams:
-        return []
-    found = marginals.main_priors(fold, streams, PRIOR_LANDMARKS, shown)
-    stamp_ns = fold.contributions[-1].end_ns
+    given = [] if fused.final else [s for s in sorted(requested) if in_main_island(fold, s)]
+    found = marginals.main_priors(fold, given, PRIOR_LANDMARKS, shown) if given else {}
     out = []
-    for stream, prior in found.items():
-        sequence = fold.next_sequence(stream) - 1
-        message = translate.prior_message(
-            stamp_ns, *stream, sequence, fused.digest, prior, fused.members, fused.heard
-        )
+    for stream in sorted(requested):
+        if stream in found:
+            message = translate.prior_message(
+                fused.stamp_ns,
+                *stream,
+                fold.next_sequence(stream) - 1,
+                fused.digest,
+                found[stream],
+                frame=fused.frame,
+                members=fused.members,
+                received=fused.heard,
+                withdrawn=len(fused.withdrawn),
+            )
+        else:
+            message = _withdrawn_prior(stream, fused)
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
+
+
+def in_main_island(fold: Fold, stream: Stream) -> bool:
+    """Whether the stream has submaps in the team's map."""
+    return stream in fold.home and fold.home[stream] == fold.main_key
+
+
+def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
+    """The message that the priors of a stream that came before this map are void."""
+    return m.Prior(
+        stamp_ns=fused.stamp_ns,
+        robot=stream[0],
+        incarnation=stream[1],
+        sequence=-1,
+        digest=fused.digest,
+        ids=b"",
+        mean=b"",
+        covariance=b"",
+        members=fused.members,
+        heard=fused.heard,
+        withdrawn=len(fused.withdrawn),
+        frame=translate.frame_name(*stream),
+        in_team_frame=False,
+    )
 
 
 def trajectories(

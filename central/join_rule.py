@@ -1,6 +1,6 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from central.config import CentralConfig
 from central.fused import receivable
@@ -22,6 +22,7 @@ from team.estimation.contribution import Stream
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.joining import Fold
 from team.wire import channels as ch
+from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded, unsound
 from team.wire.digest import digest_of
@@ -145,12 +146,29 @@ class JoinRule(FusionRule[SubmapInputs]):
         )
         self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)
+        requested = self._requested(inputs, fold, fused, shown.ids)
+        of_robots = self._sound(priors(fold, shown.ids, fused, requested))
         if final:
-            with_it = self._sound(trajectories(fold, digest, inputs.submaps))
-            return [*with_it, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
-        requested = inputs.priors_of if inputs.recorded else self._sent_priors
-        with_it = self._sound(priors(fold, shown.ids, fused, requested))
-        return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *with_it]
+            paths = self._sound(trajectories(fold, digest, inputs.submaps))
+            return [*of_robots, *paths, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
+        return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *of_robots]
+
+    def _requested(
+        self, inputs: SubmapInputs, fold: Fold, fused: m.FusedMap, shown: Sequence[int]
+    ) -> Collection[Stream]:
+        """The streams whose priors go out with a map: of each robot the latest one, if there is
+        news for it.
+        """
+        if inputs.recorded:
+            return inputs.priors_of
+        gone = {s for s, chain in inputs.submaps.items() if chain and s[0] in fused.withdrawn}
+        latest: dict[str, int] = {}
+        for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | gone:
+            latest[robot] = max(latest.get(robot, 0), incarnation)
+        streams = sorted(latest.items())
+        if fused.final:
+            return self._sent_priors.void(fold, streams)
+        return self._sent_priors.worth(fold, streams, shown)
 
     def _sound(self, out: Sequence[Outgoing]) -> list[Outgoing]:
         """The messages that every receiver accepts; others are withheld and named."""

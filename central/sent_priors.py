@@ -1,12 +1,15 @@
 """Decides which priors a robot needs: those with information that it can not have by itself.
 
+A robot that leaves the team's map, or was never in it, gets one message that withdraws its earlier
+priors; a restarted centre, which has sent none, sends it, too.
+
 A robot joins its last prior with its own later submaps, so a new prior is worth its bytes only for
 information from teammates (landmarks that have moved, inter-robot measurements), or for landmarks
 that it comes near to. Priors are most of the centre's traffic; in a map that does not change, most
 of them contain nothing new.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +31,8 @@ SURER = 0.8
 """… or their variance has fallen to this share."""
 NEVER = -1
 """Before all team time: there is no inter-robot measurement."""
+NOWHERE: Stream = ("", 0)
+"""The island of a stream without submaps."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +40,14 @@ class _Sent:
     """The map of a robot's last prior and the landmarks in it.
 
     encounter_ns: team time of the newest inter-robot measurement of the robot or by it. since: the
-    number of broadcasts since.
+    number of broadcasts since. frame: the team's, at that time.
     """
 
     blocks: LandmarkBlocks
     ids: UInt32[np.ndarray, " L"]
     encounter_ns: int
     since: int
+    frame: Stream | None = None
 
 
 class SentPriors:
@@ -49,16 +55,44 @@ class SentPriors:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._sent: dict[Stream, _Sent] = {}
+        self._sent: dict[Stream, _Sent | None] = {}
+        """None: the stream's priors are withdrawn."""
 
     def worth(self, fold: Fold, streams: Sequence[Stream], shown: Sequence[int]) -> list[Stream]:
-        """The streams to which a prior of this fold with these landmarks is to be sent."""
+        """Those of these streams to which a prior of this fold with these landmarks is to be sent.
+
+        It withdraws the earlier priors of those that are not in the team's map.
+        """
+        inside = [each for each in streams if fold.home.get(each, NOWHERE) == fold.main_key]
+        out = self._withdrawn({*streams} - {*inside})
+        if not inside:
+            return out
         blocks, newest = landmark_blocks(fold, shown), _newest_encounters(fold)
-        return [
+        return out + [
             each
-            for each in streams
-            if self.is_worth(each, last_pose(fold, each), blocks, newest.get(each[0], NEVER))
+            for each in inside
+            if self.is_worth(
+                each, last_pose(fold, each), blocks, newest.get(each[0], NEVER), fold.frame
+            )
         ]
+
+    def void(self, fold: Fold, streams: Sequence[Stream]) -> list[Stream]:
+        """Those of these streams whose last prior is not in the frame of the final map, or which
+        are not in that map.
+        """
+        outside = []
+        for stream in streams:
+            old = self._sent.get(stream)
+            elsewhere = old is not None and old.frame != fold.frame
+            if elsewhere or fold.home.get(stream, NOWHERE) != fold.main_key:
+                outside.append(stream)
+        return self._withdrawn(outside)
+
+    def _withdrawn(self, streams: Iterable[Stream]) -> list[Stream]:
+        """Those of the streams that were not withdrawn before; they are noted as such."""
+        new = [s for s in sorted(streams) if s not in self._sent or self._sent[s] is not None]
+        self._sent |= dict.fromkeys(new)
+        return new
 
     def is_worth(
         self,
@@ -66,6 +100,7 @@ class SentPriors:
         pose: Float[np.ndarray, "3"],
         blocks: LandmarkBlocks,
         encounter_ns: int = NEVER,
+        frame: Stream | None = None,
     ) -> bool:
         """Whether to send a prior at this pose in this map; if so, it is noted as sent.
 
@@ -77,11 +112,12 @@ class SentPriors:
         if (
             old is None
             or old.since + 1 >= EVERY
+            or old.frame != frame
             or encounter_ns > old.encounter_ns
             or _has_changed(old, blocks, nearest[:NEEDED])
         ):
             ids = np.sort(blocks.ids[nearest[: self._most]])
-            self._sent[stream] = _Sent(blocks, ids, encounter_ns, 0)
+            self._sent[stream] = _Sent(blocks, ids, encounter_ns, 0, frame)
             return True
         self._sent[stream] = replace(old, since=old.since + 1)
         return False

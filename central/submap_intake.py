@@ -28,7 +28,8 @@ class SubmapInputs(Inputs):
     from a submap. reached: the stream of each submap, in the order in which they came; none where
     that is not known. withdrawn: robots withdrawn by an order. verdicts: an operator's on unnamed
     landmarks. missing: what streams wait for. arrived: number of submaps, orders and verdicts that
-    have arrived, to compare maps by. priors_of: the robots whose priors are recorded with the map.
+    have arrived, to compare maps by. priors_of: the streams whose priors are recorded with the
+    map.
     """
 
     starts: Mapping[Stream, m.InitialPose] = field(default_factory=dict)
@@ -39,7 +40,7 @@ class SubmapInputs(Inputs):
     verdicts: Collection[Verdict] = ()
     missing: tuple[m.VersionEntry, ...] = ()
     arrived: int = 0
-    priors_of: Collection[str] = ()
+    priors_of: Collection[Stream] = ()
 
 
 class SubmapIntake(Intake[SubmapInputs]):

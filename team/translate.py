@@ -29,6 +29,11 @@ from team.wire.arrays import (
 from team.wire.codec import unsound
 
 
+def frame_name(robot: str, incarnation: int) -> str:
+    """The name of the frame that the start of this stream fixes."""
+    return f"{robot}/{incarnation}"
+
+
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
     """The initial pose and its covariance; pose None: unknown; covariance None: exactly known."""
     pose = floats(message.pose, "pose").copy() if message.pose else None
@@ -242,8 +247,14 @@ def pose_message(
     digest: bytes,
     pose: Float[np.ndarray, "3"],
     covariance: Float[np.ndarray, "3 3"],
+    *,
+    frame: str,
+    in_team_frame: bool,
 ) -> m.PoseEstimate:
-    """The message of a pose with its covariance, which is made exactly symmetric."""
+    """The message of a pose with its covariance, which is made exactly symmetric.
+
+    frame: named as in `FusedMap.frame`; in_team_frame: whether it is the team's.
+    """
     rows = covariance.tolist()  # so few numbers are added sooner one by one
     symmetric = [0.5 * (rows[i][j] + rows[j][i]) for i in range(3) for j in range(3)]
     return m.PoseEstimate(
@@ -254,6 +265,8 @@ def pose_message(
         map_digest=digest,
         pose=from_numbers(pose.tolist()),
         covariance=from_numbers(symmetric),
+        frame=frame,
+        in_team_frame=in_team_frame,
     )
 
 
@@ -363,11 +376,14 @@ def prior_message(
     sequence: int,
     digest: bytes,
     prior: RobotPrior,
+    *,
+    frame: str,
     members: Sequence[m.VersionEntry] = (),
     received: int = 0,
+    withdrawn: int = 0,
 ) -> m.Prior:
     """The message of a robot's prior: the joint marginal of its last fused end pose and the
-    landmarks, with the members of the set that it contains.
+    landmarks in the team's frame, with the members of the set that it contains.
     """
     return m.Prior(
         stamp_ns=stamp_ns,
@@ -387,6 +403,9 @@ def prior_message(
         ),
         members=tuple(members),
         heard=received,
+        withdrawn=withdrawn,
+        frame=frame,
+        in_team_frame=True,
     )
 
 

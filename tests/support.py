@@ -380,6 +380,8 @@ def examples() -> Iterator[m.Message]:
         map_digest=digest,
         pose=three,
         covariance=from_floats(spd(3)),
+        frame="bravo/1",
+        in_team_frame=False,
     )
     yield m.ParticleCloud(
         stamp_ns=9_000,
@@ -465,6 +467,9 @@ def examples() -> Iterator[m.Message]:
         ),
         members=(member,),
         heard=9,
+        withdrawn=1,
+        frame="bravo/1",
+        in_team_frame=True,
     )
     yield m.Trajectory(
         stamp_ns=9_000,

@@ -93,7 +93,7 @@ def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
     local = local_map(ids, seed)
     shared = SubmapCorrection(2.5, (("bearing", 0.01, 0.001), ("range_scale", -0.02, 0.003)))
     prior = RobotPrior(local.end_pose, local.ids, local.landmarks, local.covariance, shared)
-    there = over_the_wire(translate.prior_message(7, "r1", 1, 3, b"its name", prior))
+    there = over_the_wire(translate.prior_message(7, "r1", 1, 3, b"its name", prior, frame="r1/1"))
     found = translate.prior_of(there)
     for value, expected in zip(found[:-1], prior[:-1], strict=True):
         assert value.tobytes() == np.ascontiguousarray(expected).tobytes()
@@ -166,7 +166,9 @@ def test_a_map_without_landmarks_has_an_empty_covariance():
 def test_a_pose_passes_the_door_although_rounding_made_it_skew():
     covariance = np.diag([1.0, 2.0, 3.0])
     covariance[0, 1] = 1e-17
-    message = translate.pose_message(1, "r1", 1, 2, NO_MAP, np.zeros(3), covariance)
+    message = translate.pose_message(
+        1, "r1", 1, 2, NO_MAP, np.zeros(3), covariance, frame="r1/1", in_team_frame=False
+    )
     assert over_the_wire(message) == message
 
 

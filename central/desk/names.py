@@ -3,6 +3,8 @@
 import re
 from collections.abc import Iterable, Iterator
 
+OUTSIDE = "not in the team's frame"
+"""In place of the error of a robot's poses that are not in the frame of the team's map."""
 _DIGITS = re.compile("([0-9]+)")
 _NOT_JOINED = " not joined: "
 _FIRST_LIFE = " (incarnation 1)"

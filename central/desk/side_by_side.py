@@ -17,7 +17,7 @@ from central.desk.drawing import (
     landmark_blocks,
 )
 from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
-from central.desk.names import in_order
+from central.desk.names import OUTSIDE, in_order
 from central.desk.pictures.style import save
 
 if TYPE_CHECKING:
@@ -121,6 +121,8 @@ def _messages(evaluation: Evaluation, key: str) -> int:
 
 
 def _online(robot: RobotResult | None) -> str:
+    if robot is not None and robot.outside:
+        return OUTSIDE
     errors = None if robot is None else robot.online
     return _shown(None if errors is None else errors.position_rmse_m, ".4f")
 

@@ -1,13 +1,18 @@
 """Compares a running team's poses and map with the truth as they arrive.
 
 It computes `central.desk.evaluation`'s figures of what has arrived so far; without truth it stays
-empty.
+empty. Poses and maps in a frame that no known initial pose fixes are not compared.
 """
 
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from central.desk.evaluation.running import NeesTally, RunningErrors, TrueLandmarks
+from central.desk.evaluation.running import (
+    NeesTally,
+    RunningErrors,
+    TrueLandmarks,
+    TruthFrames,
+)
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
@@ -21,6 +26,12 @@ class _Robot:
     tally: NeesTally = field(default_factory=NeesTally)
     errors: RunningErrors = field(default_factory=lambda: RunningErrors(EVERY_NS))
     given_map: bool = False
+    team_ns: int = -1
+
+    def begin_again(self, *, given_map: bool) -> None:
+        """Forget poses and errors: those that follow are of another kind, or in another frame."""
+        self.given_map, self.tally = given_map, NeesTally()
+        self.errors.forget_poses()
 
     def judge(self) -> None:
         """Compare every pose up to the newest truth; forgets truth that no later pose needs."""
@@ -40,8 +51,10 @@ class LiveErrors:
     landmarks: NeesTally = field(default_factory=NeesTally)
     _robots: dict[str, _Robot] = field(default_factory=dict)
     _truth: TrueLandmarks = field(default_factory=TrueLandmarks)
+    _frames: TruthFrames = field(default_factory=TruthFrames)
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.START,
         ch.TRUTH,
         ch.TRUTH_LANDMARKS,
         ch.OWN_POSE,
@@ -59,6 +72,11 @@ class LiveErrors:
         if channel not in (ch.OWN_POSE, ch.TEAM_POSE):
             return True
         known = self._robot(robot)
+        if channel is ch.TEAM_POSE:
+            is_again = sample.stamp_ns <= known.team_ns  # it may withdraw the pose of this time
+            known.team_ns = sample.stamp_ns
+            if is_again:
+                return True
         if known.given_map != (channel is ch.TEAM_POSE):
             return channel is ch.TEAM_POSE  # the first one given the map replaces the others
         return known.errors.is_due(sample.stamp_ns)
@@ -66,8 +84,10 @@ class LiveErrors:
     def take(self, channel: ch.Channel, message: m.Message) -> None:
         """Take one message of any channel; those of other channels are ignored."""
         match message:
+            case m.InitialPose():
+                self._frames.take(message)
             case m.PoseEstimate():
-                self._take_pose(message, given_map=channel is ch.TEAM_POSE)
+                self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
                 robot = self._robot(message.robot)
                 robot.errors.take_truth(message)
@@ -82,16 +102,17 @@ class LiveErrors:
     def _robot(self, name: str) -> _Robot:
         return self._robots.setdefault(name, _Robot())
 
-    def _take_pose(self, message: m.PoseEstimate, *, given_map: bool) -> None:
+    def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         robot = self._robot(message.robot)
-        if given_map and not robot.given_map:
-            robot.given_map, robot.tally = True, NeesTally()
-            robot.errors.forget_poses()
-        robot.errors.take_pose(message)
+        given_map = by_team and message.in_team_frame
+        if by_team and given_map != robot.given_map:
+            robot.begin_again(given_map=given_map)
+        if by_team == given_map and self._frames.has(message.frame):
+            robot.errors.take_pose(message)
         robot.judge()
 
     def _take_map(self, fused: m.FusedMap) -> None:
         """Take a map in place of the one before."""
         self.landmarks = NeesTally()
-        if (fit := self._truth.fit(fused)) is not None:
+        if self._frames.has(fused.frame) and (fit := self._truth.fit(fused)) is not None:
             self.landmarks.take(fit.nees, 2)

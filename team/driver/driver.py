@@ -290,7 +290,11 @@ class Driver:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """(t, (x, y, theta)) of the robot in the team's frame, as last published by its process."""
+        """(t, (x, y, theta)) of the robot in the team's frame, as last published by its process.
+
+        None while the robot is not in the team's map: before it is joined, and once it has left
+        again, so that its pose in the team's frame is not known.
+        """
         return self._node.team_pose
 
     @property

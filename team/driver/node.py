@@ -271,8 +271,10 @@ class SourceNode:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """Time [s] and pose of the robot in the team's frame, as it last published them."""
-        if self.pose is None:
+        """Time [s] and pose of the robot in the team's frame, as it last published them; None
+        while it is not in the team's map.
+        """
+        if self.pose is None or not self.pose.in_team_frame:
             return None
         x, y, theta = (float(v) for v in floats(self.pose.pose, "pose"))
         return 1e-9 * self.pose.stamp_ns, (x, y, theta)

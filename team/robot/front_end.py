@@ -69,6 +69,7 @@ class BoundedEstimator:
         self._aside = 0
         self.submaps: list[LocalMap] = []
         self.gated = 0
+        self.started = False
 
     @property
     def waits(self) -> bool:
@@ -99,7 +100,9 @@ class BoundedEstimator:
         self.submaps = []
 
     def _begin_from(self, start: m.InitialPose) -> None:
-        self._begin_estimator(start.incarnation, self._believed(start))
+        initial = self._believed(start)
+        self.started = initial.pose is not None
+        self._begin_estimator(start.incarnation, initial)
         self._goes_in(start)
 
     def _believed(self, start: m.InitialPose) -> InitialPose:

@@ -317,7 +317,7 @@ class RobotNode:
             case m.Measurement():
                 self._inbox.put(message)
             case m.Prior():
-                self._poses.take(message)
+                return self._poses.take(message)
             case m.KnownMap():
                 self._front.know(message)
             case m.FusedMap() if message.final:
@@ -481,7 +481,8 @@ class RobotNode:
 
     @property
     def _writer(self) -> MessageWriter:
-        return MessageWriter(self.robot, self._incarnation, self._announcement.digest)
+        digest = self._announcement.digest
+        return MessageWriter(self.robot, self._incarnation, digest, self._front.started)
 
     def _progress(self) -> Outgoing:
         self._pace.unreported = 0

@@ -1,7 +1,14 @@
-"""Publishes a robot's running poses: by its own measurements, and given the team's map."""
+"""Publishes a robot's running poses: by its own measurements, and given the team's map.
+
+A pose on team/pose is in the team's frame as long as the newest prior is in the frame that the pose
+names. When a newer prior is in another frame, or withdraws the robot's, the own pose goes out on
+team/pose: it is not in the team's frame, and takes the place of the pose before it for every
+receiver, late joiners included.
+"""
 
 import math
 
+import msgspec
 import numpy as np
 
 from team.config import RobotConfig
@@ -14,14 +21,13 @@ from team.robot.team_map import TeamMap
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
-from team.wire.digest import NO_MAP
 from team.wire.newer import is_newer_prior
 
 
 class RunningPoses:
     """Publishes poses every `pose_s`.
 
-    sigma_m: standard deviation of the last pose in the team's frame; 0 before there is one.
+    sigma_m: standard deviation of the last pose in the team's frame; 0 where there is none.
     """
 
     def __init__(self, config: RobotConfig, warnings: list[str]) -> None:
@@ -30,28 +36,53 @@ class RunningPoses:
         self._warnings = warnings
         self._prior: m.Prior | None = None
         self._posed_ns: int | None = None
+        self._own: Outgoing | None = None
+        self._claimed: str | None = None
+        """The team's frame by this process's last message on team/pose; None: it was not in it."""
+        self._is_first = True
+        """No message on team/pose is this process's; there may be one of an earlier process."""
         self.team_map = TeamMap()
         self.sigma_m = 0.0
 
-    def take(self, prior: m.Prior) -> None:
-        """Take a prior from the team's map; the newest one is used."""
+    def take(self, prior: m.Prior) -> list[Outgoing]:
+        """Take a prior from the team's map; the newest one is used.
+
+        Returns the message that withdraws the last pose, if that was in another frame.
+        """
         if not is_newer_prior(prior, self._prior):
-            return
-        whole = self.team_map.decoded(prior).whole
-        why = prior_beyond(whole.mean, whole.covariance, self._bounds)
-        if why is None:
-            self._prior = prior
+            return []
+        if prior.in_team_frame:
+            whole = self.team_map.decoded(prior).whole
+            why = prior_beyond(whole.mean, whole.covariance, self._bounds)
+            if why is not None:
+                self._warnings.append(f"the team's map is refused: {why}")
+                return []
+        self._prior = prior
+        return self._withdrawn_pose()
+
+    def _withdrawn_pose(self) -> list[Outgoing]:
+        """The own pose on team/pose, if the last pose there was in another frame than the prior."""
+        prior = self._prior
+        if prior is None:
+            return []
+        if not prior.in_team_frame:
+            self.sigma_m = 0.0
+            withdraws = self._is_first or self._claimed is not None
         else:
-            self._warnings.append(f"the team's map is refused: {why}")
+            withdraws = self._claimed not in {None, prior.frame}
+        if not withdraws or self._own is None:
+            return []
+        self._claimed, self._is_first = None, False
+        return [outside_team_frame(self._own)]
 
     @property
     def has_prior(self) -> bool:
-        """Whether a prior has arrived."""
-        return self._prior is not None
+        """Whether the robot is in the team's map by the newest prior."""
+        return self._prior is not None and self._prior.in_team_frame
 
     def prior_of(self, incarnation: int) -> m.Prior | None:
         """The prior with a pose of this incarnation; None where there is none."""
-        prior = self._prior
+        prior = self._prior if self.has_prior else None
         return prior if prior is not None and prior.incarnation == incarnation else None
 
     def begin_incarnation(self, incarnation: int) -> None:
@@ -64,7 +95,14 @@ class RunningPoses:
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
-        return self.posed(stamp_ns, self.prior_of(writer.incarnation), front, writer)
+        prior = self.prior_of(writer.incarnation)
+        out = self.posed(stamp_ns, prior, front, writer)
+        self._own = out[0]
+        if len(out) == 1:
+            return [*out, *self._withdrawn_pose()]
+        assert prior is not None
+        self._claimed, self._is_first = prior.frame, False
+        return out
 
     def posed(
         self,
@@ -75,8 +113,7 @@ class RunningPoses:
     ) -> list[Outgoing]:
         """The message of the own pose and, given a prior, of the pose in the team's map."""
         sequence = front.estimator.sequence
-        own = front.estimator.own_pose()
-        out = [writer.pose(ch.OWN_POSE, stamp_ns, sequence, NO_MAP, own)]
+        out = [writer.own_pose(stamp_ns, sequence, front.estimator.own_pose())]
         if prior is None:
             return out
         try:
@@ -86,4 +123,11 @@ class RunningPoses:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out
         self.sigma_m = math.sqrt(max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0))
-        return [*out, writer.pose(ch.TEAM_POSE, stamp_ns, sequence, prior.digest, posed)]
+        return [*out, writer.team_pose(stamp_ns, sequence, prior, posed)]
+
+
+def outside_team_frame(own: Outgoing) -> Outgoing:
+    """The own pose as the message on team/pose that withdraws the poses before it."""
+    assert isinstance(own.message, m.PoseEstimate)
+    message = msgspec.structs.replace(own.message, in_team_frame=False)
+    return Outgoing(ch.TEAM_POSE, own.name, message)

@@ -4,11 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from jaxtyping import Float
-
 from team import translate
-from team.estimation.gaussian import LandmarkGaussian
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
@@ -19,15 +16,20 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
+from team.wire.digest import NO_MAP
 
 
 @dataclass(frozen=True)
 class MessageWriter:
-    """Writes the messages of one incarnation under an announced configuration (its digest)."""
+    """Writes the messages of one incarnation under an announced configuration (its digest).
+
+    started: whether its initial pose is known.
+    """
 
     robot: str
     incarnation: int
     config: bytes
+    started: bool
 
     def submap(self, closed: ClosedWindow) -> Outgoing:
         """The window's Gaussian with the names of its inputs."""
@@ -110,16 +112,32 @@ class MessageWriter:
         )
         return Outgoing(ch.OWN_MAP, self.robot, message)
 
-    def pose(
-        self,
-        channel: ch.Channel,
-        stamp_ns: int,
-        sequence: int,
-        digest: bytes,
-        pose: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
-    ) -> Outgoing:
-        """A running pose; `digest` names the fused map in it."""
+    def own_pose(self, stamp_ns: int, sequence: int, pose: PoseGaussian) -> Outgoing:
+        """A running pose by own measurements alone, in the frame of the stream's start."""
         message = translate.pose_message(
-            stamp_ns, self.robot, self.incarnation, sequence, digest, *pose
+            stamp_ns,
+            self.robot,
+            self.incarnation,
+            sequence,
+            NO_MAP,
+            *pose,
+            frame=translate.frame_name(self.robot, self.incarnation),
+            in_team_frame=self.started,
         )
-        return Outgoing(channel, self.robot, message)
+        return Outgoing(ch.OWN_POSE, self.robot, message)
+
+    def team_pose(
+        self, stamp_ns: int, sequence: int, prior: m.Prior, pose: PoseGaussian
+    ) -> Outgoing:
+        """A running pose given the team's map, in the frame of the prior."""
+        message = translate.pose_message(
+            stamp_ns,
+            self.robot,
+            self.incarnation,
+            sequence,
+            prior.digest,
+            *pose,
+            frame=prior.frame,
+            in_team_frame=True,
+        )
+        return Outgoing(ch.TEAM_POSE, self.robot, message)

@@ -10,25 +10,27 @@ from collections.abc import Sequence
 
 from team.wire import messages as m
 
-SetOrder = tuple[int, int, tuple[tuple[str, int, int], ...]]
+SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
 
 
-def set_order(received: int, members: Sequence[m.VersionEntry]) -> SetOrder:
-    """Sort key of a set: first the number of submaps that the centre had received, then the set's
-    size.
+def set_order(received: int, withdrawn: int, members: Sequence[m.VersionEntry]) -> SetOrder:
+    """Sort key of a set: first the number of submaps that the centre had received, then the number
+    of withdrawn robots, then the set's size.
 
-    The number of received submaps only grows, whichever robots are withdrawn or reinstated; of sets
-    with the same number the larger one contains the other.
+    The number of received submaps only grows, whichever robots are withdrawn or reinstated. With
+    the same submaps the fold may still withdraw a robot, as further ticks close, but reinstates
+    none; of sets with equal numbers the larger one contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
-    return received, sum(each.sequence + 1 for each in members), vector
+    return received, withdrawn, sum(each.sequence + 1 for each in members), vector
 
 
 def is_newer_prior(new: m.Prior, known: m.Prior | None) -> bool:
     """Compares incarnation, then set, then the robot's own number of submaps in the set."""
 
     def order(prior: m.Prior) -> tuple[int, SetOrder, int]:
-        return prior.incarnation, set_order(prior.heard, prior.members), prior.sequence
+        members = set_order(prior.heard, prior.withdrawn, prior.members)
+        return prior.incarnation, members, prior.sequence
 
     return known is None or order(new) > order(known)
 
@@ -39,7 +41,7 @@ def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
     """
 
     def order(fused: m.FusedMap) -> tuple[bool, int, SetOrder, bool]:
-        members = set_order(fused.heard, fused.members)
+        members = set_order(fused.heard, len(fused.withdrawn), fused.members)
         return fused.final, fused.exchange, members, not fused.provisional
 
     return known is None or order(new) > order(known)

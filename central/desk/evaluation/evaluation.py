@@ -36,6 +36,7 @@ from central.desk.evaluation.log import Collected, Traffic, collected
 from central.desk.evaluation.matching import Matching, nearest
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
+from central.desk.evaluation.running import TruthFrames
 from central.desk.evaluation.verdicts import verdicts_given
 from central.desk.names import in_order, not_joined
 from central.team_config import TeamConfig, team_config
@@ -103,7 +104,8 @@ class RobotResult:
     alone where it never had that. aligned_rmse_m, online_aligned_rmse_m: of the smoothed and of the
     online positions after the rigid motion that aligns the map (`alignment`: "map"), or where no
     true landmark is known the smoothed paths of all robots ("paths"), or where there is no map the
-    robot's own ("trajectory"). own_map: of the robot's last own map, as it lies.
+    robot's own ("trajectory"). own_map: of the robot's last own map, as it lies. outside: its
+    running poses are not in the team's frame; it has no online path then.
     """
 
     consumption: Consumption
@@ -119,6 +121,7 @@ class RobotResult:
     alignment: str | None
     online_aligned_rmse_m: float | None
     own_map: MapErrors | None = None
+    outside: bool = False
 
     @property
     def uplink_bytes_per_step(self) -> float | None:
@@ -133,9 +136,9 @@ class Evaluation:
 
     true_landmarks: all of them, measured or not. notes: the world's remarks on its data, and
     messages set aside. faults: number of messages set aside. unsound: number of invalid samples.
-    arbitrary_frame: no robot knew its initial pose, so the map's frame is not the truth's, and only
-    aligned errors are meaningful. decisions: closures and merges by landmarks without identities,
-    from the final map. verdicts: an operator's on such landmarks, in words.
+    arbitrary_frame: the map contains no robot with a known initial pose, so its frame is not the
+    truth's, and only aligned errors are meaningful. decisions: closures and merges by landmarks
+    without identities, from the final map. verdicts: an operator's on such landmarks, in words.
     """
 
     scenario: TeamConfig | None
@@ -174,11 +177,24 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     )
     association = association_result(log)
     label_of = {} if association is None else association.label_of
-    logs = {robot: robot_log(log, robot) for robot in log.robots}
-    arbitrary_frame = _is_arbitrary(log)
-    truth_from_map = _motion(logs.values()) if arbitrary_frame else np.zeros(3)
-    fused = _map_result(log, ids, positions, label_of, truth_from_map)
+    final = log.sound(log.last(ch.FINAL_MAP))
+    message = final if isinstance(final, m.FusedMap) else None
     uplink = None if scenario is None else _uplink(scenario)
+    frames = _frames(log)
+    arbitrary = _is_arbitrary(frames, message)
+
+    def is_in_frame(frame: str) -> bool:
+        if not arbitrary:
+            return frames.has(frame)
+        return message is None or not message.ids or frame in {"", message.frame}
+
+    logs = {robot: robot_log(log, robot, is_in_frame) for robot in log.robots}
+    truth_from_map = _motion(logs.values()) if arbitrary else np.zeros(3)
+    fused = (
+        None
+        if message is None
+        else _map_result(log, message, ids, positions, label_of, truth_from_map)
+    )
     motion = _team_motion(fused, logs.values())
     robots = {
         robot: _robot_result(
@@ -209,26 +225,29 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         cost_by_robot=_by_robot(log, "joint_cost_per_dof."),
         faults=len(faults),
         scale_by_robot=_by_robot(log, "covariance_scale."),
-        arbitrary_frame=arbitrary_frame,
+        arbitrary_frame=arbitrary,
         peers=peer_results(log),
         disagreement=log.disagreement,
         association=association,
-        decisions=_decisions(log),
+        decisions=() if message is None else message.decisions,
         verdicts=verdicts_given(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
     )
 
 
-def _decisions(log: Collected) -> tuple[m.AssociationDecision, ...]:
-    """Closures and merges of landmarks without names: accepted, undone and waiting."""
-    final = log.sound(log.last(ch.FINAL_MAP))
-    return final.decisions if isinstance(final, m.FusedMap) else ()
+def _frames(log: Collected) -> TruthFrames:
+    """The frames that the initial poses in the log fix."""
+    frames = TruthFrames()
+    for start in log.starts():
+        frames.take(start)
+    return frames
 
 
-def _is_arbitrary(log: Collected) -> bool:
-    """Whether there are initial poses in the log, and all of them unknown."""
-    starts = [each for robot in log.robots for each in log.messages(ch.START, robot)]
-    return bool(starts) and not any(isinstance(s, m.InitialPose) and s.pose for s in starts)
+def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
+    """Whether no known initial pose fixes the final map's frame; without a map, any at all."""
+    if fused is None or not fused.members:
+        return frames.none_is_known
+    return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
 
 
 def _lost(fused: MapResult | None) -> list[str]:
@@ -366,6 +385,7 @@ def _robot_json(robot: RobotResult) -> dict[str, Any]:
         "online_pose_coverage_95": None if online is None else online.coverage,
         "online_position_rmse_aligned_m": robot.online_aligned_rmse_m,
         "online_channel": robot.online_channel,
+        "online_in_team_frame": not robot.outside,
         "own_map_landmarks": None if own is None else own.count,
         "own_map_rmse_m": None if own is None else own.rmse_m,
         "own_map_rmse_aligned_m": None if own is None else own.aligned_rmse_m,
@@ -401,20 +421,19 @@ def _bytes(log: Collected, uplink: tuple[ch.Channel, ...] | None, robot: str) ->
 
 def _map_result(
     log: Collected,
+    message: m.FusedMap,
     true_ids: UInt32[np.ndarray, " T"],
     positions: Float[np.ndarray, "T 2"],
     label_of: Mapping[int, int],
     truth_from_map: Float[np.ndarray, "3"] | None,
-) -> MapResult | None:
+) -> MapResult:
     """The final map and its errors.
 
     truth_from_map: the motion after which landmarks without identities and labels are matched to
     the nearest true ones; None: unknown.
     """
     sample = log.last(ch.FINAL_MAP)
-    message = log.sound(sample)
-    if sample is None or not isinstance(message, m.FusedMap):
-        return None
+    assert sample is not None
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
     labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
@@ -548,6 +567,7 @@ def _robot_result(
         if team_motion is None
         else _moved_rmse(team_motion[0], log.online, log.truth),
         own_map=own_map,
+        outside=log.outside,
     )
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int64
 
 from central.desk.evaluation.events import MOST, Event, EventDetector
 from central.desk.evaluation.log import head_of
-from central.desk.evaluation.running import TrueLandmarks
+from central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
@@ -171,6 +171,7 @@ class _Gathering:
         default_factory=lambda: defaultdict(list)
     )
     truth: TrueLandmarks = field(default_factory=TrueLandmarks)
+    frames: TruthFrames = field(default_factory=TruthFrames)
     span: tuple[int, int] = _NO_SPAN
 
     def take(self, sample: Sample, channel: ch.Channel | None) -> None:
@@ -199,6 +200,8 @@ class _Gathering:
                 self._take_map(message, sample.wall_ns)
             case m.Innovation():
                 self.innovations[message.robot].append(message)
+            case m.InitialPose():
+                self.frames.take(message)
             case m.TruthLandmarks():
                 self.truth = TrueLandmarks.of(message)
             case m.Status() if name == "central":
@@ -221,7 +224,7 @@ class _Gathering:
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:
             self.map_cost.take(fused.stamp_ns, fused.chi2 / fused.dof)
-        if (fit := self.truth.fit(fused)) is not None:
+        if self.frames.has(fused.frame) and (fit := self.truth.fit(fused)) is not None:
             self.map_nees.take(fused.stamp_ns, fit.nees_per_dof)
         for member in fused.members:
             waiting = self.unused[member.robot, member.incarnation]

@@ -125,6 +125,18 @@ class Collected:
                 found.append(message)
         return found
 
+    def starts(self) -> list[m.InitialPose]:
+        """The initial poses of all streams; an invalid one has been counted as a measurement."""
+        found = []
+        for sample in (s for name in self.robots for s in self.samples.get(ch.START.key(name), [])):
+            try:
+                message = opened(sample)[2]
+            except WireError:
+                continue
+            if isinstance(message, m.InitialPose):
+                found.append(message)
+        return found
+
     def faults(self) -> list[m.Fault]:
         """The faults of all nodes, in the order of the nodes."""
         keys = sorted(key for key in self.samples if ch.FAULT.owner(key) is not None)

@@ -1,6 +1,6 @@
 """One robot in a log: its poses, its truth, and the dispositions of its measurements."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -22,7 +22,8 @@ REJECTED = "rejected: "
 class RobotLog:
     """A robot's paths with their covariances, and the truth; each may be empty.
 
-    online_channel: "team/pose", else "central/pose", else "own/pose", or None.
+    online_channel: "team/pose", else "central/pose", else "own/pose", or None. Only poses in the
+    frame of the evaluation are in `online`; outside: there are poses, and none is in it.
     """
 
     truth: Path
@@ -31,6 +32,7 @@ class RobotLog:
     online: Path
     online_covariances: Float[np.ndarray, "O 3 3"]
     online_channel: str | None
+    outside: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,20 +80,22 @@ class Consumption:
         return ", ".join([*parts, f"{self.open} open"] if self.open else parts)
 
 
-def robot_log(log: Collected, robot: str) -> RobotLog:
-    """The paths of one robot."""
+def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) -> RobotLog:
+    """The paths of one robot; is_in_frame: whether poses in the named frame are evaluated."""
     trajectories = [t for t in log.messages(ch.TRAJECTORY, robot) if isinstance(t, m.Trajectory)]
     truths = [t for t in log.messages(ch.TRUTH, robot) if isinstance(t, m.Truth)]
     smoothed, smoothed_covariances = _stacked(
         [translate.trajectory_of(t) for t in trajectories],
         [floats(t.covariances, "covariances") for t in trajectories],
     )
-    online_channel = next(
-        (c for c in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE) if log.samples.get(c.key(robot))),
-        None,
-    )
-    poses = [] if online_channel is None else log.messages(online_channel, robot)
-    estimates = [p for p in poses if isinstance(p, m.PoseEstimate)]
+    online_channel, estimates, outside = None, [], False
+    for channel in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE):
+        poses = [p for p in log.messages(channel, robot) if isinstance(p, m.PoseEstimate)]
+        estimates = [p for p in poses if is_in_frame(p.frame)]
+        outside = outside or bool(poses)
+        if estimates:
+            online_channel, outside = channel, False
+            break
     online, online_covariances = _stacked(
         [(np.array([p.stamp_ns]), floats(p.pose, "pose").reshape(1, 3)) for p in estimates],
         [floats(p.covariance, "covariance") for p in estimates],
@@ -103,6 +107,7 @@ def robot_log(log: Collected, robot: str) -> RobotLog:
         online,
         online_covariances,
         None if online_channel is None else _short(online_channel),
+        outside,
     )
 
 

@@ -15,6 +15,7 @@ from central.desk.evaluation.errors import (
     interpolated,
     pose_errors,
 )
+from central.fused import START_POSES
 from team import translate
 from team.estimation.consistency import chi2_quantile
 from team.wire import messages as m
@@ -26,6 +27,30 @@ WAITING = 4_096
 """Most poses of a robot that wait for their truth; the oldest are dropped first."""
 BATCHES = 20_000
 """Most batches of a robot's truth that are kept, the newest."""
+
+
+@dataclass
+class TruthFrames:
+    """The frames in which truth is given: those that a known initial pose fixes.
+
+    What is in another frame is not compared with the truth. Without initial poses every frame is
+    taken for one of them, as is that of a message that names none: both are of earlier versions.
+    """
+
+    _starts: dict[str, bool] = field(default_factory=dict)
+
+    def take(self, start: m.InitialPose) -> None:
+        """Take a stream's initial pose, known or not."""
+        self._starts[translate.frame_name(start.robot, start.incarnation)] = bool(start.pose)
+
+    def has(self, frame: str) -> bool:
+        """Whether truth is given in this frame."""
+        return self._starts.get(frame, frame in {"", START_POSES} or not self._starts)
+
+    @property
+    def none_is_known(self) -> bool:
+        """Whether there are initial poses, and all of them are unknown."""
+        return bool(self._starts) and not any(self._starts.values())
 
 
 class MapFit(NamedTuple):

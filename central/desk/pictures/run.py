@@ -111,6 +111,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     if evaluation.arbitrary_frame:
         return False
     shown = {n: r for n, r in evaluation.robots.items() if r.online or r.smoothed}
+    outside = [name for name, robot in evaluation.robots.items() if robot.outside]
     names = list(shown)[:DRAWN_ROBOTS]
     if not names:
         return False
@@ -127,6 +128,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
         axis.set_xlabel("team time [s]")
     left_out = len(shown) - len(names)
     more = f" · {left_out} more robots are not drawn" if left_out else ""
+    more += f" · not in the team's frame: {', '.join(outside)}" if outside else ""
     figure.suptitle(f"{_heading(evaluation)}: pose errors and what the robots believe{more}")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=10)
@@ -183,7 +185,7 @@ def _draw_paths(
             *smoothed.poses.T[:2], color=colour, linestyle="", marker="o", markersize=3.5, zorder=3
         )
         axis.plot([], [], color=colour, marker="o", label=label)
-    elif apart:
+    elif apart or robot.outside:
         axis.plot([], [], color=colour, linestyle=":", label=f"{name}: not in this map")
     else:
         x, y, _ = _thinned(robot.online_path).poses.T

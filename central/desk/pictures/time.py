@@ -97,7 +97,8 @@ def consistency_picture(evaluation: Evaluation, history: History, path: FilePath
     panels = [
         draw
         for draw, is_there in (
-            (_draw_nees, any(r.online for r in evaluation.robots.values())
+            (_draw_nees, (any(r.online for r in evaluation.robots.values())
+              and not evaluation.arbitrary_frame)
              or len(history.map_nees.values) > 0),
             (_draw_nis, any(i.per_dof is not None for i in history.innovations.values())),
             (_draw_cost, len(history.map_cost.values) > 0),
@@ -125,7 +126,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     largest = 0.0
     colours, labels = robot_colours(evaluation.robots), robot_labels(evaluation.robots)
     for name, robot in evaluation.robots.items():
-        if robot.online is None:
+        if robot.online is None or evaluation.arbitrary_frame:
             continue
         centres, (sums, counts) = binned(
             history,

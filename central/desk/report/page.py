@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from central.desk.export.take_home import write_map, write_paths
 from central.desk.export.tum import write_trajectories
-from central.desk.names import in_order
+from central.desk.names import OUTSIDE, in_order
 from central.desk.pictures.run import error_picture, map_picture
 from central.desk.pictures.style import SCREEN, Picture, Style, drawn_in
 from central.desk.pictures.time import (
@@ -237,7 +237,7 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     rows = []
     for name in in_order(run.evaluation.robots.keys() | innovations.keys() | cost.keys()):
         robot, of = run.evaluation.robots.get(name), innovations.get(name)
-        online = None if robot is None else robot.online
+        online = None if robot is None or run.evaluation.arbitrary_frame else robot.online
         rows.append(
             (
                 name,
@@ -245,7 +245,9 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
                 "–" if of is None else f"{int(of.dof.sum()):,}",
                 shown(cost.get(name), ".3f", ""),
                 shown(scale.get(name), ".2f", ""),
-                shown(None if online is None else online.nees_per_dof, ".3g", ""),
+                OUTSIDE
+                if robot is not None and robot.outside
+                else shown(None if online is None else online.nees_per_dof, ".3g", ""),
                 shown(None if online is None else online.coverage, ".0%", ""),
             )
         )
@@ -267,7 +269,7 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 def _paths(run: Run) -> list[str]:
     arbitrary = run.evaluation.arbitrary_frame
     rows = [path_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
-    if all(cell == "–" for row in rows for cell in row[1:]):
+    if all(cell in {"–", OUTSIDE} for row in rows for cell in row[1:]):
         return []
     absolute = [
         (

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from central.desk.evaluation.errors import MapErrors
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
-from central.desk.names import not_joined, short
+from central.desk.names import OUTSIDE, not_joined, short
 
 ABSURD_NEES = 1000
 """Beyond this a NEES per dof is shown in words."""
@@ -231,12 +231,13 @@ def robot_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tupl
     position = None if errors is None else errors.position_rmse_m
     if arbitrary:
         errors, mark, position = None, "", robot.aligned_rmse_m
+    outside = robot.outside and robot.smoothed is None
     return (
         name,
         str(used.steps),
         f"{'–' if used.used is None else used.used} of {used.published}",
         str(used.submaps),
-        shown(position, ".3f", mark),
+        OUTSIDE if outside else shown(position, ".3f", mark),
         shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
         shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
         shown(robot.uplink_bytes_per_step, ".1f", ""),
@@ -259,13 +260,15 @@ def path_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple
     In an arbitrary frame only the aligned errors.
     """
     cells = [name]
-    for of, aligned in (
-        (robot.smoothed, robot.aligned_rmse_m),
-        (robot.online, robot.online_aligned_rmse_m),
+    for of, aligned, outside in (
+        (robot.smoothed, robot.aligned_rmse_m, False),
+        (robot.online, robot.online_aligned_rmse_m, robot.outside),
     ):
         errors = None if arbitrary else of
         cells += [
-            shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
+            OUTSIDE
+            if outside
+            else shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
             shown(aligned, ".3f", ""),
             shown(None if errors is None else errors.nees_per_dof, ".3g", ""),
             shown(None if errors is None else errors.coverage, ".0%", ""),

@@ -18,6 +18,7 @@ from central.scheduler import Scheduler
 from central.submap_intake import SubmapInputs
 from central.submap_set import SubmapSet
 from central.unnamed_landmarks import verdict_of
+from team.estimation.contribution import Stream
 from team.pairs import RULES, Channel
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -136,10 +137,11 @@ class _LogInputs:
                     self._set.admit_sighting(each)
         starts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
         self._starts = {s: start for s, start in starts.items() if isinstance(start, m.InitialPose)}
-        self._priors_of: dict[bytes, set[str]] = {}
+        self._priors_of: dict[bytes, set[Stream]] = {}
         for prior in (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR)):
             if isinstance(prior, m.Prior):
-                self._priors_of.setdefault(prior.digest, set()).add(prior.robot)
+                stream = (prior.robot, prior.incarnation)
+                self._priors_of.setdefault(prior.digest, set()).add(stream)
         own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
         self._maps = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
 

@@ -1,6 +1,6 @@
 """Recomputes one robot's messages: its node over its recorded measurements."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
 
 from central.desk.verification.measurements import RecordedMeasurements
@@ -11,7 +11,7 @@ from team.pairs import FEEDBACK
 from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import OnDisposition, no_listener
 from team.robot.node import RobotNode
-from team.robot.poses import RunningPoses
+from team.robot.poses import RunningPoses, outside_team_frame
 from team.robot.statements import MessageWriter
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -21,6 +21,8 @@ PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
 """By (incarnation, stamp), the priors that the recorded poses name; None: a pose without a
 prior.
 """
+WithdrawnAt = Collection[tuple[int, int]]
+"""By (incarnation, stamp), the own poses that went out on team/pose, too."""
 
 
 class RecordedPoses(RunningPoses):
@@ -29,9 +31,12 @@ class RecordedPoses(RunningPoses):
     Which prior a running pose used depends on the arrival times, so the pose names it.
     """
 
-    def __init__(self, config: RobotConfig, recorded: PriorsNamed) -> None:
+    def __init__(
+        self, config: RobotConfig, recorded: PriorsNamed, withdrawn: WithdrawnAt = ()
+    ) -> None:
         super().__init__(config, [])
         self._recorded = recorded
+        self._withdrawn = withdrawn
 
     def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
         """The poses of this stamp, with every prior that a recorded one names."""
@@ -39,6 +44,8 @@ class RecordedPoses(RunningPoses):
         for prior in self._recorded.get((writer.incarnation, stamp_ns), ()):
             here = prior if prior is not None and prior.incarnation == writer.incarnation else None
             out += self.posed(stamp_ns, here, front, writer)
+        if out and (writer.incarnation, stamp_ns) in self._withdrawn:
+            out.append(outside_team_frame(out[0]))
         return out
 
 
@@ -53,12 +60,13 @@ class RecomputedRobot:
         config: RobotConfig,
         digest: bytes,
         recorded: PriorsNamed,
+        withdrawn: WithdrawnAt = (),
         on_disposition: OnDisposition = no_listener,
     ) -> None:
         self.node = RobotNode(
             config,
             announced=digest,
-            poses=RecordedPoses(config, recorded),
+            poses=RecordedPoses(config, recorded, withdrawn),
             on_disposition=on_disposition,
         )
         self._boundary = Boundary(ch.robot_node(config.id))
@@ -74,10 +82,10 @@ NewRobot = Callable[[], RecomputedRobot]
 def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
     """Every message that follows from the robot's measurements, by the names of its inputs."""
     config, digest = log.robot_config(robot)
-    named = _priors_named(log, robot)
+    named, withdrawn = _priors_named(log, robot), _withdrawn_at(log, robot)
 
     def new() -> RecomputedRobot:
-        robot = RecomputedRobot(config, digest, named)
+        robot = RecomputedRobot(config, digest, named, withdrawn)
         if log.known_map is not None:
             robot.given(log.known_map)
         return robot
@@ -102,6 +110,11 @@ def _priors_named(log: Recorded, robot: str) -> PriorsNamed:
             if prior not in names if prior is not None else not names:
                 names.append(prior)
     return used
+
+
+def _withdrawn_at(log: Recorded, robot: str) -> WithdrawnAt:
+    own = (p for p in log.of(ch.TEAM_POSE) if isinstance(p, m.PoseEstimate) and p.robot == robot)
+    return {(p.incarnation, p.stamp_ns) for p in own if not p.in_team_frame}
 
 
 def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
@@ -216,7 +229,7 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     """
     config, digest = log.robot_config(robot)
     disposition_of: dict[int, str] = {}
-    node = RecomputedRobot(config, digest, {}, disposition_of.__setitem__)
+    node = RecomputedRobot(config, digest, {}, on_disposition=disposition_of.__setitem__)
     if log.known_map is not None:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))

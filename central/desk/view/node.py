@@ -16,7 +16,7 @@ from jaxtyping import Float
 from central.desk.drawing import colour_of
 from central.desk.evaluation.errors import PoseErrors
 from central.desk.evaluation.events import Event, EventDetector
-from central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
 from central.desk.names import in_order
 from central.desk.view import foxglove_scene as fox
 from central.desk.view.drawn import Landmarks, Track, around, landmarks_of, placed
@@ -81,13 +81,21 @@ class _Robot:
         assert self.estimate is not None
         return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
-    def go_to(self, now_ns: int) -> None:
-        """Take the estimates up to this time."""
+    def leave(self) -> None:
+        """Forget poses and errors, which are not in the team's frame any more."""
+        self.coming.clear()
+        self.estimate = self.last_error = None
+        self.track = Track()
+        self.errors.forget_poses()
+
+    def go_to(self, now_ns: int, frames: TruthFrames) -> None:
+        """Take the estimates up to this time; frames: those in which truth is given."""
         while self.coming and self.coming[0].stamp_ns <= now_ns:
             self.estimate = self.coming.popleft()
             x, y, _ = self.pose().tolist()
             self.track.take(self.estimate.stamp_ns, x, y)
-            self.errors.take_pose(self.estimate)
+            if frames.has(self.estimate.frame):
+                self.errors.take_pose(self.estimate)
         self.note(self.errors.known())
         true = self.errors.truth_at(now_ns)
         if true is not None:
@@ -119,6 +127,8 @@ class ViewerNode:
         self._maps: deque[m.FusedMap] = deque()
         self._landmarks: Landmarks | None = None
         self._truth = TrueLandmarks()
+        self._frames = TruthFrames()
+        self._has_map = False
         self._fused: m.FusedMap | None = None
         self._map_is_new = False
         self._status: dict[str, float] = {}
@@ -165,6 +175,8 @@ class ViewerNode:
 
     def _take(self, channel: Channel, message: m.Message) -> None:
         match message:
+            case m.InitialPose():
+                self._frames.take(message)
             case m.PoseEstimate():
                 self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
@@ -175,6 +187,7 @@ class ViewerNode:
                 self._map_is_new = True
             case m.FusedMap():
                 self._maps.append(message)
+                self._has_map = bool(message.ids)
             case m.ParticleCloud():
                 self._of(message.robot).cloud = message
             case m.Trajectory():
@@ -197,11 +210,17 @@ class ViewerNode:
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         robot = self._of(message.robot)
-        if by_team and not robot.by_team:
+        if by_team and not message.in_team_frame:
+            robot.by_team = False
+            robot.leave()
+        elif by_team and not robot.by_team:
             robot.by_team = True
             robot.coming = deque(p for p in robot.coming if p.stamp_ns < message.stamp_ns)
         if by_team is robot.by_team:
-            robot.coming.append(message)
+            if message.in_team_frame or not self._has_map:
+                robot.coming.append(message)
+            elif robot.estimate is not None or robot.coming:
+                robot.leave()
             before = robot.reached_ns
             robot.reached_ns = message.stamp_ns if before is None else max(before, message.stamp_ns)
 
@@ -261,7 +280,7 @@ class ViewerNode:
             self._extend(self._landmarks.means)
             self._map_is_new = True
         for robot in self._robots.values():
-            robot.go_to(now_ns)
+            robot.go_to(now_ns, self._frames)
             if robot.estimate is not None:
                 self._extend(robot.pose()[np.newaxis, :2])
 
@@ -320,7 +339,9 @@ class ViewerNode:
         return out
 
     def _team(self, now_ns: int) -> views.TeamFigures:
-        fit = None if self._fused is None else self._truth.fit(self._fused)
+        fused = self._fused
+        known = fused is not None and self._frames.has(fused.frame)
+        fit = None if fused is None or not known else self._truth.fit(fused)
         return views.TeamFigures(
             now_ns * 1e-9,
             0 if self._landmarks is None else len(self._landmarks.ids),

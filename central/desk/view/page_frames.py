@@ -4,10 +4,11 @@ t: seconds of team time since the first measurement. Poses and errors are rows o
 particles base64 of little-endian float32 and uint32. Frames, by `k`:
 
 hello: team, title, colours, live. now: the team time of all robots at work. pose: rows x, y,
-heading, xx, xy, yy, variance of the heading. err: rows of three errors, three 3σ bounds, NEES per
-degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as their names. fig: a
-node's figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log has been
-read.
+heading, xx, xy, yy, variance of the heading. outside: whether the robot is outside the team's map
+from this time on; its poses are then not in the team's frame, and not sent. err: rows of three
+errors, three 3σ bounds, NEES per degree of freedom. truth: rows x, y, heading. truth_map, map,
+cloud, path: as their names. fig: a node's figures. bytes: [key, t, messages, bytes] of one second.
+ev: an event. eof: the log has been read.
 """
 
 import base64
@@ -20,7 +21,7 @@ import numpy as np
 
 from central.desk.drawing import ROBOT_COLOURS
 from central.desk.evaluation.events import EventDetector
-from central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
 from central.desk.view.drawn import around, landmarks_of
 from central.desk.view.landmark_sets import sets_of
 from central.desk.view.node import FORGET_NS
@@ -53,6 +54,7 @@ class _Stream:
 
     errors: RunningErrors = field(default_factory=RunningErrors)
     by_team: bool = False
+    outside: bool = False
     pose_ns: int | None = None
     truth_ns: int | None = None
     rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
@@ -73,6 +75,8 @@ class PageFrames:
         self._traffic: dict[tuple[str, int], list[int]] = {}
         self._detector = EventDetector()
         self._truth = TrueLandmarks()
+        self._frames = TruthFrames()
+        self._has_map = False
         self._map_ns: int | None = None
         self._figures_s: dict[str, tuple[int, float, float]] = {}
         self._newest_ns = 0
@@ -136,6 +140,8 @@ class PageFrames:
         for event in self._detector.take(message, at_ns):
             self._say("ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text)
         match message:
+            case m.InitialPose():
+                self._frames.take(message)
             case m.PoseEstimate():
                 self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
@@ -160,17 +166,27 @@ class PageFrames:
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         stream = self._streams[message.robot]
-        stream.by_team = stream.by_team or by_team
+        if by_team and stream.by_team and not message.in_team_frame:
+            stream.errors.forget_poses()  # they are in a frame that is the team's no more
+        if by_team:
+            stream.by_team = message.in_team_frame
         due = stream.pose_ns is None or message.stamp_ns >= stream.pose_ns + SPACING_NS
         if by_team is not stream.by_team or not due:
             return
         stream.pose_ns = message.stamp_ns
+        outside = self._has_map and not message.in_team_frame
+        if outside != stream.outside:
+            stream.outside = outside
+            self._say("outside", r=message.robot, t=self._t(message.stamp_ns), v=outside)
+        if outside:
+            return
         x, y, heading = floats(message.pose, "pose").tolist()
         P = floats(message.covariance, "covariance").reshape(3, 3)
         spread = [float(P[0, 0]), float(P[0, 1]), float(P[1, 1]), float(P[2, 2])]
         row = [_short(v) for v in (x, y, heading, *spread)]
         stream.add("pose", self._t(message.stamp_ns), row)
-        stream.errors.take_pose(message)
+        if self._frames.has(message.frame):
+            stream.errors.take_pose(message)
 
     def _take_truth(self, message: m.Truth) -> None:
         stream = self._streams[message.robot]
@@ -197,7 +213,8 @@ class PageFrames:
             return
         self._map_ns = message.stamp_ns
         landmarks = landmarks_of(message)
-        fit = self._truth.fit(message)
+        self._has_map = len(landmarks.ids) > 0
+        fit = self._truth.fit(message) if self._frames.has(message.frame) else None
         sets = sets_of(message)
         unnamed: dict[str, object] = {}
         if sets:

@@ -244,7 +244,14 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
             pose = moved_by(pose, inverse(np.array(sensor.mount)))
         incarnation = self.members[each.robot].incarnation
         message = translate.pose_message(
-            each.stamp_ns, each.robot, incarnation, each.number, NO_MAP, *pose
+            each.stamp_ns,
+            each.robot,
+            incarnation,
+            each.number,
+            NO_MAP,
+            *pose,
+            frame=self._frame,
+            in_team_frame=True,
         )
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 

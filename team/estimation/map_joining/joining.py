@@ -208,8 +208,15 @@ class Fold:
 
     @property
     def frame(self) -> Stream | None:
-        """The main island's frame is named by its smallest stream; None before any submap."""
-        return None if self.main_key is None else min(self.main.graph.streams)
+        """The stream whose start fixes the main island's frame; None before any submap.
+
+        It is the smallest one with a known initial pose, else the smallest one of the island. All
+        known initial poses are given in one frame, so each of them fixes the same.
+        """
+        if self.main_key is None:
+            return None
+        started = [stream for stream in self.home if stream in self.starts]
+        return min(started or self.main.graph.streams)
 
     def island(self, robot: str, incarnation: int) -> Island:
         """The island of a stream. Raises KeyError for a stream without submaps."""

@@ -31,10 +31,13 @@ class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):
 
 
 class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
-    """A robot's pose in the team's frame at stamp_ns, with its 3 × 3 covariance.
+    """A robot's pose at stamp_ns, with its 3 × 3 covariance, in the frame that it names.
 
     `map_digest` names the fused map that went into it (8 zero bytes: none), `sequence` the submap
-    in progress.
+    in progress. frame: in the notation of `FusedMap.frame`; empty in logs of earlier versions.
+    in_team_frame: this is the team's frame. On team/pose it is that of the named map, on own/pose
+    the initial pose is known. A pose on team/pose that is not in the team's frame is the own pose:
+    it withdraws the poses before it.
     """
 
     robot: Name
@@ -43,6 +46,8 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
     map_digest: Digest
     pose: Floats
     covariance: Floats
+    frame: Text = ""
+    in_team_frame: bool = True
 
     def check(self) -> None:  # noqa: D102
         check_finite(self.pose, "pose", 3)

@@ -100,10 +100,10 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
 
     members: the version vector of its set, ordered; missing: submaps known to be in a gap of it, as
     (robot, incarnation, sequence). digest: 8-byte name of the set (and of the rule and its
-    settings). frame: "robot/incarnation" whose start fixes it. provisional: some members lie ahead
-    of the watermark. covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 where the rule
-    has none. exchange: of the lockstep round, 0 under `join`. reasons: why robots are not joined,
-    what speaks for another minimum of the final map, and that models do not fit the data. biases:
+    settings). frame: the team's: "robot/incarnation" whose start fixes it. provisional: some
+    members lie ahead of the watermark. covariance: as in MapEstimate. chi2, dof: the joint cost; 0,
+    0 where the rule has none. exchange: of the lockstep round, 0 under `join`. reasons: why robots
+    are not joined, what speaks for another minimum, and that models do not fit the data. biases:
     by robot, incarnation and name, where submaps have sensitivities. joined: how robots with an
     unknown start were joined, and how sure that is. withdrawn: the robots that the team goes on
     without, ascending. covariance_scale: how many times the submaps' covariances ought to be taken,
@@ -163,7 +163,10 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     the start pose). mean: 3 + 2L floats; covariance: packed upper triangle. The robot is to take
     its submaps that are not in the set as the centre takes them: their covariances times
     covariance_factor, their means moved by the errors that the robot's submaps share (biases).
-    members, heard: as in FusedMap; by them a receiver knows the newer one of two.
+    members, heard: as in FusedMap, and withdrawn the number of robots that the team goes on
+    without; they give the newer one of two. frame: that of the pose and the landmarks, as in
+    FusedMap; in_team_frame: it is the team's. One that is not withdraws the priors before it: the
+    robot is not in the team's map, `frame` is its own, and ids, mean and covariance are empty.
     """
 
     robot: Name
@@ -177,8 +180,15 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     biases: tuple[BiasEstimate, ...] = ()
     members: tuple[VersionEntry, ...] = ()
     heard: Count = 0
+    withdrawn: Count = 0
+    frame: Text = ""
+    in_team_frame: bool = True
 
     def check(self) -> None:  # noqa: D102
+        if not self.in_team_frame:
+            if self.ids or self.mean or self.covariance:
+                raise ValueError("a prior that is not in the team's frame contains an estimate")
+            return
         check_ascending(self.ids, "ids")
         n = 3 + 2 * len(ids(self.ids, "ids"))
         check_finite(self.mean, "mean", n)

@@ -185,7 +185,7 @@ function levelOf(cost) { return cost > FAIL ? 'bad' : cost > WARN ? 'warn' : '';
 function lookAtMap() {
   const shown = store.mapAt(state.time);
   put('landmarks', shown ? shown.ids.length : '0');
-  const here = [...store.robots.values()].filter((r) => r.pose.at(state.time) >= 0);
+  const here = [...store.robots.values()].filter((r) => store.isOutside(r, state.time) || r.pose.at(state.time) >= 0);
   put('robot-count', here.filter((r) => store.stateAt(r, state.time) !== 'lost').length);
   $('rmse-box').hidden = $('nees-box').hidden = !store.trueMap;
   put('rmse', shown && shown.rmse !== null ? metresText(shown.rmse) : '–');
@@ -246,9 +246,9 @@ function lookAtRobots() {
     row.classList.toggle('chosen', robot.name === state.chosen);
     dot.style.background = robot.colour;
     const now = store.stateAt(robot, state.time);
-    note.textContent = now === 'lost' ? 'lost' : now === 'done' || now === 'left' ? 'done' : '';
-    note.className = now === 'lost' ? '' : 'done';
-    const i = robot.pose.at(state.time);
+    note.textContent = now === 'lost' ? 'lost' : store.isOutside(robot, state.time) ? 'not in the team\u2019s frame' : now === 'done' || now === 'left' ? 'done' : '';
+    note.className = now === 'lost' || store.isOutside(robot, state.time) ? '' : 'done';
+    const i = store.poseAt(robot, state.time);
     const texts = i < 0 ? ['–', '–', '–', '–', ''] : poseTexts(robot, i);
     texts.forEach((text, k) => { cells[k + 1].textContent = text; });
     const e = robot.error.at(state.time);

@@ -131,7 +131,7 @@ export class MapView {
     if (this.fitted) this.fit();
     if (this.follow) {
       const robot = this.store.robots.get(this.follow);
-      const i = robot ? robot.pose.at(time) : -1;
+      const i = robot ? this.store.poseAt(robot, time) : -1;
       if (i >= 0) { this.centre = [robot.pose.get(i, 0), robot.pose.get(i, 1)]; this.fitted = false; }
     }
     const g = this.context;
@@ -324,7 +324,7 @@ export class MapView {
     for (const robot of this.store.robots.values()) {
       const i = upTo(robot.cloudTimes, time) - 1;
       if (i < 0 || time - robot.cloudTimes[i] > 30) continue;
-      const points = robot.clouds[i], at = robot.pose.at(time);
+      const points = robot.clouds[i], at = this.store.poseAt(robot, time);
       if (at < 0) continue;
       const place = between(robot.pose, at, time), c = Math.cos(place[2]), s = Math.sin(place[2]);
       g.fillStyle = robot.colour;
@@ -353,7 +353,7 @@ export class MapView {
         g.stroke();
       }
     }
-    const i = robot.pose.at(time);
+    const i = this.store.poseAt(robot, time);
     if (i < 0) return;
     const [px, py, heading] = between(robot.pose, i, time);
     const [x, y] = this.screen(px, py);

@@ -64,6 +64,7 @@ export class Store {
       found = {
         name, pose: new Series(POSE), error: new Series(ERROR), truth: new Series(TRUTH),
         clouds: [], cloudTimes: [], smoothed: null, states: [], stateTimes: [], colour: '#888',
+        outside: new Series(1),
       };
       this.robots.set(name, found);
       this.robots = new Map([...this.robots].sort((a, b) => inOrder.compare(a[0], b[0])));
@@ -87,6 +88,7 @@ export class Store {
       case 'now': this.now = Math.max(this.now, frame.t); break;
       case 'eof': this.complete = frame.complete; break;
       case 'pose': this.robot(frame.r).pose.push(frame.t, frame.v); this.extend(frame.v, POSE); break;
+      case 'outside': this.robot(frame.r).outside.push([frame.t], [Number(frame.v)]); break;
       case 'err': this.robot(frame.r).error.push(frame.t, frame.v); break;
       case 'truth': this.robot(frame.r).truth.push(frame.t, frame.v); this.extend(frame.v, TRUTH); break;
       case 'truth_map':
@@ -149,6 +151,14 @@ export class Store {
   mapAt(time) {
     const i = upTo(this.mapTimes, time) - 1;
     return i < 0 ? null : this.maps[i];
+  }
+
+  /** The row of a robot's pose at a time; −1 where it has none in the team's frame. */
+  poseAt(robot, time) { return this.isOutside(robot, time) ? -1 : robot.pose.at(time); }
+
+  isOutside(robot, time) {
+    const i = robot.outside.at(time);
+    return i >= 0 && robot.outside.get(i, 0) === 1;
   }
 
   stateAt(robot, time) {
