@@ -83,8 +83,8 @@ class SentPriors:
         outside = []
         for stream in streams:
             old = self._sent.get(stream)
-            elsewhere = old is not None and old.frame != fold.frame
-            if elsewhere or fold.home.get(stream, NOWHERE) != fold.main_key:
+            is_in_another_frame = old is not None and old.frame != fold.frame
+            if is_in_another_frame or fold.home.get(stream, NOWHERE) != fold.main_key:
                 outside.append(stream)
         return self._withdrawn(outside)
 

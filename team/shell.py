@@ -70,11 +70,21 @@ class FaultyRunError(RuntimeError):
 def judge(boundary: Boundary, final: FusedMap | None) -> None:
     """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
     warnings = [*boundary.warnings] if boundary.faults else []
-    if final is not None and final.lost:
-        names = ", ".join(final.lost)
-        warnings.append(f"the final map is provisional: {names} lost, and not wholly in it")
+    if final is not None and (lacks := lacking(final)):
+        warnings.append(lacks)
     if warnings:
         raise FaultyRunError("; ".join(warnings))
+
+
+def lacking(final: FusedMap) -> str:
+    """The robots that were withdrawn from the final map, or lost, in words; empty: none."""
+    found = []
+    if final.withdrawn:
+        found.append(f"the final map is without {', '.join(final.withdrawn)}: withdrawn")
+    if final.lost:
+        names = ", ".join(final.lost)
+        found.append(f"the final map is provisional: {names} lost, and not wholly in it")
+    return "; ".join(found)
 
 
 class Shell:

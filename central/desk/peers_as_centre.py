@@ -25,8 +25,12 @@ _AS = {
     ch.TEAM_MAP.name: ch.FUSED_MAP,
     ch.TEAM_PRIOR.name: ch.PRIOR,
     ch.TEAM_TRAJECTORY.name: ch.TRAJECTORY,
+    ch.TEAM_WITHDRAWAL.name: ch.WITHDRAWAL,
 }
-LISTENS = (ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.WORLD_CONFIG, *OF_AGREEMENT)
+LISTENS = (
+    ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_WITHDRAWAL, ch.WORLD_CONFIG,
+    *OF_AGREEMENT,
+)  # fmt: skip
 """The channels that are presented in this way, or decide how."""
 _FOLD = "fold."
 _LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)
@@ -71,13 +75,19 @@ class PeersAsCentre:
             return self._agreed()
         if channel is ch.STATUS:
             return self._status(sample, name)
+        return self._renamed(sample, channel, name)
+
+    def _renamed(self, sample: Sample, channel: ch.Channel, name: str) -> Sample | None:
+        """A running message of a peer's fold on the centre's key."""
         as_channel = _AS.get(channel.name)
         if as_channel is None:
             return None
-        if channel is ch.TEAM_MAP or channel is ch.TEAM_CONFIG:
+        if channel in (ch.TEAM_MAP, ch.TEAM_CONFIG):
             self._robot = name if self._robot is None else self._robot
             if name != self._robot:
                 return None
+        if channel is ch.TEAM_WITHDRAWAL:
+            name = _withdrawn(sample) or name
         renamed = msgspec.structs.replace(sample, key=as_channel.key(name))
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
 
@@ -122,6 +132,14 @@ class PeersAsCentre:
             stamp_ns=status.stamp_ns, node="central", state=status.state, figures=figures
         )
         return msgspec.structs.replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
+
+
+def _withdrawn(sample: Sample) -> str | None:
+    """The robot that a peer's fold has withdrawn."""
+    try:
+        return decoded(sample.payload, m.Withdrawal).robot
+    except WireError:
+        return None
 
 
 def _is_alive(token: Sample) -> bool:

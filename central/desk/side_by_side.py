@@ -45,6 +45,10 @@ def comparison_rows(recorded: Evaluation, changed: Evaluation) -> list[Row]:
     rows = [(name, of(recorded), of(changed)) for name, of in of_the_team]
     matched = recorded.matched_by, changed.matched_by
     rows += [("landmark errors by", *matched)] if any(matched) else []
+    for name in in_order(recorded.states.keys() | changed.states.keys()):
+        states = (run.states.get(name) for run in (recorded, changed))
+        a_state, b_state = ("–" if of is None else of.state for of in states)
+        rows.append((f"{name}: in the final map", a_state, b_state))
     for name in in_order(recorded.robots.keys() | changed.robots.keys()):
         a, b = (
             None if run.arbitrary_frame else run.robots.get(name) for run in (recorded, changed)

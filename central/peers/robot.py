@@ -186,6 +186,10 @@ class PeerRobot(Peer):
             elif each.channel is ch.TEAM_END:
                 sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
                 out += self._to_estimator(each.message, sample)
+            elif isinstance(each.message, m.Withdrawal):
+                own = msgspec.structs.replace(each.message, by=f"the fold of {self.robot}")
+                if each.message.by == "central":
+                    out.append(Outgoing(ch.TEAM_WITHDRAWAL, self.robot, own))
             elif channel is None or each.name not in ("", self.robot):
                 continue
             else:

@@ -122,7 +122,9 @@ def launch(
 ) -> None:
     """Launch a whole team here, watch it, and end with a report and a log.
 
-    Every robot, the world, the central computer, the recorder and the router are processes.
+    Every robot, the world, the central computer, the recorder and the router are processes. Exit
+    status 0 only if every process ended well and every robot is in the final map; else 1. 2: wrong
+    use; 130: interrupted.
     """
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
@@ -371,6 +373,7 @@ def _conclude(
 
     from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
     from central.desk.evaluation.history import history
+    from central.desk.evaluation.states import not_in_the_map
     from central.desk.export.take_home import taken_home
     from central.desk.names import in_order
     from central.desk.report.run import Run, nis_line, run_figures
@@ -416,12 +419,13 @@ def _conclude(
             steps.begin("reading the run's history")
             run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
             typer.echo("drawing the pictures and writing the report", err=True)
-            if (line := nis_line(run)) is not None:
+            if (line := nis_line(run.history)) is not None:
                 console.print(line, highlight=False, soft_wrap=True)
             _write_report(run, outcome, {**figures, **run_figures(run)}, console)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
         outcome.failures += evaluation.disagreement
+        outcome.failures += not_in_the_map(evaluation.states)  # with the reasons
     for name in in_order(outcome.restarts):
         times = outcome.restarts[name]
         text = f"{name} was started again {times} time{'' if times == 1 else 's'}"

@@ -406,14 +406,14 @@ def _joined(log: Path) -> list[Path]:
 
 def _fail_if_provisional(parts: Sequence[Path]) -> None:
     """End with 1 where the final map lacks robots."""
-    lost = _lost_in(parts)
-    if lost:
-        fail(f"the final map is provisional: {', '.join(lost)} lost, and not wholly in it", FAILED)
+    if lacks := _lacking_in(parts):
+        fail(lacks, FAILED)
 
 
-def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
-    """The robots that are missing in the final map of a log, if it has one."""
+def _lacking_in(parts: Sequence[Path]) -> str:
+    """The robots that are missing in the final map of a log, in words; empty: none."""
     from team.recording.reader import LogError, open_log
+    from team.shell import lacking
     from team.wire.channels import FINAL_MAP, TEAM_FINAL
     from team.wire.codec import WireError, decoded
     from team.wire.messages import FusedMap
@@ -421,7 +421,7 @@ def _lost_in(parts: Sequence[Path]) -> tuple[str, ...]:
     for part in parts:
         try:
             for sample in open_log(part).samples([FINAL_MAP, TEAM_FINAL]):
-                return decoded(sample.payload, FusedMap).lost
+                return lacking(decoded(sample.payload, FusedMap))
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)
-    return ()
+    return ""

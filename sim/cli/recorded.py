@@ -142,7 +142,7 @@ def report(
         console.print(table)
     for note in evaluation.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-    if (line := nis_line(run)) is not None:
+    if (line := nis_line(run.history)) is not None:
         console.print(line, highlight=False, soft_wrap=True)
     if found is not None:
         verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()

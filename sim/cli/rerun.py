@@ -21,6 +21,10 @@ from sim.cli.options import (
 from sim.recorded.changes import Changes
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from central.desk.evaluation.evaluation import Evaluation
+    from central.desk.evaluation.history import History
     from central.desk.verification.verification import Verification
 
 app = typer.Typer()
@@ -88,7 +92,8 @@ def rerun(
     With --verify every message is computed again from the inputs that it names. Otherwise the
     recorded measurements go through the same nodes again, with the given changes; without a change,
     as if every message arrived at once. For a data set, the run to compare with is computed, too.
-    No process is started.
+    No process is started. Exit status 0 only if every robot that is not left out is in the final
+    map, with --verify only if all is equal; else 1. 2: wrong use.
     """
     changes = Changes(
         without=tuple(without or ()),
@@ -170,6 +175,8 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from rich.text import Text
 
     from central.desk.evaluation.evaluation import evaluate, to_json
+    from central.desk.evaluation.history import history
+    from central.desk.evaluation.states import not_in_the_map
     from central.desk.side_by_side import (
         comparison_picture,
         comparison_rows,
@@ -189,7 +196,8 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     recorded = evaluate(log.samples())
     try:
         plain = isinstance(log, DataSetRun) and changes == Changes()
-        changed = recorded if plain else evaluate(changed_run(log, changes))
+        computed = list(log.samples()) if plain else changed_run(log, changes)
+        changed = recorded if plain else evaluate(computed)
     except RerunError as error:
         fail(f"{path}: {error}", FAILED)
     columns = ("", "computed") if plain else ("", "recorded", "recomputed")
@@ -198,8 +206,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         table.add_row(*(Text(cell) for cell in row[: len(columns)]))
     console = Console()
     console.print(table)
-    for note in recorded.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    _print_warnings(recorded, changed, history(computed), console)
     same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
     moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
     verdict = "the same bytes" if same else f"another one{moved}"
@@ -221,6 +228,20 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
             console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
     if changed.map is None:
         fail("the changed run ended without a final map", FAILED)
+    if missing := not_in_the_map(changed.states):
+        fail("; ".join(missing), FAILED)
+
+
+def _print_warnings(
+    recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
+) -> None:
+    """Print what `launch` says of its run, here of the one that was computed."""
+    from central.desk.report.run import nis_line
+
+    lines = [f"warning: {warning}" for warning in changed.warnings]
+    lines += [f"note: {note}" for note in dict.fromkeys((*recorded.notes, *changed.notes))]
+    for line in (*lines, *filter(None, [nis_line(of)])):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _verify(path: Path, json_file: Path | None) -> None:

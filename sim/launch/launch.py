@@ -16,6 +16,7 @@ from sim.launch.watch import Watch
 from sim.scenarios.scenario import dumps
 from team.keys.credentials import Credentials, credentials_of
 from team.peers.proofs import Signs
+from team.shell import lacking
 from team.wire import channels as ch
 from team.wire.bus import BusError
 from team.wire.zenoh.bus import ZenohBus
@@ -93,16 +94,16 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
                 services.append(Supervised(name, arguments, plan.folder, starter))
             supervise(services, bus, watch, show, plan.end_silent_s)
         ended = end_all([service.child for service in services])
+    lacks = "" if watch.fused is None or not watch.fused.final else lacking(watch.fused)
     failures = watch.failures + [
         failure(e)
         for e in ended
         if e.exit != 0
         and not e.asked
         and not any(f.startswith(f"{e.name} ") for f in watch.failures)
+        and not _says_no_more(e, lacks)
     ]
-    if watch.fused is not None and watch.fused.lost:
-        names = ", ".join(watch.fused.lost)
-        failures.append(f"the final map is provisional: {names} lost, and not wholly in it")
+    failures += [lacks] if lacks else []
     return Outcome(
         log=plan.log,
         folder=plan.folder,
@@ -113,6 +114,11 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         given_up=watch.given_up,
         used={s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},
     )
+
+
+def _says_no_more(ended: Ended, lacks: str) -> bool:
+    """Whether a process failed only because the final map lacks robots, which is named once."""
+    return bool(lacks) and ended.exit == 1 and ended.last_lines[-1:] == (f"error: {lacks}",)
 
 
 @contextmanager

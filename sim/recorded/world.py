@@ -4,11 +4,14 @@ from collections import deque
 from collections.abc import Collection, Iterable
 from typing import ClassVar, Protocol, runtime_checkable
 
+import msgspec
+
 from central.desk.verification.recorded import RerunError
 from sim.scenarios.scenario import Scenario, loads
 from team.pairs import NEEDS_MAP
 from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.arrays import floats, from_floats
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import WireError
 from team.wire.digest import configured
@@ -25,6 +28,19 @@ class Samples(Protocol):
 
     def samples(self, channels: Collection[ch.Channel] | None = None) -> Iterable[Sample]:
         """The samples of these channels; None: of all."""
+
+
+def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measurement:
+    """The measurement of a team that never had these robots: a sighting of them is left out."""
+    if not isinstance(measurement, m.Sightings) or not {*measurement.teammates} & {*robots}:
+        return measurement
+    kept = [k for k, teammate in enumerate(measurement.teammates) if teammate not in robots]
+    return msgspec.structs.replace(
+        measurement,
+        teammates=tuple(measurement.teammates[k] for k in kept),
+        ranges=from_floats(floats(measurement.ranges, "ranges")[kept]),
+        bearings=from_floats(floats(measurement.bearings, "bearings")[kept]),
+    )
 
 
 class RecordedWorld:
@@ -51,6 +67,7 @@ class RecordedWorld:
                 case m.Measurement() | m.Truth() if name in without:
                     pass
                 case m.Measurement():
+                    message = _without(message, without)
                     place = (message.robot, message.incarnation, message.number)
                     out = Outgoing(channel, name, message)
                     published.setdefault(place, (message.stamp_ns, out))

@@ -227,6 +227,8 @@ TEAM_FINAL = Channel(name="team_final", template="robot/{robot}/team/final", mes
                      recomputable=True, meaning="the final map by the peer's own fold")  # fmt: skip
 TEAM_TRAJECTORY = Channel(name="team_trajectory", template="robot/{robot}/team/trajectory", message=m.Trajectory, rate="once per incarnation",
                           delivery="all", recorded=True, recomputable=True, meaning="the peer's smoothed path in its final map")  # fmt: skip
+TEAM_WITHDRAWAL = Channel(name="team_withdrawal", template="robot/{robot}/team/withdrawal", message=m.Withdrawal, rate="once per robot that it withdraws",
+                          delivery="all", recorded=True, recomputable=False, meaning="the team goes on without a robot, by the peer's own fold")  # fmt: skip
 SET_SUMMARY = Channel(name="set_summary", template="{node}/set", message=m.SetSummary, rate="at most 1 Hz, when it has changed", delivery="latest",
                       recorded=True, recomputable=False, meaning="the members of the team's set that a peer has")  # fmt: skip
 CONCLUDED = Channel(name="concluded", template="robot/{robot}/concluded", message=m.Concluded, rate="once", delivery="all", recorded=True, recomputable=False,

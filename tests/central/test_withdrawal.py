@@ -26,6 +26,7 @@ from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.map_joining.joining import converged
 from team.estimation.map_joining.marginals import Agreement, SubmapCost, joint_cost, landmark_map
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
@@ -395,3 +396,24 @@ def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
     )
     fused = rule.conclude(0)[-1].message
     assert (fused.ids, fused.members, fused.withdrawn) == (b"", (), ("r1",))
+
+
+def test_a_withdrawn_robots_pose_is_taken_back_and_all_of_it_is_recomputed(tmp_path: Path) -> None:
+    of = scenario()
+    posing = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
+    samples = tuple(run(msgspec.structs.replace(of, robots=posing), "odometry"))
+    final = final_map(list(samples))
+    assert final.withdrawn == ("r3",)
+    newest = {robot: poses_of(samples, robot)[-1] for robot in ("r1", "r2", "r3")}
+    assert {name: each.in_team_frame for name, each in newest.items()} == {
+        "r1": True, "r2": True, "r3": False,
+    }  # fmt: skip
+    assert {newest[name].frame for name in ("r1", "r2")} == {final.frame}
+    result = verify(written(tmp_path / "log.mcap", samples))
+    assert result.first is None, str(result.first)
+    assert {c.channel for c in result.channels if c.equal} >= {"prior", "team_pose", "own_pose"}
+
+
+def poses_of(samples: tuple[Sample, ...], robot: str) -> list[m.PoseEstimate]:
+    found = [opened(sample) for sample in samples if sample.key == ch.TEAM_POSE.key(robot)]
+    return [message for _, _, message in found if isinstance(message, m.PoseEstimate)]

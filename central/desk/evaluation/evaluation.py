@@ -37,8 +37,9 @@ from central.desk.evaluation.matching import Matching, nearest
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.desk.evaluation.running import TruthFrames
+from central.desk.evaluation.states import RobotState, not_in_the_map, robot_states
 from central.desk.evaluation.verdicts import verdicts_given
-from central.desk.names import in_order, not_joined
+from central.desk.names import in_order, not_joined, short
 from central.team_config import TeamConfig, team_config
 from team import translate
 from team.config import UNNAMED
@@ -139,6 +140,7 @@ class Evaluation:
     arbitrary_frame: the map contains no robot with a known initial pose, so its frame is not the
     truth's, and only aligned errors are meaningful. decisions: closures and merges by landmarks
     without identities, from the final map. verdicts: an operator's on such landmarks, in words.
+    states: of every robot of the team in the final map.
     """
 
     scenario: TeamConfig | None
@@ -158,6 +160,16 @@ class Evaluation:
     decisions: tuple[m.AssociationDecision, ...] = ()
     verdicts: tuple[str, ...] = ()
     gps_median_m: float | None = None
+    states: Mapping[str, RobotState] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The warnings about a run's result, for every command that shows it: robots that are not
+        in the map, and the map's own.
+        """
+        reasons = () if self.map is None else self.map.reasons
+        of_map = (short(each) for each in reasons if not any(not_joined([each])))
+        return (*not_in_the_map(self.states), *of_map)
 
     @property
     def matched_by(self) -> str:
@@ -216,7 +228,6 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         channels={key: log.traffic[key] for key in in_order(log.traffic)},
         notes=(
             *(end.notes if isinstance(end, m.End) else ()),
-            *_lost(fused),
             *log.disagreement,
             *_never_came(log),
             *_set_aside(faults),
@@ -230,6 +241,9 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         disagreement=log.disagreement,
         association=association,
         decisions=() if message is None else message.decisions,
+        states=robot_states(
+            log, message, () if scenario is None else [each.id for each in scenario.robots]
+        ),
         verdicts=verdicts_given(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
     )
@@ -238,8 +252,9 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
 def _frames(log: Collected) -> TruthFrames:
     """The frames that the initial poses in the log fix."""
     frames = TruthFrames()
-    for start in log.starts():
-        frames.take(start)
+    for start in (each for robot in log.robots for each in log.messages(ch.START, robot)):
+        if isinstance(start, m.InitialPose):
+            frames.take(start)
     return frames
 
 
@@ -248,12 +263,6 @@ def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
     if fused is None or not fused.members:
         return frames.none_is_known
     return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
-
-
-def _lost(fused: MapResult | None) -> list[str]:
-    """The robots of which the final map lacks submaps."""
-    lost = () if fused is None else fused.lost
-    return [f"the final map is provisional: {robot} lost, and not wholly in it" for robot in lost]
 
 
 def _never_came(log: Collected) -> list[str]:
@@ -333,9 +342,10 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "final_map_frame": None if fused is None else fused.frame,
         "frame_is_arbitrary": evaluation.arbitrary_frame,
         "not_joined": [] if fused is None else list(fused.reasons),
-        "warnings": [] if fused is None else [w for w in fused.reasons if not any(not_joined([w]))],
+        "warnings": list(evaluation.warnings),
         "joined": [] if fused is None else list(fused.joined),
         "withdrawn": [] if fused is None else list(fused.withdrawn),
+        "robot_states": {name: of._asdict() for name, of in evaluation.states.items()},
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
         "peers": {name: peer_json(peer) for name, peer in evaluation.peers.items()},
         "channels": {

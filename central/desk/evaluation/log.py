@@ -39,6 +39,8 @@ _COLLECTED = frozenset(
         ch.SUBMAP,
         ch.ROBOT_DONE,
         ch.VERDICT,
+        ch.WITHDRAWAL,
+        ch.ORDER,
     )
 )
 _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE))
@@ -122,18 +124,6 @@ class Collected:
         for sample in self.samples.get(channel.key(robot), []):
             message = self.sound(sample)
             if message is not None:
-                found.append(message)
-        return found
-
-    def starts(self) -> list[m.InitialPose]:
-        """The initial poses of all streams; an invalid one has been counted as a measurement."""
-        found = []
-        for sample in (s for name in self.robots for s in self.samples.get(ch.START.key(name), [])):
-            try:
-                message = opened(sample)[2]
-            except WireError:
-                continue
-            if isinstance(message, m.InitialPose):
                 found.append(message)
         return found
 

@@ -46,9 +46,9 @@ class Run:
         return found
 
 
-def nis_line(run: Run) -> str | None:
+def nis_line(history: History) -> str | None:
     """NIS per degree of freedom of every robot in one line; None where nothing was predicted."""
-    per_dof = {name: of.per_dof for name, of in run.history.innovations.items()}
+    per_dof = {name: of.per_dof for name, of in history.innovations.items()}
     parts = [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]
     return f"NIS per dof: {', '.join(parts)}" if parts else None
 

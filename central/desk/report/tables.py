@@ -101,9 +101,10 @@ def team_rows(evaluation: Evaluation) -> Rows:
     if fused is None:
         return [("final map", "none: the run did not come to its end")]
     errors, arbitrary = fused.errors, evaluation.arbitrary_frame
+    states = state_rows(evaluation)
     if not len(fused.ids) and fused.reasons:
-        return [("final map", f"empty: {'; '.join(fused.reasons)}")]
-    rows = [("landmarks", f"{len(fused.ids)} in the final map")]
+        return [("final map", f"empty: {'; '.join(fused.reasons)}"), *states]
+    rows = [("landmarks", f"{len(fused.ids)} in the final map"), *states]
     if errors is None:
         rows.append(("landmark errors", f"can not be computed: {_without_truth(evaluation)}"))
     else:
@@ -127,7 +128,6 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += _association_rows(evaluation)
     rows += [("joined", short(words)) for words in fused.joined]
-    rows += [("not joined", f"{who}: {why}") for who, why in not_joined(fused.reasons)]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
     rows += [("verdict", words) for words in evaluation.verdicts]
     meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
@@ -146,6 +146,20 @@ def _without_truth(evaluation: Evaluation) -> str:
     if not len(evaluation.true_landmarks):
         return "no true landmarks"
     return "no true landmark can be matched to one of the map's"
+
+
+def state_rows(evaluation: Evaluation) -> Rows:
+    """Every robot of the team with its state in the final map; those that are joined in one row."""
+    states = evaluation.states
+    joined = [name for name, of in states.items() if of.state == "joined"]
+    rows = [("robots in the map", ", ".join(joined) or "none")] if states else []
+    if any(of.state == "alone" for of in states.values()):
+        rows = [("robots, each by itself", ", ".join(states))]
+    return rows + [
+        (of.state, f"{name}: {of.why}")
+        for name, of in states.items()
+        if of.state not in {"joined", "alone"}
+    ]
 
 
 def in_words(errors: MapErrors, *, joint: bool) -> str:

@@ -22,7 +22,7 @@ def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
     lost: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(the_end, "FINAL_S", 0.1)
-    final = msgspec.structs.replace(FINAL, final=True, lost=lost)
+    final = msgspec.structs.replace(FINAL, final=True, lost=lost, withdrawn=())
     network = MemoryNetwork()
     router = MemoryBus(network)
     router.answer(

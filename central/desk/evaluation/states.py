@@ -1,0 +1,77 @@
+"""What became of each robot of a team in the final map."""
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Literal, NamedTuple
+
+from central.desk.evaluation.log import Collected
+from central.desk.names import in_order, not_joined
+from team.wire import channels as ch
+from team.wire import messages as m
+
+State = Literal["joined", "not joined", "withdrawn", "lost", "alone"]
+"""joined: in the team's map. not joined: its map, if it has one, is beside the team's. withdrawn:
+left out by an order, or since it contradicts the rest. lost: its stream is not wholly in the map.
+alone: the rule fuses nothing."""
+UNNAMED_REASON = "the log does not contain the reason"
+NO_MEMBER = "nothing of it is in the map"
+
+
+class RobotState(NamedTuple):
+    """A robot's state in the final map, and the reason for any but joined; in words."""
+
+    state: State
+    why: str = ""
+
+
+def robot_states(
+    log: Collected, fused: m.FusedMap | None, robots: Collection[str]
+) -> dict[str, RobotState]:
+    """The state of every robot of the team; empty without a final map."""
+    if fused is None:
+        return {}
+    members = {member.robot for member in fused.members}
+    team = {*robots, *log.robots, *fused.withdrawn, *fused.lost, *members}
+    if not members and fused.rule != "join":
+        return {name: RobotState("alone") for name in in_order(team)}
+    apart = {name: why for who, why in not_joined(fused.reasons) for name in who.split(", ")}
+    because = dict(_withdrawals(log))
+
+    def state_of(name: str) -> RobotState:
+        if name in fused.withdrawn:
+            return RobotState("withdrawn", because.get(name, UNNAMED_REASON))
+        if name in fused.lost:
+            return RobotState("lost", "its stream is not wholly in the map")
+        if name in apart:
+            return RobotState("not joined", apart[name])
+        if name in members:
+            return RobotState("joined")
+        return RobotState("not joined", _reason_in(fused, name) or NO_MEMBER)
+
+    return {name: state_of(name) for name in in_order(team)}
+
+
+def _withdrawals(log: Collected) -> Iterator[tuple[str, str]]:
+    """The robots that were withdrawn, by whom and why; an order comes last, since it holds."""
+    for channel in (ch.WITHDRAWAL, ch.ORDER):
+        for key in sorted(log.samples):
+            if channel.owner(key) is None:
+                continue
+            for sample in log.samples[key]:
+                message = log.sound(sample)
+                if isinstance(message, m.Withdrawal):
+                    yield message.robot, f"by {message.by}: {message.reason}"
+
+
+def _reason_in(fused: m.FusedMap, name: str) -> str:
+    """What a map of another rule than join says of a robot that is not in it."""
+    found = (each.partition(": ") for each in fused.reasons)
+    return next((why for who, _, why in found if who == name), "")
+
+
+def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
+    """The robots that are not, or not wholly, in the map, with their states, in words."""
+    return tuple(
+        f"{name} {of.state}{': ' if of.why else ''}{of.why}"
+        for name, of in states.items()
+        if of.state not in {"joined", "alone"}
+    )

@@ -1,0 +1,143 @@
+"""Every robot of the team has a state in the result, with the reason."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from central.desk.evaluation.history import history
+from central.desk.report.page import write_report
+from central.desk.report.run import Run
+from central.desk.report.tables import summary_tables, team_rows
+from sim.cli.rerun import app
+from sim.in_memory.team import final_map, run_team
+from sim.world.simulator import simulated
+from sim.world.streams import WorldStreams
+from team.containment import Boundary
+from team.shell import FaultyRunError, judge
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Sample
+from team.wire.codec import decoded, encoded
+from tests.central.test_withdrawal import run, scenario
+from tests.sim.reruns import written
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    """A run in memory of which the centre withdraws r3."""
+    return run(scenario(), "odometry")
+
+
+@pytest.fixture(scope="module")
+def result(samples: list[Sample]) -> Evaluation:
+    return evaluate(samples)
+
+
+def test_the_tables_the_page_and_the_figures_name_a_withdrawn_robot_by_whom_and_why(
+    samples: list[Sample], result: Evaluation, tmp_path: Path
+) -> None:
+    state = result.states["r3"]
+    assert state.state == "withdrawn"
+    assert state.why.startswith("by central: its submaps contradict")
+    assert [result.states[name].state for name in ("r1", "r2")] == ["joined", "joined"]
+    rows = dict(team_rows(result))
+    assert rows["robots in the map"] == "r1, r2"
+    assert rows["withdrawn"] == f"r3: {state.why}"
+    assert summary_tables(result)
+    figures = to_json(result)
+    assert figures["robot_states"]["r3"] == {"state": "withdrawn", "why": state.why}
+    assert any(each.startswith("r3 withdrawn: by central") for each in figures["warnings"])
+    write_report(Run(result, history(samples), {}), tmp_path, figures)
+    assert "r3: by central: its submaps contradict" in (tmp_path / "report.html").read_text()
+
+
+def test_a_rerun_gives_the_same_warnings_and_ends_with_1(
+    samples: list[Sample], result: Evaluation, tmp_path: Path
+) -> None:
+    log = written(tmp_path / "log.mcap", samples)
+    figures = tmp_path / "rerun.json"
+    path = str(log.path)
+    found = CliRunner().invoke(app, ["rerun", path, "--json", str(figures)], env={"COLUMNS": "300"})
+    assert found.exit_code == 1, found.output
+    for warning in result.warnings:
+        assert f"warning: {warning}" in found.output
+    assert "NIS per dof: " in found.output
+    assert json.loads(figures.read_text())["recomputed"]["robot_states"]["r3"]["why"]
+    left_out = CliRunner().invoke(app, ["rerun", path, "--without", "r3"], env={"COLUMNS": "300"})
+    assert left_out.exit_code == 0, "the others have seen it, which is left out, too"
+
+
+def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothing_is_named(
+    samples: list[Sample],
+) -> None:
+    def changed(final: m.FusedMap) -> m.FusedMap:
+        why = ("r2 (incarnation 1) not joined: 0 shared landmarks, 2 needed",)
+        members = tuple(each for each in final.members if each.robot != "r1")
+        return msgspec.structs.replace(
+            final, reasons=why, members=members, lost=("r3",), withdrawn=()
+        )
+
+    result = evaluate(with_final(samples, changed))
+    assert {name: of.state for name, of in result.states.items()} == {
+        "r1": "not joined", "r2": "not joined", "r3": "lost",
+    }  # fmt: skip
+    assert result.states["r1"].why == "nothing of it is in the map"
+    assert result.states["r2"].why == "0 shared landmarks, 2 needed"
+
+
+def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]) -> list[Sample]:
+    """The samples with another final map."""
+    return [
+        msgspec.structs.replace(s, payload=encoded(change(decoded(s.payload, m.FusedMap))))
+        if s.key == ch.FINAL_MAP.key()
+        else s
+        for s in samples
+    ]
+
+
+def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed() -> None:
+    """r1 alone has a known start; it is withdrawn, and the map is in the frame of r2."""
+    of = scenario()
+    streams = simulated(of.world, of.robots, of.seed)
+    streams = without_starts(streams, "r2", "r3")
+    wrong = list(run_team(of, streams))
+    order = m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="its wheel is flat")
+    final = final_map(wrong)
+    gone = msgspec.structs.replace(
+        final,
+        frame="r2/1",
+        withdrawn=("r1",),
+        members=tuple(each for each in final.members if each.robot != "r1"),
+    )
+    told = [*with_final(wrong, lambda _: gone)]
+    told.append(Sample(ch.ORDER.key("r1"), encoded(order), 0, 0, 0))
+    result = evaluate(told)
+    assert result.arbitrary_frame
+    assert result.states["r1"] == ("withdrawn", "by operator: its wheel is flat")
+    rows = dict(team_rows(result))
+    assert rows["landmark RMSE"].startswith("–")
+    assert "map NEES per dof" not in rows
+    assert "landmarks within 95 %" not in rows
+    assert result.robots["r1"].outside, "its poses are in the frame of its own start"
+
+
+def without_starts(streams: WorldStreams, *robots: str) -> WorldStreams:
+    """The streams, with the initial poses of these robots unknown."""
+    return replace(
+        streams,
+        streams=tuple(replace(s, start=None) if s.robot in robots else s for s in streams.streams),
+    )
+
+
+def test_a_process_whose_final_map_is_without_a_withdrawn_robot_ends_with_1(
+    samples: list[Sample],
+) -> None:
+    final = next(s for s in reversed(samples) if s.key == ch.FINAL_MAP.key())
+    with pytest.raises(FaultyRunError, match="the final map is without r3: withdrawn"):
+        judge(Boundary("robot/r1"), decoded(final.payload, m.FusedMap))
