@@ -23,6 +23,7 @@ from team.estimation.map_joining.distinctness import lost, maybe_the_same, misse
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
 from team.estimation.map_joining.refusal import refusals
+from team.estimation.map_joining.repetition import Repetition, repetitions
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -118,6 +119,7 @@ class Shown(NamedTuple):
     weak: landmarks that are left out since only submaps of a poorly known heading have them.
     missed: landmarks that are left out since nearly all submaps that look there miss them.
     headings: of the streams that were lost, the standard deviation [rad] of their least known one.
+    repeated: parts of the map that repeat others; their landmarks are left out.
     """
 
     ids: Sequence[int] = ()
@@ -125,6 +127,7 @@ class Shown(NamedTuple):
     weak: Sequence[int] = ()
     missed: Sequence[int] = ()
     headings: Mapping[Stream, float] = MappingProxyType({})
+    repeated: Sequence[Repetition] = ()
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
@@ -145,7 +148,10 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     out, view = {*weak, *seldom}, IslandView(fold.main, fold.landmarks)
     undecided = maybe_the_same(view, {*unnamed} - out)
     left = [id_ for id_ in ids if id_ not in out | {*undecided}]
-    return Shown(left, undecided, weak, seldom, lost(fold.main))
+    repeated = repetitions(fold.main, left)
+    copies = {id_ for each in repeated for id_ in each.ids}
+    left = [id_ for id_ in left if id_ not in copies]
+    return Shown(left, undecided, weak, seldom, lost(fold.main), repeated)
 
 
 def reasons(
@@ -157,6 +163,7 @@ def reasons(
         *_worded(refusals(fold)),
         *fold.warnings,
         *_lost(shown),
+        *_repeated(shown),
         *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
@@ -171,12 +178,28 @@ def _lost(shown: Shown) -> Iterator[str]:
         )
 
 
+def _repeated(shown: Shown) -> Iterator[str]:
+    """Where the map repeats itself, in words: two causes that the set does not tell apart."""
+    for each in shown.repeated:
+        x, y = each.place
+        dx, dy, turn = each.moved
+        yield (
+            f"two places look alike: from submap {each.first} on (t = {each.begin_ns * 1e-9:.0f} "
+            f"to {each.end_ns * 1e-9:.0f} s) {named(each.stream)} maps {len(each.ids)} landmarks "
+            f"that it shares with nothing before, and {len(each.pairs)} of them repeat the shape "
+            f"of {len(each.pairs)} others; either the building repeats itself, or the robot was "
+            f"carried off or slipped at ({x:.1f}, {y:.1f}) m by ({dx:+.1f}, {dy:+.1f}) m and "
+            f"{np.degrees(turn):+.0f}°; these landmarks are left out"
+        )
+
+
 def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...]:
     """Landmarks left out of the map, in words."""
     if not fold.contributions:
         return ()
     known = landmark_view.known(fold.main)
-    out = sorted({*known} - {*shown.ids, *shown.undecided, *shown.weak, *shown.missed})
+    copies = {id_ for each in shown.repeated for id_ in each.ids}
+    out = sorted({*known} - {*shown.ids, *shown.undecided, *shown.weak, *shown.missed, *copies})
     needed = max(landmark_submaps, CONFIRMED_BY if out and out[-1] >= UNNAMED else 0)
     pairs = [f"{id_} with {other}" for id_, other in sorted(shown.undecided.items())]
     named_out = [str(id_) for id_ in out if id_ < UNNAMED]

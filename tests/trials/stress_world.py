@@ -1,0 +1,276 @@
+"""Write data sets with a known fault, by a generator of its own: it imports nothing of the project.
+
+    python -m tests.trials.stress_world FOLDER --hidden --carried-off r2 15 2.0 150
+    python -m tests.trials.stress_world FOLDER --late r2 0.2
+
+Robots drive exact arcs in a square and measure landmarks by range and bearing. A fault changes the
+measurements alone, never the truth. SI units, radians.
+"""
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import pi
+from pathlib import Path
+
+import numpy as np
+
+STEP_S = 0.1
+"""Time between two odometry intervals [s]."""
+SCAN_EVERY = 5
+"""Odometry intervals from one scan to the next."""
+SPEED = 1.0
+"""Nominal speed [m/s]."""
+
+
+@dataclass(frozen=True)
+class CarriedOff:
+    """A robot is put elsewhere at a time, and its odometry does not measure it."""
+
+    robot: str
+    metres: float
+    radians: float
+    at_s: float
+
+
+@dataclass(frozen=True)
+class MovedLandmark:
+    """A landmark is elsewhere from a time on: another place, by (dx, dy)."""
+
+    landmark: int
+    shift: tuple[float, float]
+    from_s: float
+
+
+@dataclass(frozen=True)
+class StressWorld:
+    """A world and its faults.
+
+    late: by robot, the time by which its detections are stamped after the truth [s].
+    odometry_scale: factor on the logged speeds. bearing_offset: added to all bearings [rad], by
+    robot. mirrored: robots whose bearings have the wrong sign. same_id: pairs (a, b): landmark b
+    is measured with the identity of a. noise: factor on the noise of odometry and sensor.
+    """
+
+    seed: int = 1
+    robots: int = 3
+    landmarks: int = 25
+    half_m: float = 20.0
+    seconds: float = 300.0
+    reach_m: float = 10.0
+    hidden: bool = False
+    starts: bool = True
+    carried_off: tuple[CarriedOff, ...] = ()
+    late: Mapping[str, float] = field(default_factory=dict)
+    odometry_scale: float = 1.0
+    bearing_offset: Mapping[str, float] = field(default_factory=dict)
+    moved: tuple[MovedLandmark, ...] = ()
+    mirrored: tuple[str, ...] = ()
+    outlier_share: float = 0.0
+    same_id: tuple[tuple[int, int], ...] = ()
+    noise: float = 1.0
+
+
+SCENARIO = """\
+seed = {seed}
+
+[world]
+kind = "folder"
+{unknown}
+[defaults.motion]
+kind = "velocity"
+forward = {{ per_m = 0.03 }}
+turn = {{ per_m = 0.01, per_s = 0.005, per_rad = 0.05 }}
+lateral = {{ per_m = 0.01 }}
+
+[defaults.sensor]
+range_sigma = 0.05
+range_sigma_per_m = 0.02
+bearing_sigma = 0.02
+max_range = {reach}
+
+[defaults.front_end]
+particles = 100
+window_s = 10.0
+"""
+
+
+def write(world: StressWorld, folder: Path | str) -> Path:
+    """Write the CSV tables of a world, with the scenario that states its noise; returns the
+    folder.
+    """
+    place, rng = Path(folder), np.random.default_rng(world.seed)
+    place.mkdir(parents=True, exist_ok=True)
+    points = _spread(world, rng)
+    rows = [f"{i + 1},{x!r},{y!r}" for i, (x, y) in enumerate(points.tolist())]
+    _table(place / "landmarks.csv", "landmark,x_m,y_m", rows)
+    unknown = "" if world.starts else 'unknown_starts = ["*"]\n'
+    text = SCENARIO.format(seed=world.seed, reach=world.reach_m + 2.0, unknown=unknown)
+    (place / "scenario.toml").write_text(text)
+    for number in range(1, world.robots + 1):
+        _robot(world, f"r{number}", points, place / f"r{number}", rng)
+    return place
+
+
+def _spread(world: StressWorld, rng: np.random.Generator) -> np.ndarray:
+    """Landmarks in the square, at least 3 m apart where there is room."""
+    points: list[np.ndarray] = []
+    tries = 0
+    while len(points) < world.landmarks:
+        point = rng.uniform(-world.half_m, world.half_m, 2)
+        tries += 1
+        if tries > 10_000 or all(np.hypot(*(point - each)) > 3.0 for each in points):
+            points.append(point)
+    return np.array(points).reshape(-1, 2)
+
+
+def _robot(
+    world: StressWorld, name: str, points: np.ndarray, place: Path, rng: np.random.Generator
+) -> None:
+    place.mkdir(exist_ok=True)
+    count = round(world.seconds / STEP_S)
+    pose = np.array(
+        [*rng.uniform(-0.4 * world.half_m, 0.4 * world.half_m, 2), rng.uniform(-pi, pi)]
+    )
+    start, path, speeds, logged = pose.copy(), [pose], [], []
+    off = {round(each.at_s / STEP_S): each for each in world.carried_off if each.robot == name}
+    goal = rng.uniform(-0.8 * world.half_m, 0.8 * world.half_m, 2)
+    for k in range(count):
+        if k in off:
+            away = rng.uniform(-pi, pi)
+            shift = off[k].metres * np.array([np.cos(away), np.sin(away)])
+            moved = pose[:2] + shift
+            if np.abs(moved).max() > world.half_m:
+                moved = pose[:2] - shift
+            pose = np.array([*moved, pose[2] + off[k].radians])
+            path[-1] = pose
+        ahead = goal - pose[:2]
+        if np.hypot(*ahead) < 2.0:
+            goal = rng.uniform(-0.8 * world.half_m, 0.8 * world.half_m, 2)
+        error = (np.arctan2(ahead[1], ahead[0]) - pose[2] + pi) % (2 * pi) - pi
+        turn = float(np.clip(0.8 * error, -0.6, 0.6))
+        speed = SPEED * (1.0 if abs(error) < 1.0 else 0.4)
+        speeds.append((speed, turn))
+        pose = _arc(pose, speed, turn, STEP_S)
+        path.append(pose)
+        way, angle = speed * STEP_S, turn * STEP_S
+        sigma_way = 0.03 * np.sqrt(way)
+        sigma_turn = np.sqrt(0.01**2 * way + 0.005**2 * STEP_S + 0.05**2 * abs(angle))
+        slip = world.noise * sigma_way * rng.standard_normal() / STEP_S
+        twist = world.noise * sigma_turn * rng.standard_normal() / STEP_S
+        logged.append((world.odometry_scale * (speed + slip), turn + twist))
+    times = STEP_S * np.arange(count + 1)
+    rows = [
+        f"{t:.3f},{float(v)!r},{float(w)!r}" for t, (v, w) in zip(times[:-1], logged, strict=True)
+    ]
+    _table(
+        place / "odometry.csv", "t_s,forward_m_s,yaw_rate_rad_s", [*rows, f"{times[-1]:.3f},0,0"]
+    )
+    poses = zip(times, np.array(path).tolist(), strict=True)
+    rows = [f"{t:.3f},{x!r},{y!r},{a!r}" for t, (x, y, a) in poses]
+    _table(place / "truth.csv", "t_s,x_m,y_m,theta_rad", rows)
+    if world.starts:
+        x, y, a = start.tolist()
+        _table(place / "start.csv", "x_m,y_m,theta_rad", [f"{x!r},{y!r},{a!r}"])
+    _scans(world, name, points, path, place, rng)
+
+
+def _arc(pose: np.ndarray, speed: float, turn: float, seconds: float) -> np.ndarray:
+    """The pose after an exact arc."""
+    angle = turn * seconds
+    chord = speed * seconds * np.sinc(angle / 2 / pi)
+    heading = pose[2] + angle / 2
+    end = pose + np.array([chord * np.cos(heading), chord * np.sin(heading), angle])
+    end[2] = (end[2] + pi) % (2 * pi) - pi
+    return end
+
+
+def _scans(
+    world: StressWorld,
+    name: str,
+    points: np.ndarray,
+    path: list[np.ndarray],
+    place: Path,
+    rng: np.random.Generator,
+) -> None:
+    late = world.late.get(name, 0.0)
+    sign = -1.0 if name in world.mirrored else 1.0
+    alias = {b: a for a, b in world.same_id}
+    rows, labels = [], []
+    for k in range(SCAN_EVERY, len(path) - SCAN_EVERY - round(max(late, 0.0) / STEP_S), SCAN_EVERY):
+        stamp, pose = k * STEP_S + late, path[k]
+        now = points.copy()
+        for each in world.moved:
+            if k * STEP_S >= each.from_s:
+                now[each.landmark - 1] += each.shift
+        away = now - pose[:2]
+        ranges = np.hypot(*away.T)
+        bearings = np.arctan2(away[:, 1], away[:, 0]) - pose[2]
+        for i in np.flatnonzero(ranges < world.reach_m).tolist():
+            sigma = np.hypot(0.05, 0.02 * ranges[i])
+            z = ranges[i] + world.noise * sigma * rng.standard_normal()
+            b = bearings[i] + world.noise * 0.02 * rng.standard_normal()
+            b = sign * (b + world.bearing_offset.get(name, 0.0))
+            if rng.random() < world.outlier_share:
+                z, b = rng.uniform(0.5, world.reach_m), rng.uniform(-pi, pi)
+            b, z = (b + pi) % (2 * pi) - pi, max(z, 0.01)
+            numbers = f"{float(z)!r},{float(b)!r}"
+            own = alias.get(i + 1, i + 1)
+            labels.append(f"{own}")
+            rows.append(
+                f"{stamp:.3f},{numbers}" if world.hidden else f"{stamp:.3f},{own},{numbers}"
+            )
+    if world.hidden:
+        _table(place / "detections.csv", "t_s,range_m,bearing_rad", rows)
+        _table(place / "labels.csv", "landmark", labels)
+    else:
+        _table(place / "observations.csv", "t_s,landmark,range_m,bearing_rad", rows)
+
+
+def _table(path: Path, head: str, rows: list[str]) -> None:
+    path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Write one world with the faults that the arguments name."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    for name, of in (("seed", int), ("robots", int), ("landmarks", int), ("seconds", float)):
+        parser.add_argument(f"--{name}", type=of, default=getattr(StressWorld, name))
+    parser.add_argument("--hidden", action="store_true")
+    parser.add_argument("--no-starts", action="store_true")
+    off = ("ROBOT", "METRES", "RADIANS", "AT_S")
+    parser.add_argument("--carried-off", nargs=4, action="append", default=[], metavar=off)
+    parser.add_argument("--late", nargs=2, action="append", default=[], metavar=("ROBOT", "S"))
+    parser.add_argument("--bearing-offset", nargs=2, action="append", default=[])
+    parser.add_argument("--odometry-scale", type=float, default=1.0)
+    parser.add_argument("--moved", nargs=4, action="append", default=[])
+    parser.add_argument("--mirrored", nargs="*", default=[])
+    parser.add_argument("--outliers", type=float, default=0.0)
+    parser.add_argument("--same-id", nargs=2, action="append", default=[])
+    given = parser.parse_args()
+    world = StressWorld(
+        seed=given.seed,
+        robots=given.robots,
+        landmarks=given.landmarks,
+        seconds=given.seconds,
+        hidden=given.hidden,
+        starts=not given.no_starts,
+        carried_off=tuple(
+            CarriedOff(r, *(float(each) for each in rest)) for r, *rest in given.carried_off
+        ),
+        late={robot: float(by) for robot, by in given.late},
+        odometry_scale=given.odometry_scale,
+        bearing_offset={robot: float(by) for robot, by in given.bearing_offset},
+        moved=tuple(
+            MovedLandmark(int(i), (float(x), float(y)), float(t)) for i, x, y, t in given.moved
+        ),
+        mirrored=tuple(given.mirrored),
+        outlier_share=given.outliers,
+        same_id=tuple((int(a), int(b)) for a, b in given.same_id),
+    )
+    print(write(world, given.folder))
+
+
+if __name__ == "__main__":
+    main()
