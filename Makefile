@@ -2,6 +2,7 @@
 #
 #   make run        a team maps a random place; what `make test` needs is not installed for it
 #   make test       all tests
+#   make bounds     extreme messages at every node, the kernels compiled once more with checked indices
 #   make check      format, lint, strict types, the direction of imports
 #   make bench      the benchmarks against their committed baselines; half an hour on a free machine
 #   make docs       the documentation site, docs/_build/site/index.html, and the pictures of its gallery
@@ -31,7 +32,7 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: run test check bench docs setup constraints clean
+.PHONY: run test bounds check bench docs setup constraints clean
 
 run: $(VENV)/.runtime
 	$(BIN)/teamslam launch waypoints --speed 20
@@ -40,6 +41,11 @@ run: $(VENV)/.runtime
 test: $(VENV)/.dev
 	tests/get-chromium
 	$(BIN)/pytest --numprocesses 3
+
+# Of their own folder, since a kernel's cached code does not name the option; some ten minutes at first.
+bounds: $(VENV)/.dev
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/bounds TEAMSLAM_STORM=20 \
+	  $(BIN)/pytest --numprocesses 3 tests/test_hostile_messages.py tests/robot/test_total.py tests/central/test_total.py
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -143,8 +143,9 @@ def cloud(
 ) -> bytes:
     """Points of the plane with one value each, as float32."""
     packed = np.zeros((len(points), 4), "<f4")
-    packed[:, :2] = points
-    packed[:, 3] = values
+    with np.errstate(over="ignore"):  # infinite beyond 3e38
+        packed[:, :2] = points
+        packed[:, 3] = values
     kind = fox.PackedElementFieldNumericType.Float32
     fields = [
         fox.PackedElementField(name=each, offset=4 * i, type=kind)

@@ -1,0 +1,137 @@
+"""Extreme messages of every type, on every channel, given to every node: nothing raises.
+
+A message is decoded or refused by name; each node handles what its door lets in, within bounds of
+time and memory; what it answers is sound. TEAMSLAM_STORM=N draws N of each type for each channel;
+`make bounds` runs this file with the kernels' indices checked.
+"""
+
+import os
+import resource
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+
+from central.config import CentralConfig
+from central.desk.view.node import ViewerNode
+from central.node import CentralNode
+from central.peers.centre import PeerCentre
+from central.peers.robot import PeerRobot
+from team.config import FrontEnd, RobotConfig
+from team.containment import Boundary
+from team.recording.check import checked
+from team.recording.reader import open_log
+from team.recording.recorder import Recorder
+from team.recording.shell import RecordLoop
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from team.wire.codec import WireError, decoded, encoded
+from tests.extreme import CHANNELS, samples
+from tests.hostile_team import ROBOTS, S, mutated
+
+COUNT = int(os.environ.get("TEAMSLAM_STORM", "6"))
+MOST_MIB = 150
+"""Growth of the process over all messages of one type, kernels and their compilation included."""
+MOST_S = 30.0
+"""CPU time of all messages of one type at one node."""
+Node = RobotNode | CentralNode | PeerCentre | PeerRobot
+ROBOT = RobotConfig("r1", front_end=FrontEnd(particles=10, window_s=10.0))
+NODES: dict[str, Callable[[], Node]] = {
+    "robot": lambda: RobotNode(ROBOT),
+    "centre": lambda: CentralNode(CentralConfig(), ROBOTS),
+    "peer robot": lambda: PeerRobot(ROBOT, CentralConfig(), ROBOTS),
+    "peer centre": lambda: PeerCentre(CentralConfig(), ROBOTS),
+}
+CARRIED = sorted((kind for kind in CHANNELS if CHANNELS[kind]), key=m.tag_of)
+
+
+def peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+@cache
+def drawn(kind: type[m.Message], count: int) -> list[Sample]:
+    """Extreme messages of a class in a session of a robot that has begun; a tenth are mutated."""
+    rng = np.random.default_rng(sorted(m.BY_TAG).index(m.tag_of(kind)))
+    flips = Random(7)
+    found: list[Sample] = []
+    for k, (channel, name, payload) in enumerate(samples(rng, kind, count)):
+        data = mutated(flips, payload) if k % 10 == 9 else payload
+        found.append(Sample(channel.key(name), data, k, k, k))
+    return found
+
+
+def beginning() -> list[Sample]:
+    """A stream of each robot, so that extreme messages meet a window that is open."""
+    out = []
+    for robot in ROBOTS:
+        start = m.InitialPose(
+            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
+        )
+        out.append(Outgoing(ch.START, robot, start))
+        for k in range(1, 12):
+            motion = m.Odometry(
+                stamp_ns=k * S, robot=robot, incarnation=1, number=k, duration_ns=S, forward=1.0,
+                yaw_rate=0.1,
+            )  # fmt: skip
+            out.append(Outgoing(ch.ODOMETRY, robot, motion))
+    return [Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, 0) for each in out]
+
+
+def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door() -> None:
+    passed = {}
+    for kind in CARRIED:
+        sound = 0
+        for sample in drawn(kind, COUNT):
+            try:
+                sound += isinstance(opened(sample)[2], kind)
+            except WireError:
+                continue
+        passed[m.tag_of(kind)] = sound / len(drawn(kind, COUNT))
+    assert min(passed.values()) > 0.2, passed
+
+
+@pytest.mark.parametrize("kind", CARRIED, ids=m.tag_of)
+@pytest.mark.parametrize("name", NODES)
+def test_no_extreme_message_raises_in_a_node(name: str, kind: type[m.Message]) -> None:
+    node, boundary = NODES[name](), Boundary(name)
+    answers = node.begin()
+    before, began = peak_mib(), time.process_time()
+    for sample in [*beginning(), *drawn(kind, COUNT)]:
+        answers += boundary.take(node, sample)
+    assert boundary.faults == 0, boundary.last
+    assert time.process_time() - began < MOST_S
+    assert peak_mib() - before < MOST_MIB
+    for each in [*answers, Outgoing(ch.STATUS, name, node.status())]:
+        decoded(encoded(each.message), type(each.message))
+
+
+def test_no_extreme_message_raises_in_the_viewer() -> None:
+    viewer = ViewerNode()
+    for kind in CARRIED:
+        for sample in drawn(kind, COUNT):
+            try:
+                channel, _, message = opened(sample)
+            except WireError:
+                continue
+            viewer.handle(channel, message)
+
+
+def test_every_extreme_message_is_recorded_and_the_log_can_be_checked(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with Recorder(path, "t", {}) as recorder:
+        loop = RecordLoop(MemoryBus(MemoryNetwork()), recorder, ())
+        for kind in CARRIED:
+            loop.take(drawn(kind, COUNT))
+        loop.status(last=True)
+    assert sum(1 for _ in open_log(path).samples()) > 0
+    before, began = peak_mib(), time.process_time()
+    assert checked(open_log(path))
+    assert time.process_time() - began < MOST_S
+    assert peak_mib() - before < MOST_MIB
