@@ -6,9 +6,12 @@ import msgspec
 import pytest
 
 from central.config import CentralConfig
+from central.desk.evaluation.evaluation import evaluate
 from central.desk.ledger import ledger
 from central.desk.verification.recorded import recorded
 from central.desk.verification.verification import verify
+from sim.in_memory.team import run_team
+from sim.scenarios.scenario import load
 from sim.scenarios.source import streams_of
 from team.robot.ledger import IN_SIGHTING
 from team.robot.node import RobotNode
@@ -146,3 +149,12 @@ def test_with_the_grid_off_nothing_is_said_of_teammates():
     for robot in plain.robots:
         assert found.sent[ch.SIGHTING_FACTOR.key(robot.id)] == []
         assert {x.nodes for x in found.sent[ch.SUBMAP.key(robot.id)]} == {b""}
+
+
+def test_the_demo_uses_every_measurement_that_its_world_sends():
+    demo = load("waypoints")
+    run = evaluate(run_team(demo, streams_of(demo)))
+    used = [robot.consumption for robot in run.robots.values()]
+    assert [each.rejected for each in used] == [{}, {}, {}]
+    assert [each.used for each in used] == [each.published for each in used]
+    assert all(each.ledger[IN_SIGHTING] > 40 for each in used)
