@@ -18,6 +18,7 @@ from team.wire.codec import WireError
 
 LISTENS = (ch.TEAM_CONFIG, ch.TEAM_FINAL, ch.CONCLUDED, ch.GIVEN_UP, ch.ORDER)
 """The channels from which the agreement is computed."""
+_NAMES = frozenset(channel.name for channel in LISTENS)
 
 
 class Agreement:
@@ -37,7 +38,7 @@ class Agreement:
     def take(self, sample: Sample) -> None:
         """Take one sample; those of other channels, and invalid ones, are ignored."""
         found = ch.channel_of(sample.key)
-        if found is None or found[0] not in LISTENS:
+        if found is None or found[0].name not in _NAMES:
             return
         try:
             channel, name, message = opened(sample)

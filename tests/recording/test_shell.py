@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from itertools import count as count_from
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
 
@@ -60,6 +61,32 @@ def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path
                 [message.measurements for message in got if isinstance(message, m.Progress)]
             )
     assert told == [[], [PROGRESS_EVERY], [], [PROGRESS_EVERY + 10], []]
+
+
+CONCLUDED = next(message for message in examples() if isinstance(message, m.Concluded))
+GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost")
+
+
+@pytest.mark.parametrize("peers", [("r1", "r2", "r3"), ()], ids=["peers", "a centre"])
+def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(
+    path: Path, peers: tuple[str, ...]
+) -> None:
+    """Without a centre all peers' conclusions do, but for who is given up; with one its map."""
+    network = MemoryNetwork()
+    team, bus = MemoryBus(network), MemoryBus(network)
+    with Recorder(path, "t", {}) as recorder:
+        loop = RecordLoop(bus, recorder, (), peers=peers)
+
+        def ends_by(out: Outgoing) -> bool:
+            team.publish(out)
+            loop.take(bus.receive())
+            return loop.finished
+
+        for robot in ("r1", "r1", "r2"):
+            concluded = msgspec.structs.replace(CONCLUDED, robot=robot)
+            assert not ends_by(Outgoing(c.CONCLUDED, robot, concluded))
+        assert ends_by(Outgoing(c.GIVEN_UP, "robot/r3", GIVEN_UP)) == bool(peers)
+        assert ends_by(Outgoing(c.FINAL_MAP, "", FINAL))
 
 
 def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(
