@@ -131,6 +131,14 @@ def test_a_robots_own_map_is_nothing_in_a_team_with_a_centre() -> None:
     assert to_json(evaluation)["final_map_sha256"] == hashlib.sha256(encoded(TRUE)).hexdigest()
 
 
+@pytest.mark.parametrize("told", [True, False], ids=["by its robots", "by the scenario"])
+def test_no_message_of_a_robot_about_the_map_is_shown_in_a_team_with_a_centre(told: bool) -> None:
+    centre = PeersAsCentre(() if told else None)
+    running = msgspec.structs.replace(FORGED, final=False)
+    samples = [sample(ch.TEAM_MAP, "r1", running), final("r1", FORGED), concluded("r1", FORGED)]
+    assert [centre.of(each) for each in (scenario(peers=False), *samples)] == [None] * 4
+
+
 def test_a_viewer_is_given_the_final_map_once_and_when_all_have_it() -> None:
     centre = PeersAsCentre(ROBOTS)
     given = [centre.of(each) for each in (final("r1", FORGED), *HONEST)]

@@ -1,0 +1,49 @@
+"""The end of a team is taken from its author only, whatever is replied to who asks for it."""
+
+import msgspec
+import pytest
+
+from team.the_end import TheEnd
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import MemoryBus, MemoryNetwork, Sample
+from team.wire.codec import encoded
+from tests.support import examples
+
+FINAL = msgspec.structs.replace(
+    next(each for each in examples() if isinstance(each, m.FusedMap)), final=True
+)
+CENTRES = ch.FINAL_MAP.key()
+OF_R1, OF_R2 = (ch.TEAM_FINAL.key(robot) for robot in ("r1", "r2"))
+
+
+@pytest.fixture
+def bus() -> MemoryBus:
+    """A bus on which everyone's end is replied, and garbage, whatever was asked for."""
+
+    def kept(key: str, payload: bytes) -> bytes:
+        return encoded(m.Kept(stamp_ns=3, key=key, payload=payload, wall_ns=4, counter=5))
+
+    network = MemoryNetwork()
+    replies = [kept(key, encoded(FINAL)) for key in (CENTRES, OF_R1, OF_R2)]
+    garbage = [b"", kept(CENTRES, b"garbage"), kept("central/map", encoded(FINAL))]
+    MemoryBus(network).answer(ch.KEPT, "", lambda _: [*garbage, *replies])
+    return MemoryBus(network)
+
+
+@pytest.mark.parametrize(
+    ("ends", "robot", "taken"),
+    [
+        ((ch.FINAL_MAP,), "*", [CENTRES]),
+        ((ch.TEAM_FINAL,), "*", [OF_R1, OF_R2]),
+        ((ch.FINAL_MAP, ch.TEAM_FINAL), "r2", [CENTRES, OF_R2]),
+        ((ch.CONCLUDED,), "*", []),
+    ],
+    ids=["with a centre", "peers", "a driver", "by conclusions"],
+)
+def test_only_the_ends_that_the_team_has_are_taken(
+    bus: MemoryBus, ends: tuple[ch.Channel, ...], robot: str, taken: list[str]
+) -> None:
+    end = TheEnd(bus, "robot/r2", ends, robot)
+    assert end.missed() == [Sample(key, encoded(FINAL), 3, 4, 5) for key in taken]
+    assert end.missed() == [], "it asks again only after a while"
