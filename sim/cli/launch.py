@@ -198,7 +198,8 @@ def _launched(plan: "Plan") -> "Outcome":
 
     scenario = plan.scenario
     warm = (scenario.estimator, scenario.fusion)
-    with Starter(time.time_ns(), warm, plan.folder / "template.log", _Compiling().tell) as starter:
+    compiling = _Compiling()
+    with Starter(time.time_ns(), warm, plan.folder / "template.log", compiling.tell) as starter:
         from sim.launch.launch import LaunchError, launch
         from sim.launch.live import shown
 
@@ -206,12 +207,14 @@ def _launched(plan: "Plan") -> "Outcome":
             _compile(scenario)
         try:
             with shown(f"{scenario.name}, seed {scenario.seed}") as show:
-                return launch(plan, starter, show)
+                outcome = launch(plan, starter, show)
         except LaunchError as error:
             fail(str(error), FAILED)
         except KeyboardInterrupt:
             recorded_note = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
             fail(f"interrupted: every process of the team was ended{recorded_note}", FAILED)
+        outcome.compiling_s = compiling.took_s
+        return outcome
 
 
 def _keep_showing(url: str, log: Path) -> None:
@@ -315,9 +318,13 @@ KERNELS_TO_ESTIMATE = 5
 
 
 class _Compiling:
-    """Reports the compilation of kernels, which happens once per machine."""
+    """Reports the compilation of kernels, which happens once per installation.
+
+    took_s: the time since the first report [s].
+    """
 
     def __init__(self) -> None:
+        self.took_s = 0.0
         self._due = time.monotonic() + COMPILING_S
         self._first: tuple[int, float] | None = None
 
@@ -327,11 +334,12 @@ class _Compiling:
         """
         now = time.monotonic()
         self._first = self._first or (done, now)
+        self.took_s = now - self._first[1]
         if now < self._due:
             return
         self._due = now + COMPILING_S
         before, began = self._first
-        text = f"compiling the kernels, once per machine: {done} of about {of}"
+        text = f"compiling the kernels, once per installation: {done} of about {of}"
         if done - before >= KERNELS_TO_ESTIMATE:
             left_s = (now - began) / (done - before) * max(0, of - done)
             text += f", about {left_s:.0f} s left"
@@ -401,9 +409,10 @@ def _conclude(
     }
     try:
         log = replace(open_log(outcome.log), reading=steps.share)
-        evaluation = with_holes(evaluate(log.samples()), log)
+        plain = evaluate(log.samples())
+        evaluation = with_holes(plain, log)
     except (LogError, OSError) as error:
-        outcome.failures.append(f"the log can not be evaluated: {error}")
+        outcome.failures += [*outcome.deaths, f"the log can not be evaluated: {error}"]
         figures = extra
     else:
         figures = to_json(evaluation, extra)
@@ -426,12 +435,19 @@ def _conclude(
             outcome.failures.append("the run ended without a final map")
         outcome.failures += evaluation.disagreement
         outcome.failures += not_in_the_map(evaluation.states)  # with the reasons
+        is_whole = not outcome.failures and len(evaluation.notes) == len(plain.notes)
+        if outcome.deaths and is_whole:
+            text = "; ".join(outcome.deaths)
+            console.print(f"note: {text}; map and log are whole", markup=False, soft_wrap=True)
+        else:
+            outcome.failures += outcome.deaths
     for name in in_order(outcome.restarts):
         times = outcome.restarts[name]
         text = f"{name} was started again {times} time{'' if times == 1 else 's'}"
         console.print(text, highlight=False)
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
-    console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
+    compiling = f", {outcome.compiling_s:.0f} s of it compiling" if outcome.compiling_s > 1 else ""
+    console.print(f"{outcome.wall_s:.1f} s of wall time of the run{compiling}", highlight=False)
     if json_file is not None:
         _write_whole(json_file, json.dumps(figures, indent=2) + "\n")
     if outcome.failures:

@@ -39,8 +39,10 @@ class LaunchError(RuntimeError):
 class Outcome:
     """The result of a launch.
 
-    restarts: how often each process was started again. used: the resources of each process, over
-    all its lives.
+    deaths: processes that were killed at the very end, so that none was started again: no failure
+    where map and log are whole. restarts: how often each process was started again. used: the
+    resources of each process, over all its lives. compiling_s: the share of wall_s that went into
+    compiling kernels.
     """
 
     log: Path
@@ -48,9 +50,11 @@ class Outcome:
     wall_s: float
     processes: list[Ended]
     failures: list[str] = field(default_factory=list)
+    deaths: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     given_up: list[str] = field(default_factory=list)
     used: dict[str, Used] = field(default_factory=dict)
+    compiling_s: float = 0.0
 
 
 def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
@@ -95,14 +99,15 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
             supervise(services, bus, watch, show, plan.end_silent_s)
         ended = end_all([service.child for service in services])
     lacks = "" if watch.fused is None or not watch.fused.final else lacking(watch.fused)
-    failures = watch.failures + [
-        failure(e)
-        for e in ended
-        if e.exit != 0
-        and not e.asked
-        and not any(f.startswith(f"{e.name} ") for f in watch.failures)
-        and not _says_no_more(e, lacks)
+    wrong = [
+        each
+        for each in ended
+        if each.exit != 0
+        and not each.asked
+        and not any(text.startswith(f"{each.name} ") for text in watch.failures)
+        and not _says_no_more(each, lacks)
     ]
+    failures = watch.failures + [failure(each) for each in wrong if each.exit > 0]
     failures += [lacks] if lacks else []
     return Outcome(
         log=plan.log,
@@ -110,6 +115,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         wall_s=time.monotonic() - began,
         processes=ended,
         failures=failures,
+        deaths=[failure(each) for each in wrong if each.exit < 0],
         restarts=watch.restarts,
         given_up=watch.given_up,
         used={s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},

@@ -229,8 +229,10 @@ class Silence:
     @staticmethod
     def _note(watch: Watch, service: Supervised, state: str, silent_s: float) -> None:
         pid = service.child.pid
+        # A healthy process that is slow is not to be ended: only one that stands still for long.
+        stands_still = service.child.is_stopped or silent_s >= STARTING_S
         restart = f". To have it started again: kill -9 {pid}"
-        remedy = "" if state == COMPUTING else restart
+        remedy = restart if stands_still and state != COMPUTING else ""
         watch.note(
             f"{service.name} (pid {pid}) {state} and has said nothing for {silent_s:.0f} s: "
             f"the team may wait for it{remedy}"

@@ -1,5 +1,6 @@
 """Shows a log: the page, and Foxglove's WebSocket beside it."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ def session(
 
     growing: its recorder may still be running, or has not begun.
     """
+    # Every reader that comes and goes is told of on the console otherwise.
+    logging.getLogger("websockets").setLevel(logging.WARNING)
     with FoxgloveFeed(host, foxglove_port, live=growing) as foxglove:
         feed = Feed(Tail(log), foxglove)
         with serving(feed, host, port, growing=growing) as url:

@@ -6,6 +6,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -15,7 +16,12 @@ from central.desk.report import page
 from central.desk.report.run import Run
 from sim.cli import launch
 from sim.cli.main import app
+from sim.in_memory.team import run_team
 from sim.launch.launch import Outcome
+from sim.scenarios.scenario import dumps
+from team.recording.recorder import Recorder
+from team.wire import channels as ch
+from tests.sim.logs import scenario, streams
 
 
 def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_leaves_no_half_file(
@@ -62,3 +68,27 @@ def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_els
         f"{tmp_path}: can not write the report: No space left on device; "
         f"`teamslam report {outcome.log} -o FOLDER` makes it elsewhere"
     )
+
+
+@pytest.mark.parametrize("lost", ["nothing", "a measurement", "the final map"])
+def test_a_router_killed_as_the_run_ends_is_a_note_where_map_and_log_are_whole(
+    lost: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    of = scenario()
+    samples = list(run_team(of, streams(of)))
+    key = {"a measurement": ch.ODOMETRY.key("r1"), "the final map": ch.FINAL_MAP.key()}.get(lost)
+    without = next((n for n, sample in enumerate(samples) if sample.key == key), None)
+    log = tmp_path / "log.mcap"
+    with Recorder(log, of.team, {"scenario": dumps(of)}) as recorder:
+        recorder.write([sample for n, sample in enumerate(samples) if n != without])
+    death = "router (pid 7) was ended by SIGKILL"
+    outcome = Outcome(log=log, folder=tmp_path, wall_s=1.0, processes=[], deaths=[death])
+    if lost == "nothing":
+        launch._conclude(of, outcome, None, report=False)
+        assert f"note: {death}; map and log are whole" in capsys.readouterr().out
+        assert outcome.failures == []
+    else:
+        with pytest.raises(typer.Exit) as ended:
+            launch._conclude(of, outcome, None, report=False)
+        assert ended.value.exit_code == 1
+        assert death in outcome.failures
