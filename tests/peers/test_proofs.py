@@ -245,6 +245,38 @@ def test_a_certificate_that_is_not_the_authoritys_takes_no_place_of_the_true_one
     assert team.r2.take_sample(true.as_sample(0), "robot/r1")
 
 
+def test_an_order_by_an_operators_key_that_is_revoked_is_refused_once_the_next_one_is_seen(
+    tmp_path: Path,
+) -> None:
+    team = Renewed(tmp_path)
+    stolen = Signer(credentials_of(tmp_path, "operator", "t"))
+    make_keys(tmp_path, "t", [], revoke=["operator"])
+    make_keys(tmp_path, "t", nodes_of(ROBOTS))
+    present = Signer(credentials_of(tmp_path, "operator", "t"))
+
+    def carried(signer: Signer, robot: str, to: PeerNode, stamp_ns: int = 0) -> list[Member]:
+        order = m.Withdrawal(stamp_ns=stamp_ns, robot=robot, by="operator", reason="broken")
+        said = member(ch.ORDER, order)
+        return to.take_carried(
+            m.Members(
+                stamp_ns=0,
+                node="robot/r2",
+                keys=(said.key,),
+                payloads=(said.payload,),
+                signatures=(signed_order(signer, said).signature,),
+            )
+        )
+
+    assert carried(stolen, "r1", team.r3), "nothing that it has seen says otherwise"
+    assert carried(present, "r2", team.r3)
+    assert not carried(stolen, "r3", team.r3)
+    assert "an operator's certificate that is revoked" in team.r3.last_refused
+    with_roster = team.peer("r3")
+    assert not carried(stolen, "r1", with_roster), "its roster says so from the beginning"
+    assert not carried(present, "r1", with_roster, stamp_ns=2**62 - 1)
+    assert "stamped after the operator's certificate had ended" in with_roster.last_refused
+
+
 def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present_key(
     tmp_path: Path,
 ) -> None:
