@@ -1,18 +1,21 @@
 """Whole teams under `launch` whose processes are killed, or stopped for a while, at random.
 
+    python -m tests.trials.kills --acceptance --runs 20
     python -m tests.trials.kills --runs 20 --kills 3 --load 4
     python -m tests.trials.kills --runs 10 --stop 20 --what central,router
     python -m tests.trials.kills --runs 6 --kills 1 --stop inf --end-silent 12
     python -m tests.trials.kills --runs 10 --keys --verify
     python -m tests.trials.kills --runs 10 --without-centre --what robot,router,world
 
-Each run is a short world; with --keys behind certificates. Who is stopped for ever stays so until
-`launch --end-silent` ends it. The final map, --without-centre every robot's, is compared, byte by
-byte, with that of the same team in memory, where nobody dies, the log's content with the streams'
-own last counts; with --verify each log is computed again. A row per run, and a summary. --json FILE
-keeps what each run was, as it ends; called again with this file, only runs that are not in it are
-made. Ends with 1 unless every run ended with 0, with this map, left no process, and no hole in its
-log that `teamslam log check` does not name.
+--acceptance: with keys, each run with three kills and one stop of 12 s, of any process, beside two
+busy loops. Each run is a short world; with --keys behind certificates. Who is stopped for ever
+stays so until `launch --end-silent` ends it. The final map, --without-centre every robot's, is
+compared, byte by byte, with that of the same team in memory, where nobody dies, the log's content
+with the streams' own last counts; with --verify each log is computed again. A row per run, and a
+summary. --json FILE keeps what each run was, as it ends; called again with this file, only runs
+that are not in it are made. Ends with 1 unless every run ended with 0, with this map, left no
+process, and no hole in its log that `teamslam log check` does not name. Counted, too: the processes
+that ended by themselves with an error, as for silence, though somebody only stood still.
 """
 
 import argparse
@@ -20,6 +23,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -43,6 +47,10 @@ from team.wire.codec import WireError
 PROGRAM = (sys.executable, "-P", "-m", "sim")
 KINDS = ("robot", "central", "router", "record", "world", "viewer")
 PROC = Path("/proc")
+STOP_S = 12.0
+"""How long [s] a process is stopped, in the acceptance."""
+GAVE_UP = re.compile(r"(\S+) \(pid \d+\) ended with exit status \d+")
+"""A process that ended by itself with an error, in the words of `launch`."""
 
 
 @dataclass
@@ -55,6 +63,7 @@ class Run:
     wall_s: float = 0.0
     equal: bool = False
     left: int = 0
+    gave_up: list[str] = field(default_factory=list)
     check: str = ""
     verified: bool | None = None
     lacks: list[str] = field(default_factory=list)
@@ -66,7 +75,8 @@ class Run:
         """As if nothing had happened."""
         unnamed = bool(self.lacks) and not self.check
         sound = self.verified in (None, True)
-        return self.exit == 0 and self.equal and not self.left and not unnamed and sound
+        ended = self.left or self.gave_up
+        return self.exit == 0 and self.equal and not ended and not unnamed and sound
 
 
 def children(launch: int, folder: Path) -> dict[int, list[str]]:
@@ -164,14 +174,15 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             )  # fmt: skip
         await_start(folder, launch, "robot-r1" if options.without_centre else "central")
         awake: list[tuple[float, int]] = []
-        due = sorted(
-            time.monotonic() + rng.uniform(0.0, options.span) for _ in range(options.kills)
-        )
+        now = time.monotonic()
+        due = [(now + rng.uniform(0.0, options.span), options.stop) for _ in range(options.kills)]
+        due += [(now + rng.uniform(0.0, options.span), STOP_S) for _ in range(options.stops)]
+        due.sort()
         while launch.poll() is None and time.monotonic() - began < options.timeout:
             now = time.monotonic()
-            while due and now >= due[0]:
-                due.pop(0)
-                hit(launch.pid, folder, rng, options, run, awake, now - began)
+            while due and now >= due[0][0]:
+                _, stop_s = due.pop(0)
+                hit(launch.pid, folder, rng, options.what, stop_s, run, awake, now - began)
             for at, pid in [a for a in awake if now >= a[0]]:
                 awake.remove((at, pid))
                 with suppress(ProcessLookupError):
@@ -192,6 +203,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             launch.kill()
             launch.wait()
         run.wall_s = time.monotonic() - began
+        run.gave_up = GAVE_UP.findall((folder / "said").read_text("utf-8", "replace"))
         result = {}
         with suppress(OSError, ValueError):
             result = json.loads((folder / "result.json").read_text())
@@ -232,26 +244,27 @@ def await_start(folder: Path, launch: subprocess.Popen[bytes], node: str) -> Non
 
 
 def hit(
-    launch: int, folder: Path, rng: random.Random, options: argparse.Namespace, run: Run,
+    launch: int, folder: Path, rng: random.Random, what: list[str], stop_s: float, run: Run,
     awake: list[tuple[float, int]], at_s: float,
 ) -> None:  # fmt: skip
     """Kill one process of the wanted kinds, or stop it until later."""
     stopped = {pid for _, pid in awake}
     lines = children(launch, folder).items()
-    there = {p: li for p, li in lines if li[0] in options.what and p not in stopped}
+    there = {p: li for p, li in lines if li[0] in what and p not in stopped}
     kinds = sorted({line[0] for line in there.values()})
     if not kinds:
         return
     kind = rng.choice(kinds)
     pid = rng.choice(sorted(pid for pid, line in there.items() if line[0] == kind))
     with suppress(ProcessLookupError):
-        if options.stop:
+        if stop_s:
             os.kill(pid, signal.SIGSTOP)
-            awake.append((time.monotonic() + options.stop, pid))  # at infinity: never
+            awake.append((time.monotonic() + stop_s, pid))  # at infinity: never
         else:
             os.kill(pid, signal.SIGKILL)
         robots = [word for word in there[pid] if word in ("r1", "r2", "r3")]
-        run.hit.append((round(at_s, 2), "-".join([kind, *robots])))
+        named = "-".join([kind, *robots])
+        run.hit.append((round(at_s, 2), f"{named} for {stop_s:g} s" if stop_s else named))
 
 
 def kept_in(path: Path | None) -> list[Run]:
@@ -275,6 +288,8 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=3, help="in each run")
     parser.add_argument("--span", type=float, default=10.0, help="seconds in which they fall")
     parser.add_argument("--stop", type=float, default=0.0, help="stop for so long, do not kill")
+    parser.add_argument("--stops", type=int, default=0, help=f"stop so many for {STOP_S:g} s, too")
+    parser.add_argument("--acceptance", action="store_true", help="the trial that has to be passed")
     parser.add_argument("--end-silent", type=float, help="launch ends who is silent so long [s]")
     parser.add_argument("--keys", action="store_true", help="behind certificates")
     parser.add_argument("--verify", action="store_true", help="compute each log again")
@@ -290,6 +305,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     options.what = options.what.split(",")
+    if options.acceptance:
+        options.keys, options.kills, options.stops = True, 3, 1
+        options.load = max(options.load, 2)
     with tempfile.TemporaryDirectory() as name:
         scenario = shortened(Path(name), options.steps)
         resolved = with_options(load(scenario), identities=options.identities)
@@ -314,9 +332,10 @@ def main() -> int:
                 process.wait()
     good = sum(run.good for run in runs)
     hits = sum(len(run.hit) for run in runs)
-    verb = "stopped" if options.stop else "killed"
+    stopped = sum(" for " in named for run in runs for _, named in run.hit)
     print(
-        f"{good} of {len(runs)} runs good, {hits} processes {verb}; "
+        f"{good} of {len(runs)} runs good, {hits - stopped} processes killed, {stopped} stopped, "
+        f"{sum(len(run.gave_up) for run in runs)} ended by themselves with an error; "
         f"map equal in {sum(r.equal for r in runs)}, exit 0 in {sum(r.exit == 0 for r in runs)}, "
         f"no process left in {sum(not r.left for r in runs)}, "
         f"log whole in {sum(not r.lacks for r in runs)}, with an unnamed hole in "
@@ -335,6 +354,7 @@ def row(run: Run) -> str:
         "map equal" if run.equal else "MAP DIFFERS",
         f"hit {what or 'nobody'}",
         *([f"{run.left} LEFT"] if run.left else []),
+        *([f"GAVE UP: {', '.join(run.gave_up)}"] if run.gave_up else []),
         *(["NOT VERIFIED"] if run.verified is False else []),
         *([f"log lacks {', '.join(run.lacks)}"] if run.lacks else []),
         *([f"check: {run.check.splitlines()[0][:120]}"] if run.check else []),
