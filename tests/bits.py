@@ -81,7 +81,8 @@ CASES: Mapping[str, Callable[[], Scenario]] = {
     "waypoints 1": lambda: world("waypoints"),
     "unknown initial poses": lambda: world("thesis", unknown_starts=("*", "!r1")),
     "outliers": outliers,
-    **{f"pair {e} + {f}": lambda e=e, f=f: pair(e, f) for e, f in sorted(PAIRS)},
+    # The optimum of `batch` is GTSAM's, which promises no bits.
+    **{f"pair {e} + {f}": lambda e=e, f=f: pair(e, f) for e, f in sorted(PAIRS) if f != "batch"},
     "utias 1": lambda: utias(1),
     "utias 2": lambda: utias(2),
     "utias 6": lambda: utias(6),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 
-from sim.studies.estimators import batch
+from sim.studies.batch_reference import growing as batch
 from sim.studies.estimators.robot_step import RobotStep
 from team.config import Sensor
 from team.library import BatchMap, InitialPose, Keyframe, LandmarkMap, Trajectory

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from central.desk.evaluation.errors import Path
 from sim.scenarios.scenario import Scenario
-from sim.studies.batch_reference.graph import factor_graph, values_of
+from sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
 from sim.studies.batch_reference.measurements import (
     BatchReferenceError,
     Chain,
@@ -22,7 +22,6 @@ from sim.studies.batch_reference.measurements import (
     chains_of,
 )
 from sim.studies.batch_reference.reference import BatchReference, batch_map
-from sim.studies.estimators.batch import FLOOR_SIGMAS
 from team.config import MotionModel, MotionNoise, RobotConfig
 from team.estimation.geometry import between, compose, exponential, tangent
 from team.estimation.models import increment_of

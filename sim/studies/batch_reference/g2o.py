@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from central.desk.evaluation.evaluation import evaluate
-from sim.studies.batch_reference.graph import landmark_starts
+from sim.studies.batch_reference.graph import FLOOR_SIGMAS, landmark_starts
 from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
 from sim.studies.batch_reference.reference import placed
-from sim.studies.estimators.batch import FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Point
 from team.estimation.models import predicted

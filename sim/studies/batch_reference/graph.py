@@ -12,13 +12,37 @@ from jaxtyping import Float
 
 from central.desk.evaluation.evaluation import MapResult
 from sim.studies.batch_reference.measurements import Chain
-from sim.studies.estimators.batch import EXACT_SIGMA, FLOOR_SIGMAS
 from team.estimation.gaussian import Matrix
 from team.estimation.geometry import Point, Pose, tangent
 from team.estimation.models import located, predicted
+from team.extras import install_command
+from team.registry import NotInstalledError
 
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32
+FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
+"""Added to each keyframe's motion (forward [m], left [m], turn [rad]): the covariance of a robot
+that can not slip is singular, and that of no motion at all is zero."""
+EXACT_SIGMA = 1e-5
+"""Of an initial pose that is exactly known [m, rad]."""
+
+
+def load_gtsam() -> Any:
+    """GTSAM; raises NotInstalledError with the command that installs it."""
+    try:
+        import gtsam
+    except ImportError:
+        raise NotInstalledError(
+            f"the batch optimum needs GTSAM: {install_command('batch-reference')}"
+        ) from None
+    return gtsam
+
+
+def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
+    """The Newton step of a linear graph, and its length in standard deviations."""
+    step = linear.optimize()
+    gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
+    return step, float(np.sqrt(max(2.0 * gain, 0.0)))
 
 
 def pose_key(chain: int, pose: int) -> int:
@@ -82,7 +106,7 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
         first = pose_key(c, 0)
         start = chain.start if anyone or c > 0 else path[0]
         if start is not None:
-            graph.push_back(_start_factor(gtsam, first, start, chain.start_covariance))
+            graph.push_back(start_factor(gtsam, first, start, chain.start_covariance))
         for i, increment in enumerate(chain.increments):
             model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
             motion = gtsam.Pose2(*increment.mean)
@@ -97,7 +121,7 @@ def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
 
 
-def _start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
+def start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
     """The prior of the initial pose; its covariance in (x, y, θ) is rotated into the tangent space
     of the pose.
     """

@@ -31,12 +31,19 @@ from central.desk.evaluation.errors import (
 )
 from central.desk.evaluation.evaluation import Evaluation, evaluate
 from sim.studies.batch_reference.errors import add_errors, bias_key, has_biases, profile_graph
-from sim.studies.batch_reference.graph import factor_graph, landmark_starts, pose_key, values_of
+from sim.studies.batch_reference.graph import (
+    factor_graph,
+    landmark_starts,
+    load_gtsam,
+    newton_step,
+    pose_key,
+    values_of,
+)
 from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
 from team.estimation.gaussian import Matrix, PoseGaussian
 from team.estimation.geometry import inverse, tangent
 from team.estimation.mount import moved_by
-from team.extras import install_command
+from team.registry import NotInstalledError
 from team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
@@ -190,7 +197,7 @@ def _solved(
             f"the batch cost {costs[best]} lies above its start's, {initial_cost}"
         )
     linear = graph.linearize(optima[best])
-    _, decrement = _newton_step(gtsam, linear)
+    _, decrement = newton_step(gtsam, linear)
     if decrement > LARGEST_DECREMENT:
         raise BatchReferenceError(
             f"the batch has not converged: the next Newton step goes {decrement:.2g} sigma, "
@@ -206,12 +213,9 @@ def _solved(
 
 def _gtsam() -> Any:
     try:
-        import gtsam
-    except ImportError:
-        raise BatchReferenceError(
-            f"the batch reference needs GTSAM: {install_command('batch-reference')}"
-        ) from None
-    return gtsam
+        return load_gtsam()
+    except NotInstalledError as error:
+        raise BatchReferenceError(str(error)) from None
 
 
 def placed(
@@ -245,13 +249,6 @@ def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
     return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
 
 
-def _newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
-    """The Newton step of a linear graph, and its length in standard deviations."""
-    step = linear.optimize()
-    gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
-    return step, float(np.sqrt(max(2.0 * gain, 0.0)))
-
-
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
     """The values after Gauss-Newton; a step that does not lower the cost is halved.
 
@@ -259,7 +256,7 @@ def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
     """
     values, cost = initial, graph.error(initial)
     for _ in range(ITERATIONS):
-        step, decrement = _newton_step(gtsam, graph.linearize(values))
+        step, decrement = newton_step(gtsam, graph.linearize(values))
         if decrement < LARGEST_DECREMENT:
             break
         for halvings in range(30):

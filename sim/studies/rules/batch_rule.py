@@ -9,8 +9,9 @@ from contextlib import suppress
 import numpy as np
 
 from central.config import CentralConfig
-from sim.studies.estimators import batch
-from sim.studies.estimators.batch import Batch
+from sim.studies.batch_reference import growing as batch
+from sim.studies.batch_reference.graph import load_gtsam
+from sim.studies.batch_reference.growing import GrowingBatch, UnsolvableError
 from sim.studies.estimators.robot_step import RobotStep
 from sim.studies.rules.measurement_rules import MapContent, MeasurementRule
 from sim.studies.rules.team_keyframes import RobotKeyframe
@@ -18,9 +19,7 @@ from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import Matrix, PoseGaussian
 from team.estimation.geometry import Pose, inverse
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.mount import moved_by
-from team.estimation.sparse_cholesky import sparse
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
 
@@ -39,10 +38,11 @@ class BatchRule(MeasurementRule):
     Sensor errors that persist, and biases, are taken as white noise, with a warning.
     """
 
-    _batch: Batch
+    _batch: GrowingBatch
 
     def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
         super().__init__(config, digest, robots)
+        load_gtsam()
         self._waiting: list[RobotStep] = []
         self._newest: dict[str, RobotKeyframe] = {}
         self._stamps: dict[str, list[int]] = defaultdict(list)
@@ -79,7 +79,7 @@ class BatchRule(MeasurementRule):
     def _content(self, *, final: bool) -> MapContent:
         self._grow()
         if final:
-            self._batch = self._solved(self._batch.renewed, FINAL_ITERATIONS, FINAL_DECREMENT)
+            self._batch = self._solved(self._batch, FINAL_ITERATIONS, FINAL_DECREMENT)
             if not self._batch.converged(FINAL_DECREMENT):
                 self._findings.append(
                     f"the batch has not converged in {FINAL_ITERATIONS} iterations: the next step "
@@ -98,23 +98,22 @@ class BatchRule(MeasurementRule):
         turns, self._waiting = self._waiting, []
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):
-            with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+            with suppress(UnsolvableError, ArithmeticError), np.errstate(all="ignore"):
                 grown = batch.extended(self._batch, some)
-                once = batch.solved(grown, 1, RUNNING_DECREMENT)
-                if np.isfinite(once.poses).all() and np.isfinite(once.posterior.panels).all():
-                    self._batch = grown
-                    return
+                _ = batch.solved(grown, 1, RUNNING_DECREMENT).marginals
+                self._batch = grown
+                return
             self._findings.append(
                 f"measurements of {len(turns)} steps up to {self.now_ns * 1e-9:.1f} s refused: "
                 "with them the map has no solution"
             )
 
-    def _solved(self, grown: Batch, iterations: int, decrement: float) -> Batch:
+    def _solved(self, grown: GrowingBatch, iterations: int, decrement: float) -> GrowingBatch:
         """The solution; where there is none, the estimate before it."""
-        with suppress(*UNSOLVABLE, sparse.NotPositiveDefiniteError), np.errstate(all="ignore"):
+        with suppress(UnsolvableError, ArithmeticError), np.errstate(all="ignore"):
             solution = batch.solved(grown, iterations, decrement)
-            if np.isfinite(solution.poses).all() and np.isfinite(solution.posterior.panels).all():
-                return solution
+            _ = solution.marginals
+            return solution
         self._findings.append("the batch has no full solution")
         return grown
 

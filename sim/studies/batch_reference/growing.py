@@ -1,0 +1,269 @@
+"""Batch MAP over all raw measurements of a team, solved again by GTSAM as measurements arrive.
+
+Minimises Σ rᵀP⁻¹r of the initial poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the measurements over
+one pose per robot and keyframe and all landmarks (Dellaert & Kaess 2006, Square root SAM). ρ is the
+identity, or Cauchy's c² log(1 + χ²/c²). A measurement's noise is the sensor's at the range that the
+estimate predicts, and is not differentiated: the graph is built again at each new estimate. Poses
+are perturbed on the right.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from sim.studies.batch_reference.graph import (
+    FLOOR_SIGMAS,
+    load_gtsam,
+    newton_step,
+    start_factor,
+    under_loss,
+)
+from sim.studies.batch_reference.measurements import Scan
+from sim.studies.estimators.robot_step import RobotStep
+from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from team.estimation.geometry import Pose, compose, tangent
+from team.estimation.models import located, predicted
+
+ROBUST_START, ROBUST_DECAY = 8.0, 0.7
+"""A robust solution begins with Cauchy's scale 8 c, which narrows to c: a measurement that is far
+off since a pose was dead-reckoned is not taken for an outlier."""
+_POSES = 2**32
+"""First key of a pose; the key of a landmark is its id, which is below 2³²."""
+
+
+class UnsolvableError(ValueError):
+    """The measurements have no solution: some unknown is not determined, or a number overflows."""
+
+
+@dataclass(frozen=True, eq=False)
+class GrowingBatch:
+    """An estimate of all poses and landmarks, in the map frame.
+
+    starts: initial pose of each robot with its covariance in (x, y, θ); None: exactly known.
+    steps: in their order; step k ends at pose len(starts) + k. poses: (x [m], y [m], θ [rad]),
+    the initial poses first. landmarks: [m], by id. robust_c: Cauchy's scale on √χ² of a measurement
+    (2 numbers); None for least squares.
+    """
+
+    starts: Mapping[str, tuple[Pose, Matrix | None]]
+    robust_c: float | None
+    steps: tuple[RobotStep, ...]
+    poses: Float[np.ndarray, "K 3"]
+    landmarks: Mapping[int, Float[np.ndarray, "2"]]
+
+    @property
+    def ids(self) -> UInt32[np.ndarray, " L"]:
+        """The landmarks' ids, ascending."""
+        return np.array(sorted(self.landmarks), np.uint32)
+
+    def places(self, robot: str) -> list[int]:
+        """The rows of a robot's poses, its initial pose first; raises ValueError for a robot
+        without one.
+        """
+        robots = list(self.starts)
+        if robot not in self.starts:
+            raise ValueError(f"{robot} has no start")
+        own = (len(robots) + k for k, step in enumerate(self.steps) if step.robot == robot)
+        return [robots.index(robot), *own]
+
+    @property
+    def cost(self) -> float:
+        """Σ of χ² of all factors, under the loss; about `dof` where the models are right."""
+        return 2.0 * float(self._graph.error(self._values))
+
+    @property
+    def dof(self) -> int:
+        """Numbers in all factors less the number of unknowns: 2 n − 2 L, since there are as many
+        initial poses and motions as poses.
+        """
+        return 2 * sum(len(step.ids) for step in self.steps) - 2 * len(self.landmarks)
+
+    @cached_property
+    def newton_decrement(self) -> float:
+        """√(gᵀH⁻¹g): the length of the next Newton step in standard deviations."""
+        try:
+            return newton_step(load_gtsam(), self._graph.linearize(self._values))[1]
+        except RuntimeError as error:
+            raise UnsolvableError(str(error).strip()) from error
+
+    def converged(self, least_decrement: float) -> bool:
+        """Whether the next step goes no farther than that."""
+        return self.newton_decrement <= least_decrement
+
+    @cached_property
+    def _values(self) -> Any:
+        gtsam = load_gtsam()
+        values = gtsam.Values()
+        for k, pose in enumerate(self.poses):
+            values.insert(_POSES + k, gtsam.Pose2(*pose))
+        for landmark, position in self.landmarks.items():
+            values.insert(landmark, np.asarray(position))
+        return values
+
+    @cached_property
+    def _graph(self) -> Any:
+        return self.graph(self.robust_c)
+
+    def graph(self, robust_c: float | None) -> Any:
+        """The factors, with the noise of measurements at the present estimate."""
+        gtsam = load_gtsam()
+        graph = gtsam.NonlinearFactorGraph()
+        floor = np.diag(FLOOR_SIGMAS) ** 2
+        for k, (start, covariance) in enumerate(self.starts.values()):
+            graph.push_back(start_factor(gtsam, _POSES + k, start, covariance))
+        newest = {robot: k for k, robot in enumerate(self.starts)}
+        for place, step in enumerate(self.steps, len(self.starts)):
+            motion = gtsam.noiseModel.Gaussian.Covariance(step.increment.covariance + floor)
+            before, newest[step.robot] = newest[step.robot], place
+            between = gtsam.Pose2(*step.increment.mean)
+            graph.push_back(
+                gtsam.BetweenFactorPose2(_POSES + before, _POSES + place, between, motion)
+            )
+            scan = Scan(step.ids, step.ranges, step.bearings, step.own)
+            seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
+            for k, (landmark, r, b) in enumerate(seen):
+                distance, _ = predicted(self.poses[place], self.landmarks[landmark])
+                R = scan.noise(k, step.sensor, distance)[::-1, ::-1]
+                model = under_loss(gtsam, gtsam.noiseModel.Gaussian.Covariance(R), robust_c)
+                graph.push_back(
+                    gtsam.BearingRangeFactor2D(_POSES + place, landmark, gtsam.Rot2(b), r, model)
+                )
+        return graph
+
+    @cached_property
+    def marginals(self) -> Any:
+        """GTSAM's marginals; raises `UnsolvableError` where an unknown is not determined."""
+        try:
+            return load_gtsam().Marginals(self._graph, self._values)
+        except RuntimeError as error:
+            raise UnsolvableError(str(error).strip()) from error
+
+
+def initial_state(
+    starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None
+) -> GrowingBatch:
+    """The robots' initial poses alone; raises NotInstalledError without GTSAM."""
+    load_gtsam()
+    mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
+    return GrowingBatch(dict(starts), robust_c, (), mean, {})
+
+
+def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
+    """The batch with more steps, in the given order.
+
+    A new pose is dead-reckoned from the robot's newest one, a new landmark is where its first
+    measurement puts it. Raises ValueError for a robot that has no initial pose.
+    """
+    newest = {robot: batch.poses[batch.places(robot)[-1]] for robot in batch.starts}
+    poses, landmarks = [*batch.poses], dict(batch.landmarks)
+    for step in steps:
+        if step.robot not in newest:
+            raise ValueError(f"{step.robot} has no start")
+        pose = newest[step.robot] = compose(newest[step.robot], step.increment.mean)
+        poses.append(pose)
+        for id_, r, b in zip(step.ids.tolist(), step.ranges, step.bearings, strict=True):
+            if id_ not in landmarks:
+                landmarks[id_] = located(pose, float(r), float(b))
+    return replace(
+        batch,
+        steps=(*batch.steps, *steps),
+        poses=np.array(poses).reshape(-1, 3),
+        landmarks=landmarks,
+    )
+
+
+def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> GrowingBatch:
+    """The estimate after at most so many iterations of Levenberg-Marquardt, ended where it has
+    converged (`converged` tells). Raises `UnsolvableError`.
+    """
+    for scale in _scales(batch.robust_c):
+        left = iterations
+        while left > 0 and not (scale == batch.robust_c and batch.converged(least_decrement)):
+            found, used = _descended(batch, scale, left)
+            left -= max(used, 1)
+            if used == 0:
+                break
+            batch = found
+            if scale != batch.robust_c:
+                break
+    if not np.isfinite(batch.poses).all():
+        raise UnsolvableError("a pose is not finite")
+    return batch
+
+
+def _scales(robust_c: float | None) -> list[float | None]:
+    """Cauchy's scales of a robust solution, narrowing to `robust_c`."""
+    if robust_c is None:
+        return [None]
+    scales = [ROBUST_START * robust_c]
+    while scales[-1] * ROBUST_DECAY > robust_c:
+        scales.append(scales[-1] * ROBUST_DECAY)
+    return [*scales, robust_c]
+
+
+def _descended(
+    batch: GrowingBatch, scale: float | None, iterations: int
+) -> tuple[GrowingBatch, int]:
+    """The optimum of the present graph, and the number of iterations that it took."""
+    gtsam = load_gtsam()
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(1e-13)
+    parameters.setAbsoluteErrorTol(1e-11)
+    graph = batch._graph if scale == batch.robust_c else batch.graph(scale)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, batch._values, parameters)
+    try:
+        values = optimizer.optimize()
+    except RuntimeError as error:
+        raise UnsolvableError(str(error).strip()) from error
+    poses = (values.atPose2(_POSES + k) for k in range(len(batch.poses)))
+    found = replace(
+        batch,
+        poses=np.array([(pose.x(), pose.y(), pose.theta()) for pose in poses]).reshape(-1, 3),
+        landmarks={id_: np.asarray(values.atPoint2(id_)) for id_ in batch.landmarks},
+    )
+    return found, int(optimizer.iterations())
+
+
+def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
+    """Mean and joint marginal covariance of all landmarks."""
+    ids = batch.ids
+    means = np.array([batch.landmarks[id_] for id_ in ids.tolist()]).reshape(-1, 2)
+    n = len(ids)
+    covariance = np.empty((2 * n, 2 * n))
+    if n == 1:
+        covariance[:] = batch.marginals.marginalCovariance(int(ids[0]))
+    elif n:
+        joint = batch.marginals.jointMarginalCovariance([int(id_) for id_ in ids])
+        for i, a in enumerate(ids.tolist()):
+            for j, b in enumerate(ids.tolist()):
+                covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = joint.at(a, b)
+    return LandmarkGaussian(ids, means, 0.5 * (covariance + covariance.T))
+
+
+def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
+    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ).
+
+    Raises ValueError for a robot that is not in the batch.
+    """
+    place = batch.places(robot)[-1]
+    return PoseGaussian(batch.poses[place], _covariance(batch, place))
+
+
+def trajectory(
+    batch: GrowingBatch, robot: str
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
+    """The robot's poses from its start on, each with its marginal covariance in (x, y, θ)."""
+    own = batch.places(robot)
+    return batch.poses[own], np.array([_covariance(batch, place) for place in own])
+
+
+def _covariance(batch: GrowingBatch, place: int) -> Matrix:
+    G = tangent(batch.poses[place, 2])
+    covariance = G @ np.asarray(batch.marginals.marginalCovariance(_POSES + place)) @ G.T
+    symmetric: Matrix = 0.5 * (covariance + covariance.T)
+    return symmetric
