@@ -24,9 +24,12 @@ _LEAST_M = 0.01
 """Least thickness and width of an ellipse."""
 
 
+_LAST_NS = 2**32 * 1_000_000_000 - 1
+
+
 def stamp(stamp_ns: int) -> fox.Timestamp:
-    """A team time as Foxglove's; before zero it is zero."""
-    at = max(stamp_ns, 0)
+    """A team time as Foxglove's; before zero it is zero, beyond 32 bits of seconds the last one."""
+    at = min(max(stamp_ns, 0), _LAST_NS)
     return fox.Timestamp(at // 1_000_000_000, at % 1_000_000_000)
 
 
