@@ -8,8 +8,8 @@ from typing import NamedTuple
 from team.recording.counters import Counters
 from team.recording.cut import CUT
 from team.recording.declared import declared, misdeclared
-from team.recording.inventory import Inventory
-from team.recording.last_words import MISSING, LastWords
+from team.recording.inventory import MISSING, Inventory
+from team.recording.last_words import LastWords
 from team.recording.reader import Log, LogError
 from team.recording.records import index_damage
 from team.recording.repair import REPAIRED, salvaged

@@ -20,6 +20,8 @@ from team.wire import messages as m
 from team.wire.bus import NO_COUNTER, Sample, opened
 from team.wire.codec import WireError
 
+MISSING = "missing: "
+"""Beginning of the recorder's last note, which lists what it lacks."""
 _HEAD = 128  # bytes of a message: its tag, stamp, robot, incarnation and number are within
 Kind = Literal["measurements", "submaps"]
 _ASKED_FOR = (ch.SIGHTING_FACTOR, *ch.REPLIES[ch.KEPT])

@@ -17,9 +17,6 @@ from team.wire import channels as ch
 from team.wire.bus import NO_COUNTER, Sample
 from team.wire.messages import Tally
 
-MISSING = "missing: "
-"""Beginning of the recorder's last note, which lists what it lacks."""
-
 
 @dataclass
 class LastWords:

@@ -8,8 +8,7 @@ from contextlib import closing, suppress
 
 import msgspec
 
-from team.recording.inventory import Inventory, NumberedStream, intervals
-from team.recording.last_words import MISSING
+from team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.replayer import schedule
 from team.the_end import TheEnd
