@@ -109,6 +109,15 @@ def whitened(L: Matrix, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n
     return dense.forward(L, error)
 
 
+def deviation(variance: float) -> float:
+    """The standard deviation of a variance; 0 of one that rounding has made negative.
+
+    Selected inversion subtracts numbers of the size of the largest variance: the smallest ones may
+    come out below zero.
+    """
+    return math.sqrt(variance) if variance > 0.0 else 0.0
+
+
 def information(covariance: Matrix, what: str) -> Matrix:
     """P⁻¹ = L⁻ᵀL⁻¹ from the Cholesky factor of P, exactly symmetric."""
     if not len(covariance):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from team.estimation import dense, elementary, elementwise
 from team.estimation.consistency import chi2_limit
-from team.estimation.gaussian import information
+from team.estimation.gaussian import deviation, information
 from team.estimation.geometry import wrapped
 
 ITERATIONS = 10
@@ -136,7 +136,7 @@ def _shape_heading_sigma(
         len(jacobian) - 3
     )
     extent = float((elementary.squared(in_b - in_b.mean(axis=0))).sum())
-    return float(np.sqrt(variance / extent))
+    return deviation(variance / extent)
 
 
 def _linearised(

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt32
 
 from team.config import UNNAMED, Bias
 from team.estimation.contribution import Stream
+from team.estimation.gaussian import deviation
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
 from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
@@ -123,7 +124,7 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
             covariance = among[np.ix_(of, of)]
         else:
             mean, covariance = _own_marginal(island, node)
-        sigma = float(np.sqrt(covariance.sum()))
+        sigma = deviation(covariance.sum())
         found.append(BiasEstimate(stream, bias, float(mean.sum()), sigma))
     return found
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.estimation import elementwise
+from team.estimation.gaussian import deviation
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
 from team.estimation.map_joining.alignment import Alignment, SharedPoints
@@ -147,8 +148,8 @@ def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> 
     """By what an island was merged, and how certain its place is."""
     node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
-    sigma_m = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
-    sigma_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
+    sigma_m = deviation(covariance[0, 0] + covariance[1, 1])
+    sigma_deg = float(np.degrees(deviation(covariance[2, 2])))
     dof = 2 * sum(shared) - 3
     text = (
         f"{shared}, chi² {max(rise, 0.0) / dof:.1f} per degree of freedom, "

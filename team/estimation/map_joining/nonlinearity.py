@@ -7,7 +7,6 @@ ten times the rise: the robot may well be at a place that its covariance exclude
 minimum is right.
 """
 
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from team.estimation import dense, elementwise
 from team.estimation.contribution import Stream, named
-from team.estimation.gaussian import information
+from team.estimation.gaussian import deviation, information
 from team.estimation.geometry import compose, inverse, logarithm
 from team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
@@ -64,7 +63,7 @@ def heading_sigma(island: Island, node: int) -> float:
     graph = island.graph
     if graph.fixed[node]:
         return 0.0
-    return math.sqrt(graph.pattern.diagonal_block(island.selected_covariance, node)[2, 2])
+    return deviation(graph.pattern.diagonal_block(island.selected_covariance, node)[2, 2])
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
@@ -73,7 +72,7 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
     Empty where the heading is known too well for a curved valley.
     """
     _, covariance = joint_marginal(island, [node])
-    sigma = float(np.sqrt(covariance[2, 2]))
+    sigma = deviation(covariance[2, 2])
     if sigma < STRAIGHT_RAD:
         return
     island = aged(island, FULL_AGE)
