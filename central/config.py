@@ -60,10 +60,13 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     landmark_sigma [m]: standard deviation, in each direction, of the point that all robots measure
     of a landmark about the landmark's own place (the front of a cylinder, a marker that hangs
     beside its post): added to the covariance of each landmark of the map.
-    withdraw_above: a robot is withdrawn if the median cost of its submaps per degree of freedom is
-    above this and the rest of the team agrees without it; absent: by an operator only. bounds:
-    submaps, inter-robot measurements and initial poses beyond them are refused. association:
-    thresholds for merging landmarks without identities: a profile for each kind of sensor.
+    withdraw_above: a robot is withdrawn if the cost of the team's submaps per degree of freedom is
+    above this with it, and the rest of the team agrees without it and without no other robot;
+    absent: by an operator only. least_sigma: least standard deviations [m, rad] of what one submap
+    measures; one that claims less has its covariance raised by these, and is named; 0: none.
+    bounds: submaps, inter-robot measurements and initial poses beyond them are refused.
+    association: thresholds for merging landmarks without identities: a profile for each kind of
+    sensor.
     """
 
     fusion: FusionRule = "join"
@@ -79,6 +82,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joined_ranges: bool = False
     particles: Annotated[int, Meta(ge=4, le=100_000)] = 1000
     withdraw_above: Annotated[float, Meta(ge=2.0)] | None = 4.0
+    least_sigma: tuple[NonNegative, NonNegative] = (5e-4, 5e-5)
     bounds: Bounds = Bounds()
     association: AssociationProfile = AssociationProfile()
     landmark_sigma: NonNegative = 0.0

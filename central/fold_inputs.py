@@ -5,7 +5,7 @@ fold: `tick` returns what one tick brings, and a fold without some robots reads 
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from central.config import CentralConfig
 from central.members import Members
@@ -24,7 +24,7 @@ class FoldInputs:
     def __init__(self, config: CentralConfig) -> None:
         self.tick_ns = round(config.tick_s * 1e9)
         self._bounds = config.bounds
-        self._members = Members(self.tick_ns)
+        self._members = Members(self.tick_ns, config.least_sigma)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._verdicts: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
@@ -73,6 +73,10 @@ class FoldInputs:
     def size(self, tick: int, without: Collection[str]) -> int:
         """Number of submaps of a tick, those of some robots left out."""
         return len(self._members.keys(tick, without))
+
+    def raised(self, without: Collection[str]) -> Mapping[str, int]:
+        """By robot, how many folded submaps have had their covariance raised to the least one."""
+        return self._members.raised(without)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
         """The members of a tick, without some robots' submaps and the measurements of these robots.

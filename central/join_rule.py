@@ -1,5 +1,6 @@
 """The rule `join`: the team's map is a pure function of the set of submaps."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 
 from central.config import CentralConfig
@@ -50,6 +51,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         self._source: Mapping[Stream, object] | None = None
         self._seen = 0
         self._gone: set[str] = set()
+        self._accused: Mapping[str, str] = {}
 
     def take(self, inputs: SubmapInputs) -> list[Outgoing]:
         """Fold the ticks that are closed."""
@@ -60,11 +62,18 @@ class JoinRule(FusionRule[SubmapInputs]):
     def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
         """The map of a set of submaps: law 2. The final one is solved until it stands still."""
         self._file(inputs)
+        ticks, self._accused = self._ticks, {}
         if tail == "final":
-            return self._messages(inputs, self._ticks.solved(), tail)
-        self._ticks.take_until(inputs.closed_ns)
-        fold = self._ticks.provisional() if inputs.ahead else self._ticks.fold
-        return self._messages(inputs, fold, tail)
+            return self._messages(inputs, ticks, ticks.solved(), tail)
+        ticks.take_until(inputs.closed_ns)
+        fold = ticks.fold
+        if inputs.ahead:
+            fold = ticks.provisional()
+            self._accused = ticks.accused(fold)
+        if self._accused:
+            ticks = ticks.without(self._accused, math.inf)
+            fold = ticks.fold
+        return self._messages(inputs, ticks, fold, tail)
 
     def _file(self, inputs: SubmapInputs) -> None:
         """File the new submaps by tick; ticks that were folded already are folded again with
@@ -105,6 +114,11 @@ class JoinRule(FusionRule[SubmapInputs]):
         return self._ticks.convicted
 
     @property
+    def suspended(self) -> Mapping[str, str]:
+        """The robots that the newest map leaves out until they are tested again."""
+        return {**self._ticks.suspended, **self._accused}
+
+    @property
     def figures(self) -> Mapping[str, float]:
         """The monitor's figures."""
         return self.finding.figures
@@ -114,11 +128,24 @@ class JoinRule(FusionRule[SubmapInputs]):
         """The monitor's warnings, why robots are not joined, and warnings about the map, in
         words.
         """
-        return (*self.finding.warnings, *self.reasons)
+        apart = (
+            f"{robot} is left out of running maps: {why}"
+            for robot, why in sorted(self.suspended.items())
+        )
+        least_m, least_rad = self.config.least_sigma
+        raised = (
+            f"{robot}: {count} submaps claim to be surer than {least_m:g} m and {least_rad:g} rad; "
+            "taken as no surer than that"
+            for robot, count in self._ticks.raised.items()
+        )
+        undecided = (self._ticks.undecided,) if self._ticks.undecided else ()
+        return (*self.finding.warnings, *apart, *undecided, *raised, *self.reasons)
 
-    def _messages(self, inputs: SubmapInputs, fold: Fold, tail: Tail) -> list[Outgoing]:
+    def _messages(
+        self, inputs: SubmapInputs, ticks: TickFold, fold: Fold, tail: Tail
+    ) -> list[Outgoing]:
         """The messages of a fold: the map, with priors or, at the end, the whole paths."""
-        ticks, final = self._ticks, tail == "final"
+        final = tail == "final"
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None
         biases = marginals.bias_estimates(fold)

@@ -6,12 +6,15 @@ made again from it; it is kept as long as some fold has it.
 
 import math
 from bisect import insort
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from weakref import WeakValueDictionary
 
 from team import translate
 from team.estimation.contribution import Contribution
 from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.plausible import with_least_spread
 from team.wire.digest import Digest
 from team.wire.messages import SightingFactor, Submap
 
@@ -25,8 +28,10 @@ class Members:
     Tick b has the submaps that end in (b·tick, (b + 1)·tick].
     """
 
-    def __init__(self, tick_ns: int) -> None:
+    def __init__(self, tick_ns: int, least_sigma: tuple[float, float] = (0.0, 0.0)) -> None:
         self.tick_ns = tick_ns
+        self._least_sigma = least_sigma
+        self._raised: set[Key] = set()
         self._ticks: dict[int, dict[Key, Submap]] = {}
         self._order: list[int] = []
         self._sightings: dict[Key, tuple[InterRobotFactor, ...]] = {}
@@ -46,6 +51,7 @@ class Members:
         if sightings:
             self._sightings[key] = tuple(translate.sighting_of(each) for each in sightings)
         self._made.pop(key, None)
+        self._raised.discard(key)
         self._named = {at: each for at, each in self._named.items() if each[0] < tick}
         return tick
 
@@ -72,12 +78,21 @@ class Members:
         return sorted(key for key in self._ticks[tick] if key[1] not in gone)
 
     def contribution(self, key: Key) -> Contribution:
-        """A submap as the join takes it."""
+        """A submap as the join takes it, with the least covariance that one may have."""
         found = self._made.get(key)
         if found is None:
-            found = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
+            claimed = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
+            local = with_least_spread(claimed.local, self._least_sigma)
+            found = claimed if local is claimed.local else replace(claimed, local=local)
+            if found is not claimed:
+                self._raised.add(key)
             self._made[key] = found
         return found
+
+    def raised(self, gone: Collection[str]) -> Mapping[str, int]:
+        """By robot, how many submaps that were asked for claimed less than the least covariance."""
+        robots = sorted(key[1] for key in self._raised if key[1] not in gone)
+        return Counter(robots)
 
     def sightings(self, key: Key) -> tuple[InterRobotFactor, ...]:
         """The inter-robot measurements from a submap."""

@@ -57,6 +57,11 @@ class FusionRule(ABC, Generic[I]):
         return {}
 
     @property
+    def suspended(self) -> Mapping[str, str]:
+        """The robots that running maps leave out for now, with the reason in words."""
+        return {}
+
+    @property
     def figures(self) -> Mapping[str, float]:
         """Figures for people."""
         return {}

@@ -7,7 +7,7 @@ inputs.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -101,8 +101,14 @@ class Scheduler:
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
         """The inputs up to this time, as a map names them."""
-        gone, found = self.intake.withdrawn, self.intake.members(until_ns)
+        gone, found = self._left_out, self.intake.members(until_ns)
         return {s: n for s, n in found.items() if s[0] not in gone} if gone else found
+
+    @property
+    def _left_out(self) -> Collection[str]:
+        """The robots that maps are without: withdrawn ones, and suspended ones."""
+        suspended = self.rule.suspended
+        return {*self.intake.withdrawn, *suspended} if suspended else self.intake.withdrawn
 
     def _newest(self, inputs: Inputs) -> list[Outgoing]:
         """The map of the closed ticks, or of everything that is here if that is more.
@@ -112,7 +118,7 @@ class Scheduler:
         of the watermark are in a provisional map and not yet in a closed one.
         """
         whole = self._members(self._ticks_end_ns(inputs.closed_ns))
-        gone = self.intake.withdrawn
+        gone = self._left_out
         published = {s: n for s, n in self._published.items() if s[0] not in gone}
         if _lacks(whole, published) or _lacks(whole, self._members(inputs.closed_ns)):
             return self._whole(inputs)

@@ -17,6 +17,11 @@ taken again without these robots. It is tested after the first tick of each broa
 after the full solution, never when a broadcast happens to be due. So a withdrawal depends on the
 set alone, not on the order or time of arrival.
 
+A robot with few submaps is suspended: running maps leave it out at once, so that it does not move
+its teammates' poses, but it is withdrawn only once it has enough of them, or by the full solution.
+Until then it is tested again, with all its submaps, whenever the set has grown by GROWTH. A
+provisional map is tested by itself.
+
 The running fold is bounded (`condensing`): its old submaps are condensed before each tick. Where a
 condensed island has to move, the ticks since it was condensed are taken again raw. The full
 solution uses the raw submaps: it begins where the running fold has its nodes. Only where not all
@@ -26,12 +31,12 @@ ticks again.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from central.checkpoints import Checkpoints
 from central.config import CentralConfig
 from central.fold_inputs import FoldInputs
-from central.withdrawal import convicted, suspects
+from central.withdrawal import LEAST_SUBMAPS, Trial, convicted, suspects
 from team.config import UNNAMED
 from team.estimation.contribution import Stream
 from team.estimation.hybrid_slam.sensitivity_kernel import BIASES
@@ -76,10 +81,43 @@ def join_settings(config: CentralConfig) -> JoinSettings:
 
 @dataclass(frozen=True)
 class Conviction:
-    """The robots that a fold has withdrawn, with the reason in words, and the last tick for it."""
+    """The robots that a fold leaves out by itself, each with the reason in words.
+
+    robots: withdrawn. suspended: left out until they are tested again. retried: of the suspended
+    robots, the number of submaps of the set from which each is tested again. at: the last tick that
+    all this is based on. tested_from: the first tick that is tested under it.
+    """
 
     robots: Mapping[str, str] = field(default_factory=dict)
+    suspended: Mapping[str, str] = field(default_factory=dict)
+    retried: Mapping[str, float] = field(default_factory=dict)
     at: float = -math.inf
+    tested_from: float = -math.inf
+
+    def with_withdrawn(self, robot: str, reason: str, at: float) -> "Conviction":
+        """The conviction with one more robot withdrawn."""
+        without = self.without_suspended(robot, at, -math.inf)
+        return replace(without, robots={**self.robots, robot: reason})
+
+    def with_suspended(self, robot: str, reason: str, retried: float, at: float) -> "Conviction":
+        """The conviction with one more robot suspended."""
+        return replace(
+            self,
+            suspended={**self.suspended, robot: reason},
+            retried={**self.retried, robot: retried},
+            at=max(self.at, at),
+            tested_from=-math.inf,
+        )
+
+    def without_suspended(self, robot: str, at: float, tested_from: float) -> "Conviction":
+        """The conviction under which a suspended robot is tested again."""
+        return replace(
+            self,
+            suspended={each: why for each, why in self.suspended.items() if each != robot},
+            retried={each: size for each, size in self.retried.items() if each != robot},
+            at=max(self.at, at),
+            tested_from=tested_from,
+        )
 
 
 class TickFold:
@@ -88,6 +126,8 @@ class TickFold:
     ordered: robots withdrawn by an order. conviction: those withdrawn by the fold itself; none,
     unless `convicts`. bounded: old submaps are condensed, except in ticks up to `_raw_until`, where
     a condensed island had to move. inputs: those of another fold, which are then only read.
+    undecided: in words, robots that contradict each other at the last test, of which none can be
+    told wrong.
     """
 
     def __init__(
@@ -101,6 +141,7 @@ class TickFold:
         self.convicts = config.withdraw_above is not None
         self._ordered: frozenset[str] = frozenset()
         self._agreed: tuple[Fold, Agreement] | None = None
+        self.undecided = ""
         self._begin_again(Conviction())
 
     def _begin_again(self, conviction: Conviction) -> None:
@@ -178,12 +219,17 @@ class TickFold:
         return self._conviction.robots
 
     @property
+    def suspended(self) -> Mapping[str, str]:
+        """The robots that running maps leave out for now, with the reason in words."""
+        return self._conviction.suspended
+
+    @property
     def _gone(self) -> frozenset[str]:
-        return self._ordered.union(self.convicted)
+        return self._ordered.union(self.convicted, self.suspended)
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
-        """The withdrawn robots."""
+        """The robots that the fold is without: withdrawn ones, and suspended ones."""
         return tuple(sorted(self._gone))
 
     @property
@@ -224,9 +270,29 @@ class TickFold:
             return False
         self.checkpoints.push(tick, fold, is_raw=is_raw)
         is_tested = math.isinf(before) or before // self._period < tick // self._period
-        if is_tested and fold.size >= GROWTH * self.checkpoints.tested:
+        if not is_tested or tick < self._conviction.tested_from:
+            return True
+        if (robot := self._retried(tick)) is not None:
+            first = tick // self._period * self._period
+            self._begin_again(self._conviction.without_suspended(robot, tick, first))
+            return False
+        if fold.size >= GROWTH * self.checkpoints.tested:
             return not self._convict(fold, tick)
         return True
+
+    def _retried(self, tick: int) -> str | None:
+        """A suspended robot that is tested again at a tick; None if there is none."""
+        if not self.suspended:
+            return None
+        size = self._size_until(tick)
+        due = (r for r, size_then in sorted(self._conviction.retried.items()) if size >= size_then)
+        return next(due, None)
+
+    def _size_until(self, tick: float) -> int:
+        """Number of submaps up to a tick, those of suspended robots included."""
+        gone = self._gone.difference(self.suspended)
+        ticks = self._inputs.ticks_behind(-math.inf, gone)
+        return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
 
     def _with_tick(self, fold: Fold, tick: int) -> tuple[Fold, bool]:
         """The fold with all of a tick, and whether nothing was condensed for it; members beyond the
@@ -266,37 +332,58 @@ class TickFold:
         return self._agreed[1]
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Whether a robot is withdrawn; it is then left out from the first tick on."""
-        limit = self._config.withdraw_above
-        if limit is None or not self.convicts or not fold.contributions:
+        """Whether a robot is withdrawn or suspended; it is then left out from the first tick on.
+
+        at: the tick; infinity for the full solution, which suspends nobody. Its warning is part of
+        the map, so a fold that withdraws nobody computes it, too.
+        """
+        self.undecided = ""
+        if not self.convicts and math.isfinite(at):
             return False
-        agreement = self.agreement(fold)
-        if not suspects(agreement, limit):
-            return False
-        self.checkpoints.note_tested(fold.size)
-        found = convicted(agreement, limit, self._agreement_without)
+        found = self._trial(fold, self._until_ns)
         if found is None:
             return False
-        robot, reason = found
-        robots = {**self.convicted, robot: reason}
-        self._begin_again(Conviction(robots, max(self._conviction.at, at)))
+        if fold is self.fold:
+            self.checkpoints.note_tested(fold.size)
+        self.undecided = found.undecided
+        if found.robot is None or not self.convicts:
+            return False
+        own = sum(n + 1 for stream, n in self.members(fold).items() if stream[0] == found.robot)
+        before = self._conviction
+        if math.isinf(at) or own >= LEAST_SUBMAPS:
+            self._begin_again(before.with_withdrawn(found.robot, found.reason, at))
+        else:
+            retried = GROWTH * self._size_until(at)
+            self._begin_again(before.with_suspended(found.robot, found.reason, retried, at))
         return True
 
-    def _agreement_without(self, robots: Collection[str]) -> Agreement | None:
-        fold = self.without(robots).fold
-        if not fold.home:
+    def _trial(self, fold: Fold, until_ns: float) -> Trial | None:
+        """The trial of a fold up to this time; None where nobody is suspect."""
+        limit = self._config.withdraw_above
+        if limit is None or not fold.contributions:
             return None
-        return marginals.joint_cost(fold if fold.departed else converged(fold, self.settings))
+        if not suspects(self.agreement(fold), limit):
+            return None
+        at_rest = fold if fold.departed else converged(fold, self.settings)
 
-    def without(self, robots: Collection[str]) -> "TickFold":
-        """Another fold of the same inputs without some robots', with the same ticks taken.
+        def without(robots: Collection[str]) -> Agreement | None:
+            rest = self.without(robots, until_ns).fold
+            if not rest.home:
+                return None
+            return marginals.joint_cost(rest if rest.departed else converged(rest, self.settings))
+
+        return convicted(marginals.joint_cost(at_rest), limit, without)
+
+    def without(self, robots: Collection[str], until_ns: float | None = None) -> "TickFold":
+        """Another fold of the same inputs without some robots', with the same ticks taken, or those
+        up to a time.
 
         It withdraws no further robot.
         """
         other = TickFold(self._config, self._bounded, self._inputs)
         other.convicts = False
         other._ordered = self._gone.union(robots)
-        other.take_until(self._until_ns)
+        other.take_until(self._until_ns if until_ns is None else until_ns)
         return other
 
     # Solutions beyond the closed ticks.
@@ -308,15 +395,29 @@ class TickFold:
             try:
                 fold, _ = self._with_tick(fold, tick)
             except CondensedError:
-                whole = self.without(())
-                whole.take_until(math.inf)
-                return whole.fold
+                return self.without((), math.inf).fold
         return fold
 
+    def accused(self, provisional: Fold) -> Mapping[str, str]:
+        """The robot that contradicts the rest in a provisional fold, with the reason in words; none
+        where nothing is ahead of the watermark, since the ticks behind it are tested by themselves.
+        """
+        if provisional is self.fold or not self.convicts:
+            return {}
+        found = self._trial(provisional, math.inf)
+        return {} if found is None or found.robot is None else {found.robot: found.reason}
+
     def solved(self) -> Fold:
-        """The full solution of everything that is here, without the robots that it withdraws."""
+        """The full solution of everything that is here, without the robots that it withdraws.
+
+        Suspended robots are tested with all that they sent, one after the other.
+        """
         while True:
             self.take_until(math.inf)
+            if self.suspended:
+                robot = min(self.suspended)
+                self._begin_again(self._conviction.without_suspended(robot, math.inf, math.inf))
+                self.take_until(math.inf)
             fold = self.fold
             if not self.checkpoints.is_raw:
                 again = fold.landmarks.are_there and fold.size <= FULL_UNNAMED
@@ -327,7 +428,7 @@ class TickFold:
             if not fold.contributions:
                 return fold
             fold = converged(fold, self.settings)
-            if not self._convict(fold, math.inf):
+            if not self._convict(fold, math.inf) and not self.suspended:
                 return fold
 
     def _solved_raw(self) -> Fold:
@@ -336,12 +437,18 @@ class TickFold:
         """
         other = TickFold(self._config, False, self._inputs)
         other.convicts, other._ordered = self.convicts, self._ordered
-        if not self.convicted:
+        if not self._gone.difference(self._ordered):
             other.checkpoints = Checkpoints(self.checkpoints.raw().taken[-1:])
         fold = other.solved()
-        if other.convicted != self.convicted:
+        if other._gone != self._gone:
             self._begin_again(other._conviction)
+        self.undecided = other.undecided
         return fold
+
+    @property
+    def raised(self) -> Mapping[str, int]:
+        """By robot, how many folded submaps have had their covariance raised to the least one."""
+        return self._inputs.raised(self._gone)
 
     # The names of a fold.
 

@@ -1,35 +1,94 @@
 """Finds the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
-A robot's disagreement is the median over its submaps of χ²/dof at the joint estimate: near or below
-1 for a robot whose covariances are right, whatever a few of its submaps are. One wrong robot
-distorts the map and makes others disagree, too. So it is found by leaving out: a robot is withdrawn
-only if the rest agree without it; where only one other robot is left, only if it contradicts itself
-when alone, since of two that disagree either may be wrong.
+A robot's disagreement is the larger of two figures, both near or below 1 where its covariances are
+right: its share of the joint cost per degree of freedom, where that is beyond chance, and the
+median over its submaps of χ²/dof, where it has enough of them. The first one finds a single
+contradiction that the map takes at full weight. A robust loss bounds it; there the second one finds
+a robot whose submaps disagree in the majority.
+
+One wrong robot distorts the map and makes others disagree, too; one that claims to be very sure,
+or that fixes the frame, makes only others disagree. So nobody is judged by its own disagreement.
+Each robot is left out in turn, which compares the joint cost of the rest with and without it in
+whatever frame the rest has: a robot is withdrawn only if the rest agree without it, and without no
+other. Two robots that contradict each other, and nobody else, are told and both stay, unless one of
+them contradicts itself when alone.
 """
 
-from collections.abc import Callable, Collection
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from statistics import median
 
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""Least number of submaps of a robot for it to be judged."""
+"""Least number of submaps of a robot for their median to be judged, and for it to be withdrawn
+before the final map; with fewer it is suspended."""
 AGREEING = 0.5
 """The rest agree if no disagreement is above this share of the limit."""
 TRIED = 3
-"""Most robots that are left out for a trial, the most suspect first."""
+"""Most robots that are left out for a trial, the most suspect first; as many again of those that
+disagree least, since the map follows a robot that claims to be very sure."""
+LEAST_DOF = 3.0
+"""Least degrees of freedom of a share of the joint cost that is judged."""
+SUSPICION, ACCORD = 20.0, 7.0
+"""Exponents of the chance that a right robot's share is beyond the bound of `_bound`: for it to be
+a suspect, and for it to be no longer in accord with the rest."""
 
 Without = Callable[[Collection[str]], Agreement | None]
 """The agreement of the team without some robots; None: nothing is left."""
 
 
-def disagreement(agreement: Agreement) -> dict[str, float]:
-    """The median of χ²/dof over the submaps of each robot that has enough of them."""
+@dataclass(frozen=True)
+class Trial:
+    """The robot that is wrong beyond chance, None if there is none; and the reason in words.
+
+    undecided: in words, robots that contradict each other, where it can not be told which of them
+    is wrong.
+    """
+
+    robot: str | None = None
+    reason: str = ""
+    undecided: str = ""
+
+
+def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:
+    """The disagreement of each robot that can be judged.
+
+    chance: a share of the joint cost that a right robot exceeds with a probability above e^−chance
+    is no disagreement.
+    """
     ratios: dict[str, list[float]] = {}
     for (robot, _), _, chi2, dof, _ in agreement.submaps:
         if dof >= 1.0:
             ratios.setdefault(robot, []).append(chi2 / dof)
-    return {r: median(ratios[r]) for r in sorted(ratios) if len(ratios[r]) >= LEAST_SUBMAPS}
+    found = {}
+    for robot in sorted({*ratios, *agreement.robots}):
+        own = ratios.get(robot, [])
+        values = [median(own)] if len(own) >= LEAST_SUBMAPS else []
+        if (share := _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)) is not None:
+            values.append(share)
+        if values:
+            found[robot] = max(values)
+    return found
+
+
+def _share(chi2: float, dof: float, chance: float) -> float | None:
+    """The joint cost per degree of freedom, at most 1 where chance explains it; None where too few
+    degrees of freedom are left to judge it.
+
+    A cost without degrees of freedom, or without end, has overflown: a disagreement like any other.
+    """
+    if not math.isfinite(chi2) or not math.isfinite(dof):
+        return math.inf
+    if chi2 <= _bound(max(dof, LEAST_DOF), chance):
+        return None if dof < LEAST_DOF else min(chi2 / dof, 1.0)
+    return chi2 / max(dof, LEAST_DOF)
+
+
+def _bound(dof: float, chance: float) -> float:
+    """χ² that is exceeded with a probability below e^−chance (Laurent & Massart 2000, lemma 1)."""
+    return dof + 2.0 * math.sqrt(dof * chance) + 2.0 * chance
 
 
 def suspects(agreement: Agreement, limit: float) -> list[str]:
@@ -39,26 +98,55 @@ def suspects(agreement: Agreement, limit: float) -> list[str]:
     return [robot for _, robot in wrong]
 
 
-def convicted(agreement: Agreement, limit: float, without: Without) -> tuple[str, str] | None:
-    """The robot that is wrong beyond chance, and why, in words; None if there is none."""
+def convicted(agreement: Agreement, limit: float, without: Without) -> Trial:
+    """The robot that is wrong beyond chance, by leaving out one robot after the other.
+
+    It is the only one without which the rest agree, and two others at least agree on that; or it is
+    the only one of those that contradicts itself when alone.
+    """
     found = disagreement(agreement)
-    verdicts = []
-    for robot in suspects(agreement, limit)[:TRIED]:
+    suspected = suspects(agreement, limit)
+    if not suspected:
+        return Trial()
+    others = sorted({*found} - {*suspected}, key=lambda robot: (found[robot], robot))
+    candidates = [*suspected[:TRIED], *others[:TRIED]]
+    cleared: dict[str, dict[str, float]] = {}
+    for robot in candidates:
         rest = without({robot})
-        if rest is None:
-            continue
-        others = disagreement(rest)
-        if not others or max(others.values()) > AGREEING * limit:
-            continue
-        if len(others) == 1:
-            alone = without(others)
-            if alone is None or disagreement(alone).get(robot, 0.0) <= limit:
-                continue
-        verdicts.append((max(others.values()), robot))
-    if not verdicts:
-        return None
-    agreed, robot = min(verdicts)
-    return robot, (
-        f"its submaps contradict the rest: median cost {found[robot]:.1f} per degree of freedom; "
-        f"without it the others' is {agreed:.1f} or less"
+        left = {} if rest is None else disagreement(rest, ACCORD)
+        if left and max(left.values()) <= AGREEING * limit:
+            cleared[robot] = left
+    team = {*found, *agreement.robots}
+    wrong = [
+        robot
+        for robot in cleared
+        if (len(cleared) == 1 and len(cleared[robot]) > 1)
+        or _contradicts_itself(without(team - {robot}), robot, limit)
+    ]
+    if len(wrong) != 1:
+        return Trial(undecided=_words_of(tuple(sorted(cleared)), found))
+    robot = wrong[0]
+    return Trial(
+        robot,
+        f"its submaps contradict the rest: cost {_largest(found):.1f} per degree of freedom with "
+        f"it; without it {_largest(cleared[robot]):.1f} or less",
+    )
+
+
+def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
+    return alone is not None and disagreement(alone).get(robot, 0.0) > limit
+
+
+def _largest(found: Mapping[str, float]) -> float:
+    return max(found.values())
+
+
+def _words_of(opposed: tuple[str, ...], found: Mapping[str, float]) -> str:
+    """Robots that contradict each other, in words; empty where there are none."""
+    if len(opposed) < 2:
+        return ""
+    return (
+        f"{', '.join(opposed)} contradict each other: cost {_largest(found):.1f} per degree of "
+        "freedom together, none without one of them; nobody is withdrawn, as either may be wrong: "
+        "check their data, then `teamslam withdraw` one"
     )

@@ -4,8 +4,10 @@ The wire checks whether a message is well formed; this module checks whether it 
 robot on the ground. A refusal is not an error of the program: it is a value, with its reason.
 """
 
+from dataclasses import replace
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from team.config import Bounds
 from team.estimation import dense, elementary
@@ -21,15 +23,37 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
     """Why a submap is refused; None if it is within the bounds."""
     if len(local.ids) > bounds.submap_landmarks:
         return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
-    poses = 3 * (1 + len(local.node_stamps))
-    angles = np.zeros(len(local.mean), dtype=np.bool_)
-    angles[2:poses:3] = True
+    angles = _angles_of(local)
     if np.abs(local.mean[angles]).max() > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(local.mean[~angles], bounds.extent_m, "of its start")
     if why is None and np.abs(local.sensitivity).max(initial=0.0) > bounds.sensitivity:
         why = f"a sensitivity beyond {bounds.sensitivity:g}"
     return why or _spread(local.covariance, angles, bounds)
+
+
+def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
+    """The submap whose covariance P is raised to P + F where P − F is not positive definite.
+
+    F = diag(least²) for coordinates [m] and headings [rad]. Where each pose and each landmark has
+    an error of its own that is not smaller, P − F is a covariance, and P stays to the bit.
+    """
+    angles = _angles_of(local)
+    sigmas = np.where(angles, least[1], least[0])
+    if not (sigmas > 0.0).all():
+        return local
+    try:
+        dense.cholesky(local.covariance / sigmas / sigmas[:, None] - np.eye(len(sigmas)))
+    except np.linalg.LinAlgError:
+        return replace(local, covariance=local.covariance + np.diag(elementary.squared(sigmas)))
+    return local
+
+
+def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
+    """Marks the headings among the numbers of a submap."""
+    angles = np.zeros(len(local.mean), dtype=np.bool_)
+    angles[2 : 3 * (1 + len(local.node_stamps)) : 3] = True
+    return angles
 
 
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:

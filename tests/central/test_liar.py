@@ -1,0 +1,272 @@
+"""A robot that lies about its own submaps is found whoever fixes the frame, and moves nobody."""
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.intake import Instant
+from central.join_rule import JoinRule
+from central.scheduler import Scheduler
+from central.withdrawal import convicted, disagreement
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.scenario import Scenario
+from sim.world.simulator import simulated
+from team import translate
+from team.config import Exchange, RobotConfig
+from team.estimation.gaussian import deviation
+from team.estimation.map_joining.joining import converged
+from team.estimation.map_joining.marginals import Agreement, landmark_map
+from team.estimation.map_joining.nonlinearity import heading_sigma
+from team.estimation.plausible import with_least_spread
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.arrays import floats, from_floats, stamps
+from team.wire.bus import Outgoing, Sample, opened
+from tests.central.test_withdrawal import messages, of_set, scenario, team_run
+
+LIES = ("still", "micrometre", "far", "modest", "swap")
+"""It never moved; its landmarks lie 2 m off, or 100 km, with sigmas of 1 µm; 1 m off with 5 cm;
+their names are exchanged."""
+BEFORE = 3
+"""Number of a liar's first submaps that are true."""
+
+
+def lie(true: m.Submap, base: m.Submap, kind: str) -> m.Submap:
+    """The lie in the place of a true submap, with the landmarks of an earlier one."""
+    poses = 1 + len(stamps(true.nodes, "nodes"))
+    base_poses = 1 + len(stamps(base.nodes, "nodes"))
+    points = floats(base.mean, "mean")[3 * base_poses :].copy()
+    motion = floats(true.mean, "mean")[: 3 * poses].copy()
+    variance = {"modest": 0.05**2, "swap": 1e-4}.get(kind, 1e-12)
+    match kind:
+        case "still":
+            motion[:] = 0.0
+        case "micrometre":
+            points += 2.0
+        case "far":
+            points += 1e5
+        case "modest":
+            points += 1.0
+        case "swap":
+            points = points.reshape(-1, 2)[::-1].ravel()
+    mean = np.concatenate((motion, points))
+    return msgspec.structs.replace(
+        true,
+        ids=base.ids,
+        mean=from_floats(mean),
+        covariance=from_floats(variance * np.eye(len(mean))[np.triu_indices(len(mean))]),
+        sightings=0,
+    )
+
+
+class Liar(RobotNode):
+    """A robot's node whose submaps behind the first ones are lies."""
+
+    kind = ""
+    _base: m.Submap | None = None
+
+    def begin(self) -> list[Outgoing]:
+        return list(self._spoilt(super().begin()))
+
+    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        return list(self._spoilt(super().handle(message, now_ns)))
+
+    def _spoilt(self, out: list[Outgoing]) -> Iterator[Outgoing]:
+        for each in out:
+            said = each.message
+            if isinstance(said, m.SightingFactor):
+                if said.sequence < BEFORE:
+                    yield each
+            elif isinstance(said, m.Submap):
+                if self._base is None or said.sequence < BEFORE:
+                    self._base = said
+                    yield each
+                else:
+                    yield each._replace(message=lie(said, self._base, self.kind))
+            else:
+                yield each
+
+
+@cache
+def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
+    """The small team in which one robot lies."""
+
+    def robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
+        node = (Liar if config.id == liar else RobotNode)(config, exchange)
+        if isinstance(node, Liar):
+            node.kind = kind
+        return node
+
+    of: Scenario = scenario()
+    talking = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
+    of = msgspec.structs.replace(of, robots=talking)
+    return tuple(run_team(of, simulated(of.world, of.robots, of.seed), robot))
+
+
+def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
+    """Distances [m] of the other robots' poses in the team's frame from their true ones."""
+    true: dict[tuple[str, int], np.ndarray] = {}
+    for each in messages(samples, m.Truth):
+        poses = floats(each.poses, "poses").reshape(-1, 3)
+        true |= {
+            (each.robot, stamp): pose
+            for stamp, pose in zip(stamps(each.stamps, "stamps").tolist(), poses, strict=True)
+        }
+    found = []
+    for channel, _, each in map(opened, samples):
+        if channel is ch.TEAM_POSE and each.robot != liar:
+            at = true.get((each.robot, each.stamp_ns))
+            if at is not None:
+                found.append(np.hypot(*(floats(each.pose, "pose") - at)[:2]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("liar", "kind"), [*(("r1", kind) for kind in LIES), ("r2", "still"), ("r2", "modest")]
+)
+def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar: str, kind: str) -> None:
+    """r1 is the robot that names the frame."""
+    samples = run_with(liar, kind)
+    final = final_map(list(samples))
+    assert final.withdrawn == (liar,)
+    assert [each.robot for each in messages(samples, m.Withdrawal)] == [liar]
+    never = of_set(samples, without=liar)
+    never.take_until(math.inf)
+    found = landmark_map(converged(never.fold, never.settings))
+    assert final.means == found.means.tobytes()
+    assert final.covariance == translate.joint_bytes(found.covariance)
+    errors = online_errors(samples, liar)
+    assert len(errors) > 20
+    assert errors.max() < online_errors(run_with("", ""), liar).max() + 1.0
+
+
+def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
+    """r1 lies for a while; what is folded depends on the set, not on when it was asked for."""
+    samples = run_with("r1", "still")
+    ticks = of_set(samples)
+    ticks.take_until(30e9)
+    assert list(ticks.suspended) == ["r1"]
+    assert (list(ticks.convicted), ticks.withdrawn) == ([], ("r1",))
+    assert {each.robot for each in ticks.fold.contributions} == {"r2", "r3"}
+    for until_s in (35, 45, 60):
+        ticks.take_until(until_s * 1e9)
+    at_once = of_set(samples)
+    at_once.take_until(60e9)
+    assert (ticks.convicted, ticks.suspended) == (at_once.convicted, at_once.suspended)
+    assert ticks.fold.main.state.tobytes() == at_once.fold.main.state.tobytes()
+    assert list(ticks.convicted) == ["r1"]
+
+
+def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:
+    """One of its first submaps is wrong by 0.8 m; its true ones outvote it later."""
+    samples = team_run()
+    (wrong,) = (s for s in messages(samples, m.Submap) if (s.robot, s.sequence) == ("r1", 2))
+    mean = floats(wrong.mean, "mean").copy()
+    mean[0] += 0.8
+    ticks = of_set(samples, instead=msgspec.structs.replace(wrong, mean=from_floats(mean)))
+    ticks.take_until(20e9)
+    assert (list(ticks.suspended), ticks.withdrawn) == (["r1"], ("r1",))
+    ticks.take_until(30e9)
+    assert (ticks.suspended, ticks.convicted, ticks.withdrawn) == ({}, {}, ())
+    assert {each.robot for each in ticks.fold.contributions} == {"r1", "r2", "r3"}
+    ticks.solved()
+    assert ticks.withdrawn == ()
+
+
+def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map() -> None:
+    """All submaps are there, of which the first tick and a half is closed."""
+    samples = run_with("r1", "still")
+    rule = Scheduler(JoinRule(scenario().central, bytes(8)))
+    for start in messages(samples, m.InitialPose):
+        rule.intake.take_start(start)
+    for sighting in messages(samples, m.SightingFactor):
+        rule.intake.take_sighting(sighting)
+    for submap in messages(samples, m.Submap):
+        rule.intake.take_submap(submap)
+    out = rule.at(Instant(10**11, rule.intake.inputs(15e9, 10**11)))
+    (fused,) = (each.message for each in out if isinstance(each.message, m.FusedMap))
+    assert fused.provisional
+    assert fused.withdrawn == ("r1",)
+    assert {each.robot for each in fused.members} == {"r2", "r3"}
+    assert [w for w in rule.rule.findings if w.startswith("r1 is left out of running maps")]
+    assert not [each for each in out if isinstance(each.message, m.Withdrawal)]
+    assert not rule._is_news(math.inf), "a map that leaves it out lacks nothing"
+
+
+def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:
+    """r1 never sees where r3 is: whether r1 or r2 lies can not be told."""
+    quiet = Agreement(0.0, 1.0, {"r1": (50.0, 50.0), "r2": (50.0, 50.0), "r3": (50.0, 50.0)}, ())
+    loud = Agreement(0.0, 1.0, {"r1": (1e4, 50.0), "r2": (60.0, 50.0), "r3": (50.0, 50.0)}, ())
+
+    def without(robots: Collection[str]) -> Agreement:
+        left = quiet if {"r1", "r2"} & {*robots} else loud
+        rest = {each: cost for each, cost in left.robots.items() if each not in robots}
+        return Agreement(0.0, 1.0, rest, ())
+
+    found = convicted(loud, 4.0, without)
+    assert found.robot is None
+    assert found.undecided.startswith("r1, r2 contradict each other: cost 200.0 per degree")
+
+
+def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree() -> None:
+    def without(robots: Collection[str]) -> Agreement:
+        liar_is_there = "r1" not in robots
+        costs = {"r1": (1e-9, 50.0), "r2": (1e5 if liar_is_there else 50.0, 50.0)}
+        costs["r3"] = (1e6 if liar_is_there else 50.0, 50.0)
+        return Agreement(0.0, 1.0, {r: costs[r] for r in costs if r not in robots}, ())
+
+    assert convicted(without(()), 4.0, without).robot == "r1"
+
+
+@pytest.mark.parametrize(("chi2", "dof"), [(np.inf, 40.0), (np.nan, 40.0), (1e9, -47.0)])
+def test_a_cost_that_has_overflown_is_a_disagreement(chi2: float, dof: float) -> None:
+    assert disagreement(Agreement(0.0, 1.0, {"r1": (chi2, dof)}, ()))["r1"] > 1e8
+
+
+def test_chance_alone_makes_nobody_suspect() -> None:
+    """Five degrees of freedom reach nine per degree once in 10^8."""
+    assert disagreement(Agreement(0.0, 1.0, {"r1": (45.0, 5.0)}, ())) == {"r1": 1.0}
+    assert disagreement(Agreement(0.0, 1.0, {"r1": (450.0, 50.0)}, ())) == {"r1": 9.0}
+
+
+def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot_named() -> None:
+    lying = of_set(run_with("r1", "still"), central=scenario(withdraw_above=None).central)
+    lying.take_until(math.inf)
+    count = sum(each.robot == "r1" for each in messages(team_run(), m.Submap))
+    assert dict(lying.raised) == {"r1": count - BEFORE}
+    for each in lying.fold.contributions:
+        variances = np.linalg.eigvalsh(each.local.covariance)
+        assert variances.min() >= 5e-5**2 * 0.99
+    true = of_set(team_run())
+    true.take_until(math.inf)
+    assert dict(true.raised) == {}
+
+
+def test_a_covariance_above_the_least_spread_is_kept_to_the_bit() -> None:
+    local = translate.local_map_of(messages(team_run(), m.Submap)[0])
+    for least in ((5e-4, 5e-5), (0.0, 0.0)):
+        kept = with_least_spread(local, least).covariance
+        assert kept.tobytes() == local.covariance.tobytes()
+    sure = replace(local, covariance=1e-10 * local.covariance)
+    raised = with_least_spread(sure, (5e-4, 5e-5)).covariance - sure.covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(raised))[:3], [5e-4, 5e-4, 5e-5])
+    # One number that depends on another one too well, though each by itself is uncertain enough.
+    twin = np.ones_like(local.covariance) + 1e-9 * np.eye(len(local.mean))
+    found = with_least_spread(replace(local, covariance=twin), (5e-4, 5e-5)).covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(found - twin))[:3], [5e-4, 5e-4, 5e-5], rtol=1e-6)
+
+
+def test_a_variance_that_rounding_made_negative_raises_nothing() -> None:
+    ticks = of_set(team_run())
+    ticks.take_until(math.inf)
+    island = replace(ticks.fold.main)
+    island.__dict__["selected_covariance"] = -1e-18 * np.abs(island.selected_covariance)
+    node = next(iter(island.graph.streams.values()))[-1]
+    assert heading_sigma(island, node) == 0.0
+    assert (deviation(4.0), deviation(-1e-18), deviation(math.nan)) == (2.0, 0.0, 0.0)
