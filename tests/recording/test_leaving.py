@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from team import shell
+from team.recording.check import holes
 from team.recording.inventory import Inventory
+from team.recording.reader import open_log
 from team.recording.received import Received
 from team.recording.recorder import Recorder
 from team.recording.shell import RecordLoop
@@ -102,7 +104,11 @@ def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path: Path) -> None:
         with leaving(centre) as thread:
             wait_until(lambda: bool(turn() or not thread.is_alive()))
         assert not lost
+        centre.close()
+        wait_until(lambda: bool(turn() or logged(path, c.TALLY) == 2))
         loop.close()
+    found = [str(each) for each in holes(open_log(path)) if each.where.startswith("central")]
+    assert found == [], "the totals, too, are counted"
     assert logged(path, c.TRAJECTORY) == len(TRAJECTORIES)
 
 

@@ -135,13 +135,14 @@ class ZenohBus:
                 pass
 
     def publish_totals(self) -> Tally | None:
-        """Reports to a recorder the number of samples of each key: the last ones may have been
-        lost. None for a process without a token.
+        """Reports to a recorder the number of samples of each key, this report included: the last
+        ones may have been lost. None for a process without a token.
         """
         if not self._tokens:
             return None
         node = next(iter(self._tokens))
-        counts = dict(sorted(self._published.items()))
+        own = TALLY.key(node)
+        counts = dict(sorted({**self._published, own: self._published.get(own, 0) + 1}.items()))
         tally = Tally(
             stamp_ns=self._newest_ns,
             node=node,
