@@ -221,6 +221,21 @@ def test_a_robot_that_joins_a_frame_of_a_larger_name_gives_it_no_other_name():
     assert team.poses["alpha"].in_team_frame
 
 
+def test_poses_are_taken_back_where_only_the_final_map_has_another_frame():
+    team = Team({"alpha": (False, False), "bravo": (False, False)})
+    run_to_the_end(team, "alpha", "bravo")
+    end = end_of(team)
+    assert {pose.frame for pose in team.poses.values()} == {"alpha/1"}
+    team.order_without("alpha")
+    assert team.map is not None
+    assert team.map.frame == "alpha/1", "no submap came since"
+    team.to_centre(end)
+    assert team.map.final
+    assert team.map.frame == "bravo/1"
+    team.check()
+    assert not any(pose.in_team_frame for pose in team.poses.values())
+
+
 def test_a_withdrawn_robot_and_those_in_its_frame_withdraw_their_poses():
     team = Team({"alpha": (False, False), "bravo": (False, False), "charlie": (False, False)})
     last = team.coming["charlie"].pop()
