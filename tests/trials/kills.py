@@ -182,7 +182,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             now = time.monotonic()
             while due and now >= due[0][0]:
                 _, stop_s = due.pop(0)
-                hit(launch.pid, folder, rng, options.what, stop_s, run, awake, now - began)
+                hit(launch.pid, folder, rng, options.what, stop_s, run, awake, at_s=now - began)
             for at, pid in [a for a in awake if now >= a[0]]:
                 awake.remove((at, pid))
                 with suppress(ProcessLookupError):
