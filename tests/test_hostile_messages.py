@@ -37,9 +37,9 @@ from tests.hostile_team import ROBOTS, S, mutated
 
 COUNT = int(os.environ.get("TEAMSLAM_STORM", "6"))
 MOST_MIB = 150
-"""Growth of the process over all messages of one type, kernels and their compilation included."""
-MOST_S = 30.0
-"""CPU time of all messages of one type at one node."""
+"""Growth of the process over all messages of one type."""
+MOST_S = 10.0
+"""CPU time of all messages of one type at one node; compiling kernels does not count."""
 Node = RobotNode | CentralNode | PeerCentre | PeerRobot
 ROBOT = RobotConfig("r1", front_end=FrontEnd(particles=10, window_s=10.0))
 NODES: dict[str, Callable[[], Node]] = {
@@ -100,16 +100,24 @@ def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door() -> No
 @pytest.mark.parametrize("kind", CARRIED, ids=m.tag_of)
 @pytest.mark.parametrize("name", NODES)
 def test_no_extreme_message_raises_in_a_node(name: str, kind: type[m.Message]) -> None:
-    node, boundary = NODES[name](), Boundary(name)
-    answers = node.begin()
-    before, began = peak_mib(), time.process_time()
-    for sample in [*beginning(), *drawn(kind, COUNT)]:
-        answers += boundary.take(node, sample)
-    assert boundary.faults == 0, boundary.last
-    assert time.process_time() - began < MOST_S
-    assert peak_mib() - before < MOST_MIB
-    for each in [*answers, Outgoing(ch.STATUS, name, node.status())]:
-        decoded(encoded(each.message), type(each.message))
+    def hand_over() -> tuple[float, float]:
+        """CPU time [s] and growth of the peak of memory [MiB]."""
+        node, boundary = NODES[name](), Boundary(name)
+        answers = node.begin()
+        before, began = peak_mib(), time.process_time()
+        for sample in [*beginning(), *drawn(kind, COUNT)]:
+            answers += boundary.take(node, sample)
+        took = time.process_time() - began, peak_mib() - before
+        assert boundary.faults == 0, boundary.last
+        for each in [*answers, Outgoing(ch.STATUS, name, node.status())]:
+            decoded(encoded(each.message), type(each.message))
+        return took
+
+    took_s, grown_mib = hand_over()
+    if took_s > MOST_S or grown_mib > MOST_MIB:  # of a first time, in which kernels are compiled
+        took_s, grown_mib = hand_over()
+    assert took_s < MOST_S
+    assert grown_mib < MOST_MIB
 
 
 def test_no_extreme_message_raises_in_the_viewer() -> None:
