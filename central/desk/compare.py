@@ -90,8 +90,7 @@ def _smoothed(robot: RobotResult, name: str) -> float | None:
 
 
 def _settings(run: Evaluation) -> str:
-    scenario = run.scenario
-    return "–" if scenario is None else f"{scenario.name}, seed {scenario.seed}"
+    return "–" if run.scenario is None else run.title
 
 
 def _method(run: Evaluation) -> str:

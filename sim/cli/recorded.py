@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from central.desk.pictures.style import Form, Look, Picture, Style
+from central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
 from sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -99,6 +99,13 @@ def report(
     picture: Annotated[
         Picture | None, typer.Option(help="This picture alone, and no page.")
     ] = None,
+    width: Annotated[
+        str | None,
+        typer.Option(
+            help="Width of pictures for a paper, as 3.5in or 89mm; default: 3.5in, of panels 7.16in.",
+            metavar="WIDTH",
+        ),
+    ] = None,
 ) -> None:
     """A page, pictures, tables and figures of a run, from its log alone."""
     from rich.console import Console
@@ -113,6 +120,7 @@ def report(
     from team.recording.reader import open_log
 
     _check_folder(output)
+    width_in = _width(width, look)
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
     steps.begin("scoring the run")
@@ -127,7 +135,9 @@ def report(
     run = Run(evaluation, history(opened.samples()), opened.metadata, found, why, home)
     steps.begin("drawing")
     if look or form or picture:
-        style = Style(look or Look.SCREEN, form or (Form.PDF if look else Form.PNG), picture)
+        style = Style(
+            look or Look.SCREEN, form or (Form.PDF if look else Form.PNG), picture, width_in
+        )
         drawn = write_pictures(run, output, style)
         for path in drawn.values():
             console.print(f"wrote {path}", highlight=False, soft_wrap=True)
@@ -155,6 +165,18 @@ def report(
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=2) + "\n")
     _hint_if_cut(opened)
+
+
+def _width(text: str | None, look: Look | None) -> float | None:
+    """The width of pictures for a paper [inches]."""
+    if text is None:
+        return None
+    if look is not Look.PAPER:
+        fail("--width is of pictures for a paper: give --style paper, too", WRONG_USE)
+    try:
+        return parsed_width(text)
+    except ValueError as error:
+        fail(f"--width {error}", WRONG_USE)
 
 
 def _check_folder(path: Path) -> None:

@@ -18,6 +18,10 @@ _IN_WORDS = {
 """The patterns of names."""
 
 
+LARGEST_SIGMA_RAD = 0.5
+"""A larger standard deviation of a bearing [rad] is probably in degrees."""
+
+
 class ScenarioError(ValueError):
     """A scenario that can not be run; the text names file, field and remedy."""
 
@@ -46,7 +50,18 @@ def check_fields(value: object, declared: Any, at: str) -> None:
         for name, part in value.items():
             if name != tag:
                 check_known(name, [known for known in types if _here(known, at)], at)
+                if name == "bearing_sigma":
+                    _check_radians(part, f"{at}.{name}" if at else name)
                 check_fields(part, types[name], f"{at}.{name}" if at else name)
+
+
+def _check_radians(sigma: object, at: str) -> None:
+    """Raise ScenarioError for a bearing's standard deviation that is probably in degrees."""
+    if isinstance(sigma, int | float) and LARGEST_SIGMA_RAD < sigma <= math.pi:
+        raise ScenarioError(
+            f"{sigma:g} rad is {math.degrees(sigma):.0f}°, at {at}; if it is in degrees, "
+            f"write {math.radians(sigma):.4g}"
+        )
 
 
 @cache

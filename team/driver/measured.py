@@ -18,6 +18,8 @@ M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
 NAMED = "a small letter, then small letters, digits and _ (32 at most)"
 UNNAMED = 2**31
+LARGEST_SIGMA_RAD = 0.5
+"""A larger standard deviation of a bearing [rad] is probably in degrees."""
 """Landmark numbers from here on are reserved for landmarks without identity."""
 
 
@@ -77,7 +79,7 @@ def observations(
             ids=from_ids(numbers),
             ranges=from_floats(far),
             bearings=from_floats(angles),
-            covariances=_blocks(covariances, len(numbers), what),
+            covariances=_polar_blocks(covariances, len(numbers), what),
         ),
         what,
     )
@@ -123,7 +125,7 @@ def detections(
             number=0,
             ranges=from_floats(far),
             bearings=from_floats(angles),
-            covariances=_blocks(covariances, len(far), what),
+            covariances=_polar_blocks(covariances, len(far), what),
         ),
         what,
     )
@@ -166,6 +168,18 @@ def square(covariance: ArrayLike | None, what: str) -> bytes:
     if matrix.shape != (3, 3):
         raise MeasurementError(f"{what}: a covariance is 3 × 3, not {matrix.shape}")
     return from_floats(matrix.ravel())
+
+
+def _polar_blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
+    """As `_blocks`, of (range, bearing); a bearing's deviation is in radians."""
+    packed = _blocks(covariances, count, what)
+    for sigma in np.sqrt(np.asarray(covariances)[:, 1, 1]).tolist() if packed else ():
+        if sigma > LARGEST_SIGMA_RAD:
+            raise MeasurementError(
+                f"{what}: the bearing's standard deviation of {sigma:.3g} rad is "
+                f"{np.degrees(sigma):.0f}°; if it is in degrees, give {np.radians(sigma):.3g}"
+            )
+    return packed
 
 
 def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:

@@ -8,6 +8,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import PurePath
 from typing import Any
 
 import msgspec
@@ -92,6 +93,10 @@ class MapResult:
     matching: Matching | None = None
 
 
+PACKED = (".zip", ".mcap", ".db3")
+"""Endings of data sets that are one file."""
+USUAL = ("hybrid", "join")
+"""The estimator and the rule that are taken where none is chosen."""
 TeamMotion = tuple[Float[np.ndarray, "3"], str]
 """A rigid motion from the map to the truth, and what it aligns best."""
 
@@ -140,7 +145,8 @@ class Evaluation:
     arbitrary_frame: the map contains no robot with a known initial pose, so its frame is not the
     truth's, and only aligned errors are meaningful. decisions: closures and merges by landmarks
     without identities, from the final map. verdicts: an operator's on such landmarks, in words.
-    states: of every robot of the team in the final map.
+    states: of every robot of the team in the final map. data_set: the name of its folder or file;
+    empty for a simulated world.
     """
 
     scenario: TeamConfig | None
@@ -160,6 +166,7 @@ class Evaluation:
     decisions: tuple[m.AssociationDecision, ...] = ()
     verdicts: tuple[str, ...] = ()
     gps_median_m: float | None = None
+    data_set: str = ""
     states: Mapping[str, RobotState] = field(default_factory=dict)
 
     @property
@@ -170,6 +177,21 @@ class Evaluation:
         reasons = () if self.map is None else self.map.reasons
         of_map = (short(each) for each in reasons if not any(not_joined([each])))
         return (*not_in_the_map(self.states), *of_map)
+
+    @property
+    def title(self) -> str:
+        """The name of the data set; of a simulated world the scenario and its seed."""
+        if self.scenario is None:
+            return "a run whose scenario is not known"
+        return self.data_set or f"{self.scenario.name}, seed {self.scenario.seed}"
+
+    @property
+    def method(self) -> str:
+        """Estimator and rule; empty for a data set where they are the usual ones."""
+        if self.scenario is None:
+            return ""
+        chosen = self.scenario.estimator, self.scenario.fusion
+        return "" if self.data_set and chosen == USUAL else " + ".join(chosen)
 
     @property
     def matched_by(self) -> str:
@@ -245,6 +267,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
             log, message, () if scenario is None else [each.id for each in scenario.robots]
         ),
         verdicts=verdicts_given(log),
+        data_set=_data_set(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
     )
 
@@ -313,6 +336,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
     shape = None if errors is None else errors.shape
     figures = {
         "scenario": None if scenario is None else scenario.name,
+        "data_set": evaluation.data_set or None,
         "seed": None if scenario is None else scenario.seed,
         "estimator": None if scenario is None else scenario.estimator,
         "fusion": None if scenario is None else scenario.fusion,
@@ -414,6 +438,28 @@ def _scenario(log: Collected) -> TeamConfig | None:
         return team_config(message.configuration)
     except ValueError:
         return None
+
+
+class _Place(msgspec.Struct):
+    path: str = ""
+
+
+class _World(msgspec.Struct):
+    """The part of a scenario in which a data set is named."""
+
+    world: _Place
+
+
+def _data_set(log: Collected) -> str:
+    """The name of the folder or file that the measurements are from; empty where there is none."""
+    message = log.sound(log.last(ch.WORLD_CONFIG))
+    if not isinstance(message, m.Configuration):
+        return ""
+    try:
+        place = PurePath(msgspec.json.decode(message.configuration, type=_World).world.path)
+    except (msgspec.MsgspecError, UnicodeEncodeError):
+        return ""
+    return place.stem if place.suffix in PACKED else place.name
 
 
 def _uplink(team: TeamConfig) -> tuple[ch.Channel, ...] | None:

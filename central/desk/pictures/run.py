@@ -306,14 +306,13 @@ def thinning(count: int) -> slice:
 
 
 def _heading(evaluation: Evaluation) -> str:
-    scenario = evaluation.scenario
-    return "a run" if scenario is None else f"{scenario.name}, seed {scenario.seed}"
+    return "a run" if evaluation.scenario is None else evaluation.title
 
 
 def _title(evaluation: Evaluation) -> list[str]:
-    """Scenario and seed; estimator, rule and errors."""
-    scenario, fused = evaluation.scenario, evaluation.map
-    second = [] if scenario is None else [f"{scenario.estimator} + {scenario.fusion}"]
+    """Data set, or scenario and seed; estimator, rule and errors."""
+    fused = evaluation.map
+    second = [evaluation.method] if evaluation.method else []
     if fused is None:
         second.append("no final map")
     elif fused.errors is not None:

@@ -1,5 +1,6 @@
 """The look and the file format of pictures: for a screen, or for a paper."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -12,6 +13,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 120
+PAPER_DPI = 300
+COLUMN_IN, TEXT_IN = 3.5, 7.16
+"""Widths of a column and of a page's text in two columns [inches]."""
+PAPER_PT, POINT_PT = 8.0, 6.0
+"""Sizes of text for a paper, and there of the labels of single points [points]."""
+LEAST_IN, MOST_IN = 1.0, 40.0
+INCHES = {"in": 1.0, "mm": 1.0 / 25.4, "cm": 1.0 / 2.54, "pt": 1.0 / 72.27}
+
+
+def parsed_width(text: str) -> float:
+    """A width such as 3.5in, 89mm, 8.9cm or 252pt [inches]; raises ValueError."""
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(in|mm|cm|pt)", text.strip())
+    width = float(found[1]) * INCHES[found[2]] if found else 0.0
+    if not LEAST_IN <= width <= MOST_IN:
+        raise ValueError(
+            f"{text}: give a width from {LEAST_IN:g}in to {MOST_IN:g}in, as 3.5in or 89mm"
+        )
+    return width
 
 
 class Form(StrEnum):
@@ -42,11 +61,21 @@ class Look(StrEnum):
 
 @dataclass(frozen=True)
 class Style:
-    """The look and the form of every picture of a report; only: the one picture that is drawn."""
+    """The look and the form of every picture of a report; only: the one picture that is drawn.
+
+    width_in: of a picture for a paper [inches]; None: COLUMN_IN, or TEXT_IN where it has several
+    panels.
+    """
 
     look: Look = Look.SCREEN
     form: Form = Form.PNG
     only: Picture | None = None
+    width_in: float | None = None
+
+    def file_name(self, picture: Picture) -> str:
+        """The name of a picture's file, which for a paper is not that of the page's."""
+        paper = "-paper" if self.look is Look.PAPER and self.form is Form.PNG else ""
+        return f"{picture}{paper}.{self.form}"
 
     @property
     def drawn(self) -> tuple[Picture, ...]:
@@ -77,9 +106,60 @@ def drawn_in(style: Style) -> Iterator[None]:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a picture in the format of its name's suffix; for a paper without its titles."""
-    if _current.get().look is Look.PAPER:
-        figure.suptitle("")
-        if len(figure.axes) == 1:
-            figure.axes[0].set_title("")
-    figure.savefig(path, dpi=DPI)
+    """Write a picture in the format of its name's suffix; for a paper without its titles, in its
+    width, with all text in PAPER_PT.
+    """
+    style = _current.get()
+    if style.look is not Look.PAPER:
+        figure.savefig(path, dpi=DPI)
+        return
+    figure.suptitle("")
+    if len(figure.axes) == 1:
+        figure.axes[0].set_title("")
+    _resize(figure, style.width_in)
+    figure.savefig(path, dpi=PAPER_DPI)
+
+
+def _resize(figure: "Figure", width_in: float | None) -> None:
+    """Scale a figure to a width: lines and markers shrink with it, text has PAPER_PT.
+
+    Labels of single points are smaller. In a column legends lie below their axes, and panels have
+    no titles.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.text import Annotation, Text
+
+    width, height = figure.get_size_inches()
+    new = width_in or (COLUMN_IN if len(figure.axes) == 1 else TEXT_IN)
+    scale, is_column = new / width, new < 0.7 * TEXT_IN
+    panels = len(figure.axes) > 1
+    figure.set_size_inches(new, height * (max(scale, 0.6) if panels and is_column else scale))
+    for text in figure.findobj(Text):
+        text.set_fontsize(PAPER_PT)
+    for line in figure.findobj(Line2D):
+        line.set_markersize(line.get_markersize() * scale)
+        line.set_linewidth(line.get_linewidth() * scale)
+    for axis in figure.axes:
+        axis.tick_params(labelsize=PAPER_PT)
+        for label in axis.texts:
+            label.set_fontsize(POINT_PT)
+            if isinstance(label, Annotation):
+                label.xyann = tuple(scale * each for each in label.xyann)
+        if is_column and panels and axis.get_title():
+            axis.set_title("")
+        legend = axis.get_legend()
+        if legend is None or not (is_column or not panels):
+            continue
+        handles, labels = axis.get_legend_handles_labels()
+        legend.remove()
+        columns = 2 if is_column else 4
+        if panels:
+            axis.legend(
+                handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.3), ncols=columns,
+                frameon=False, fontsize=POINT_PT,
+            )  # fmt: skip
+        else:
+            figure.legend(
+                handles, labels, loc="outside lower center", ncols=columns, frameon=False,
+                fontsize=PAPER_PT,
+            )  # fmt: skip

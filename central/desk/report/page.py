@@ -104,7 +104,7 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
     }
     directory.mkdir(parents=True, exist_ok=True)
     with drawn_in(style):
-        paths = {each: directory / f"{each}.{style.form}" for each in style.drawn}
+        paths = {each: directory / style.file_name(each) for each in style.drawn}
         return {str(each): path for each, path in paths.items() if draw[each](path)}
 
 

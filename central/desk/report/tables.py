@@ -88,11 +88,8 @@ def peer_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
 
 
 def title_of(evaluation: Evaluation) -> str:
-    """Scenario, seed, estimator and rule."""
-    scenario = evaluation.scenario
-    if scenario is None:
-        return "a run whose scenario is not known"
-    return f"{scenario.name}, seed {scenario.seed}: {scenario.estimator} + {scenario.fusion}"
+    """The data set, or scenario and seed; then estimator and rule."""
+    return ": ".join(filter(None, (evaluation.title, evaluation.method)))
 
 
 def team_rows(evaluation: Evaluation) -> Rows:

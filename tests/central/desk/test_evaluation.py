@@ -13,15 +13,17 @@ from hypothesis import strategies as st
 from central.desk.compare import compare_picture, compare_rows
 from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
 from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.report.tables import robot_note, robot_row, team_rows
+from central.desk.report.tables import robot_note, robot_row, team_rows, title_of
 from central.desk.side_by_side import comparison_rows
 from sim.scenarios.scenario import Scenario
+from sim.world.config import FolderWorld
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.translate import joint_bytes
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing, Sample
+from team.wire.digest import configured
 from tests.sim.logs import (
     final_map,
     joined_log,
@@ -578,3 +580,16 @@ def test_the_table_tells_used_from_rejected_and_open_measurements() -> None:
     assert "rejected" not in robot_note(every)
     without = evaluate(world_log(scenario()))
     assert robot_row("r1", without.robots["r1"])[2] == f"– of {published}"
+
+
+def test_a_run_on_a_data_set_is_titled_with_its_name() -> None:
+    of = scenario()
+    world = FolderWorld(path="/somewhere/my_set")
+    told = configured("world", 0, 0, msgspec.structs.replace(of, world=world))
+    (configuration,) = samples([Outgoing(ch.WORLD_CONFIG, "", told)])
+    key = ch.WORLD_CONFIG.key()
+    named = [configuration if each.key == key else each for each in joined_log(of, 0.1)]
+    run = evaluate(named)
+    assert title_of(run) == "my_set"
+    assert to_json(run)["data_set"] == "my_set"
+    assert title_of(evaluate(joined_log(of, 0.1))) == "small, seed 1: hybrid + join"
