@@ -102,7 +102,7 @@ def report(
     width: Annotated[
         str | None,
         typer.Option(
-            help="Width of pictures for a paper, as 3.5in or 89mm; default: 3.5in, of panels 7.16in.",
+            help="Width of pictures for a paper, as 89mm; default: 3.5in, of panels 7.16in.",
             metavar="WIDTH",
         ),
     ] = None,
