@@ -1,6 +1,7 @@
 """The router of a team, and the messages that it stores for late joiners."""
 
 import json
+import os
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -26,6 +27,16 @@ if TYPE_CHECKING:  # a router without keys needs none of it
 
 REFUSALS = "error,zenoh_link_tls=warn"
 """The part of Zenoh's log that a router with keys shows: refused connections, with the reasons."""
+PUSH_US = 2_000_000
+"""Time [us] that a message waits for a subscriber whose queue is full: then its link is closed.
+
+It delays all others meanwhile. Whoever is cut off so connects again and fetches what it missed. A
+message of S bytes needs a link of (S - 5 MB) in that time.
+"""
+QUEUE_BATCHES = 16
+"""Batches of 64 kB in the queue to each subscriber, Zenoh's largest number."""
+RX_THREADS = 128
+"""Threads that receive; more than a team has links."""
 MOST_TEAMS = 1_000
 """Number of teams of which a router without keys stores messages."""
 
@@ -44,7 +55,12 @@ def router(
         "mode": "router",
         "listen/endpoints": [listen],
         "adminspace/enabled": True,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": PUSH_US,
+        "transport/link/tx/queue/size/data": QUEUE_BATCHES,
     }
+    # Each link whose messages wait for a slow subscriber blocks a thread, and the slow link is
+    # closed on one of them, too: with two threads, the default, it never would be.
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RX_THREADS}))")
     if keys is not None:
         if not listen.startswith("tls/"):
             raise BusError(f"{listen}: with keys a router listens at tls/HOST:PORT")
