@@ -10,13 +10,12 @@ from pathlib import Path
 from central.desk.peers_as_centre import LISTENS, PeersAsCentre
 from sim.launch.plan import Plan
 from sim.launch.processes import Starter, Used
-from sim.launch.supervision import failure, supervise
+from sim.launch.supervision import failure, lacking_in, names_only, supervise
 from sim.launch.supervisor import Ended, Supervised, end_all
 from sim.launch.watch import Watch
 from sim.scenarios.scenario import dumps
 from team.keys.credentials import Credentials, credentials_of
 from team.peers.proofs import Signs
-from team.shell import lacking
 from team.wire import channels as ch
 from team.wire.bus import BusError
 from team.wire.zenoh.bus import ZenohBus
@@ -98,14 +97,14 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
                 services.append(Supervised(name, arguments, plan.folder, starter))
             supervise(services, bus, watch, show, plan.end_silent_s)
         ended = end_all([service.child for service in services])
-    lacks = "" if watch.fused is None or not watch.fused.final else lacking(watch.fused)
+    lacks = lacking_in(watch)
     wrong = [
         each
         for each in ended
         if each.exit != 0
         and not each.asked
         and not any(text.startswith(f"{each.name} ") for text in watch.failures)
-        and not _says_no_more(each, lacks)
+        and not names_only(each, lacks)
     ]
     failures = watch.failures + [failure(each) for each in wrong if each.exit > 0]
     failures += [lacks] if lacks else []
@@ -120,11 +119,6 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         given_up=watch.given_up,
         used={s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},
     )
-
-
-def _says_no_more(ended: Ended, lacks: str) -> bool:
-    """Whether a process failed only because the final map lacks robots, which is named once."""
-    return bool(lacks) and ended.exit == 1 and ended.last_lines[-1:] == (f"error: {lacks}",)
 
 
 @contextmanager

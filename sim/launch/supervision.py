@@ -13,6 +13,7 @@ from contextlib import suppress
 from central.desk.orders import ordered
 from sim.launch.supervisor import Ended, Supervised
 from sim.launch.watch import TURN_S, Watch
+from team.shell import lacking
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Outgoing
@@ -108,7 +109,8 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     if (status == 0 and service.name != "router") or failed_at_the_end:
         service.over = True
         if failed_at_the_end:
-            watch.failures.append(failure(service.child.ended()))
+            ended = service.child.ended()
+            watch.failures += [] if names_only(ended, lacking_in(watch)) else [failure(ended)]
         return
     ended = service.child.ended()
     service.died(watch.progress(node_of(service.name)))
@@ -237,6 +239,17 @@ class Silence:
             f"{service.name} (pid {pid}) {state} and has said nothing for {silent_s:.0f} s: "
             f"the team may wait for it{remedy}"
         )
+
+
+def lacking_in(watch: Watch) -> str:
+    """The robots that the final map lacks, in words; empty: none."""
+    return "" if watch.fused is None or not watch.fused.final else lacking(watch.fused)
+
+
+def names_only(ended: Ended, lacks: str) -> bool:
+    """Whether a process failed only because the final map lacks robots, which `launch` names."""
+    last = ended.last_lines[-1] if ended.last_lines else ""
+    return bool(lacks) and ended.exit == 1 and last.endswith(f"error: {lacks}")
 
 
 def failure(ended: Ended) -> str:
