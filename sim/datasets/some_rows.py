@@ -40,11 +40,6 @@ def numbers_in(
     return numbers
 
 
-BEARING = "c_bb"
-LARGEST_SIGMA_RAD = 0.5
-"""A larger standard deviation of a bearing [rad] is probably in degrees."""
-
-
 def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray, "R _"]:
     """Each row's packed covariance, NaN in a row that has none; raises DatasetError where a row
     has a part of one.
@@ -57,16 +52,6 @@ def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray,
             columns[int(empty[row].argmax())],
             f"no number here; a covariance has all of {','.join(columns)}, or none in this row",
         )
-    if BEARING in columns:
-        variances = numbers[:, [*columns].index(BEARING)]
-        for row in np.flatnonzero(variances > LARGEST_SIGMA_RAD**2)[:1].tolist():
-            sigma = float(np.sqrt(variances[row]))
-            raise table.error(
-                row,
-                BEARING,
-                f"a variance of ({sigma:.3g} rad)², a bearing off by {np.degrees(sigma):.0f}°; "
-                "if it is in degrees, map it with scale = 3.046e-4, the square of a degree",
-            )
     return numbers
 
 

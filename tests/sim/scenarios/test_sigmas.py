@@ -1,12 +1,9 @@
-"""A bearing's standard deviation in degrees is refused wherever it is given."""
+"""A bearing's standard deviation in degrees is refused in scenarios and by the driver."""
 
 from pathlib import Path
 
 import pytest
 
-from sim.datasets.csv_table import CsvTable
-from sim.datasets.some_rows import covariances_of
-from sim.datasets.tables import DatasetError
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import load
 from team.driver.measured import MeasurementError, observations
@@ -20,13 +17,6 @@ def test_a_bearing_s_sigma_in_degrees_is_refused_in_a_scenario(tmp_path: Path, p
         load(file)
     file.write_text(f'base = "waypoints"\n{place}\nbearing_sigma = 0.5\n')
     assert load(file).robots[0].sensor.bearing_sigma == 0.5
-
-
-def test_a_bearing_s_variance_in_degrees_is_refused_in_a_table() -> None:
-    columns = ("c_rr", "c_rb", "c_bb")
-    table = CsvTable("seen.csv", dict(zip(columns, (["1"], ["0"], ["4"]), strict=True)), [2])
-    with pytest.raises(DatasetError, match=r"line 2, column c_bb: .* off by 115°; if it is in deg"):
-        covariances_of(table, columns)
 
 
 def test_a_bearing_s_variance_in_degrees_is_refused_by_the_driver() -> None:
