@@ -6,7 +6,6 @@ Control characters are escaped, so that a record is one line, of at most LONGEST
 """
 
 import logging
-import time
 
 from team.wire.text import cut, one_line
 
@@ -27,7 +26,7 @@ class Limits(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether the record is logged; its message is then one printable line."""
-        now = time.monotonic()
+        now = record.created
         site = (record.pathname, record.lineno)
         allowance, since, left_out = self._sites.get(site, (float(AT_ONCE), now, 0))
         allowance = min(float(AT_ONCE), allowance + PER_S * max(0.0, now - since))

@@ -32,8 +32,14 @@ def test_a_log_line_is_escaped_whoever_formats_it(caplog: pytest.LogCaptureFixtu
 def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    now = [1000.0]
-    monkeypatch.setattr(logs.time, "monotonic", lambda: now[0])
+    now, made = [1000.0], logging.getLogRecordFactory()
+
+    def record(*arguments: object, **named: object) -> logging.LogRecord:
+        found = made(*arguments, **named)
+        found.created = now[0]
+        return found
+
+    monkeypatch.setattr(logging, "_logRecordFactory", record)
     for k in range(30_000):
         if k == 29_999:
             now[0] += 1.0 / logs.PER_S
