@@ -3,6 +3,7 @@
 import logging
 import math
 import re
+import threading
 from collections.abc import Sequence
 from ipaddress import ip_address
 from pathlib import Path
@@ -113,12 +114,21 @@ def check_pieces(scenario: Scenario) -> None:
         )
 
 
-def connected(team: str, connect: str, keys: Path | None, node: str) -> "ZenohBus":
-    """A bus of the team at the router's endpoint; with keys by TLS, with the node's certificate."""
+def connected(
+    team: str,
+    connect: str,
+    keys: Path | None,
+    node: str,
+    stop: threading.Event | None = None,
+) -> "ZenohBus":
+    """Connect to the router's endpoint; with keys by TLS, with the node's certificate.
+
+    stop: of a process of the team, which waits for a silent router until it is set.
+    """
     from team.wire.zenoh.bus import ZenohBus
 
     own = None if keys is None else own_keys(keys, node, team)
-    return ZenohBus(team, over_tls(connect) if keys else connect, keys=own)
+    return ZenohBus(team, over_tls(connect) if keys else connect, keys=own, stop=stop)
 
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":

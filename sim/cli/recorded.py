@@ -71,7 +71,7 @@ def replay(
     with (
         process("replay") as stop,
         hub as endpoint,
-        connected(opened.team, endpoint, keys, "replay") as bus,
+        connected(opened.team, endpoint, keys, "replay", stop) as bus,
     ):
         if connect is None:
             typer.echo(f"listening at {endpoint}", err=True)

@@ -54,7 +54,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
     resolved = scenario_of(scenario)
     with (
         process("viewer", endless=True) as stop,
-        connected(resolved.team, connect, keys, "viewer") as bus,
+        connected(resolved.team, connect, keys, "viewer", stop) as bus,
     ):
         _LOG.info("connected to team %s at %s", resolved.team, connect)
         peers = [each.id for each in resolved.robots] if resolved.peers else []

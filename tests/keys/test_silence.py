@@ -11,7 +11,7 @@ import pytest
 from team.keys.credentials import credentials_of
 from team.keys.roster import load_roster
 from team.wire import channels as ch
-from team.wire.bus import Outgoing
+from team.wire.bus import BusError, Outgoing
 from team.wire.zenoh import session
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.handshake import examine
@@ -126,3 +126,48 @@ def test_a_pair_of_which_one_half_is_copied_yet_is_waited_for(keys: Folders) -> 
         found = examine(endpoint, mixed, 0.3)
     assert found.refused is None
     assert "can not be read" in found.waits_for
+
+
+@pytest.mark.parametrize("with_keys", [True, False], ids=["keys", "no keys"])
+def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
+    keys: Folders,
+    with_keys: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A process of the team is restarted while the router stands still for longer than patience."""
+    monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
+    monkeypatch.setattr("team.wire.zenoh.handshake.TIMEOUT_S", 0.2)
+    caplog.set_level(logging.WARNING, "teamslam")
+    own = (credentials_of(keys.own, "router"), load_roster(keys.own)) if with_keys else None
+    robot = credentials_of(keys.own, "robot-r1", TEAM) if with_keys else None
+    stop, opened = threading.Event(), threading.Event()
+
+    def start(endpoint: str, until: threading.Event | None) -> None:
+        with ZenohBus(TEAM, endpoint, 0.3, robot, stop=until):
+            opened.set()
+
+    with (
+        router(f"{'tls' if with_keys else 'tcp'}/127.0.0.1:0", own) as endpoint,
+        Link(endpoint) as link,
+    ):
+        link.stall()
+        with pytest.raises(BusError, match="no router answers"):
+            start(link.endpoint, None)  # a command of an operator does not wait
+        starting = threading.Thread(target=start, args=(link.endpoint, stop))
+        starting.start()
+        wait_until(lambda: "waiting for the router" in caplog.text, what="the reason in the log")
+        assert not opened.is_set()
+        link.mend()
+        wait_until(opened.is_set, what="the link")
+        starting.join()
+
+
+def test_a_process_that_waits_for_a_silent_router_ends_when_it_is_told_to(
+    keys: Folders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
+    stop = threading.Event()
+    stop.set()
+    with answering(None) as endpoint, pytest.raises(BusError, match="no router answers"):
+        ZenohBus(TEAM, endpoint, 0.3, credentials_of(keys.own, "robot-r1", TEAM), stop=stop)

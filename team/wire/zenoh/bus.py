@@ -63,6 +63,7 @@ class ZenohBus:
     keys: the certificate that this node presents to the router, over TLS; None: none, over TCP.
         Raises `BusError` when no router answers there within `patience_s`, or one that refuses us
         or that we refuse. One thread publishes and receives; `close` may be called from any.
+    stop: of a process of the team, which waits for a router that is silent until it is set.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class ZenohBus:
         patience_s: float = 10.0,
         keys: "Credentials | None" = None,
         sheds: Collection[Channel] = (),
+        stop: threading.Event | None = None,
     ) -> None:
         self._prefix = f"team/{team}/"
         self._sheds = frozenset(channel.name for channel in sheds)
@@ -92,7 +94,7 @@ class ZenohBus:
         self._counting = threading.Lock()
         self._closed = threading.Event()
         self._keys = keys
-        self._session = client(connect, patience_s, keys)
+        self._session = client(connect, patience_s, keys, stop)
         self._recovery = Recovery(self._session, self._prefix, self._admit)
         self._queries = Queries(self._session, self._prefix, self._queue.put)
         self._link = RouterLink(self._session, connect, keys)

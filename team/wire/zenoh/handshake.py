@@ -9,7 +9,7 @@ network is no evidence, and is reported as a reason to wait.
 import re
 import socket
 import ssl
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -37,12 +37,14 @@ class Examined:
 
     refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
     is no link yet, in words; empty if the handshake succeeded. router_ends: when the router's
-    certificate expires [s since 1970], if it was received.
+    certificate expires [s since 1970], if it was received. accepts: whether connections are
+    accepted there, though perhaps not answered.
     """
 
     refused: str | None = None
     waits_for: str = ""
     router_ends: float | None = None
+    accepts: bool = False
 
 
 def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT_S) -> Examined:
@@ -60,7 +62,8 @@ def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT
     except OSError as error:
         return Examined(waits_for=error.strerror or str(error))
     with link:
-        return _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
+        found = _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
+    return replace(found, accepts=True)
 
 
 def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> Examined:

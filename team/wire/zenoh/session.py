@@ -54,8 +54,18 @@ def opened(settings: dict[str, object]) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def client(connect: str, patience_s: float, keys: "Credentials | None") -> zenoh.Session:
-    """A client's session; raises `BusError` when no router answers, or one that refuses us."""
+def client(
+    connect: str,
+    patience_s: float,
+    keys: "Credentials | None",
+    stop: threading.Event | None = None,
+) -> zenoh.Session:
+    """Open a client's session; raises `BusError` when no router answers within `patience_s`, or one
+    that refuses us.
+
+    stop: of a process of the team, which waits until it is set for a router that accepts
+        connections without answering, as one that is stopped or busy does.
+    """
     settings: dict[str, object] = {
         "mode": "client",
         "connect/endpoints": [connect],
@@ -81,6 +91,9 @@ def client(connect: str, patience_s: float, keys: "Credentials | None") -> zenoh
             if found.refused is not None:
                 raise BusError(found.refused) from error
             wait_s = deadline - time.monotonic()
+            if wait_s <= 0.0 and found.accepts and stop is not None and not stop.is_set():
+                LOG.warning("waiting for the router at %s: %s", connect, found.waits_for)
+                wait_s = FIRST_LOOK_S
             if wait_s <= 0.0:
                 example = "tls/HOST:PORT" if keys is not None else "tcp/HOST:PORT"
                 reason = f": {found.waits_for}" if found.waits_for else ""
