@@ -25,7 +25,7 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
-from sim.calibration import claims, motion, sensor
+from sim.calibration import claims, clocks, motion, sensor
 from sim.calibration.consistency import (
     central_figures,
     factor_by_cost,
@@ -71,7 +71,8 @@ class Calibration:
     the user.
 
     robots: figures of single robots' sensors, where robots differ. detections: what is clutter and
-    what is missed, where there are detections without identities.
+    what is missed, where there are detections without identities. clocks: `clock_offset_s` of the
+    robots whose odometry has another clock than their detections.
     """
 
     motion: tuple[Figure, ...]
@@ -81,6 +82,7 @@ class Calibration:
     central: tuple[Figure, ...] = ()
     robots: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)
     detections: tuple[Figure, ...] = ()
+    clocks: Mapping[str, Figure] = field(default_factory=dict)
 
 
 def calibrated(
@@ -112,13 +114,13 @@ def calibrated(
 def _by_truth(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
-    data, notes = [], []
-    for label, world in worlds:
-        paths = true_paths(world.streams)
-        turning = _turning_first(world, scenario)
-        given = world, paths, _positions(world), TRUTH_GAP_NS, label, turning
-        data += references(*given, scenario.robots[0])
-        notes += _left_out(label, world, paths, "no ground truth")
+    data, notes = against_truth(worlds, scenario)
+    found = clocks.clocks_of(data, scenario.robots[0].sensor)
+    off = {robot: clock.clock_offset_s for robot, clock in found.items() if clock.is_off}
+    if off:
+        worlds = [(label, clocks.on_one_clock(world, found)) for label, world in worlds]
+        data, notes = against_truth(worlds, scenario)
+    notes += clocks.clock_notes(found)
     for note in notes:
         progress(note)
     progress(f"odometry and sensor against the truth of {len(data)} robots")
@@ -145,7 +147,29 @@ def _by_truth(
     true = [_positions(world) for _, world in worlds]
     of_central = central_figures(folds, scenario, strays, progress, true)
     findings = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
-    return Calibration(of_motion, of_sensor, True, findings, of_central, own.robots)
+    known = {robot.id: robot.clock_offset_s for robot in scenario.robots}
+    of_clocks = {
+        robot: replace(figure, value=known.get(robot, 0.0) + figure.value)
+        for robot, figure in off.items()
+    }
+    return Calibration(
+        of_motion, of_sensor, True, findings, of_central, own.robots, clocks=of_clocks
+    )
+
+
+def against_truth(
+    worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario
+) -> tuple[list[Reference], list[str]]:
+    """The references by the truth, and notes on the robots that have none."""
+    data: list[Reference] = []
+    notes: list[str] = []
+    for label, world in worlds:
+        paths = true_paths(world.streams)
+        turning = _turning_first(world, scenario)
+        given = world, paths, _positions(world), TRUTH_GAP_NS, label, turning
+        data += references(*given, scenario.robots[0])
+        notes += _left_out(label, world, paths, "no ground truth")
+    return data, notes
 
 
 def _other_model(data: Sequence[Reference], depth: bool) -> tuple[str, ...]:

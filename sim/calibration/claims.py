@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sim.calibration.data import Reference, poses_at, sensor_poses
 from sim.calibration.figures import huber
@@ -25,6 +25,8 @@ LEAST = 30
 """Least number of spans or measurements from which a factor is learnt."""
 CERTAIN_M = 0.02
 """A mount is not reported where three standard deviations of its position exceed this [m]."""
+NEGLIGIBLE_M = 0.005
+"""A mount that is nearer than this [m] to the scenario's is not reported."""
 DISTANT = 3.0
 """Number of standard deviations from which a mount differs from the scenario's."""
 
@@ -113,6 +115,18 @@ def _rows(data: Reference, sensor: Sensor) -> _Rows:
     return _Rows(taken, ranges, points, np.hypot(true[:, 0], true[:, 1]), true, off)
 
 
+def measured_and_true(
+    data: Reference, sensor: Sensor
+) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
+    """Of all detections: which are of known landmarks from known poses, the points that they
+    measure, and the true ones, relative to the sensor.
+    """
+    rows = _rows(data, sensor)
+    points, true = (np.full((len(rows.taken), 2), np.nan) for _ in range(2))
+    points[rows.taken], true[rows.taken] = rows.points, rows.true_points
+    return rows.taken, points, true
+
+
 def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
     """The sensor's mount estimated by the truth, as a note, where it differs from the
     scenario's.
@@ -148,7 +162,7 @@ def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
             "narrow a view, or with so much noise, it can not be told from range_offset and "
             "bearing_offset",
         )
-    if np.all(np.abs(found[:2]) <= DISTANT * sigmas):
+    if np.all(np.abs(found[:2]) <= np.maximum(DISTANT * sigmas, NEGLIGIBLE_M)):
         return ()
     x, y, heading = sensor.mount
     c, s = np.cos(heading), np.sin(heading)

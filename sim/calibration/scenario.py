@@ -35,10 +35,13 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
         if figures:
             lines += ["", f"[{name}]", *_table(figures, declared)]
     differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
-    by_robot = calibration.robots or (calibration.by_truth and differ)
+    by_robot = calibration.robots or calibration.clocks or (calibration.by_truth and differ)
     for robot in scenario.robots if by_robot or isinstance(world, LiveWorld) else ():
         fields = nested({}, calibration.robots.get(robot.id, ()), Sensor)
         own = [f"sensor = {_inline(fields)}"] if fields else []
+        clock = calibration.clocks.get(robot.id)
+        if clock is not None:
+            own.append(f"clock_offset_s = {clock.value:.5g}  # {_uncertainty(clock)}")
         lines += ["", "[[robots]]", f'id = "{robot.id}"', *own]
     return "\n".join(lines) + "\n"
 
@@ -74,6 +77,13 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
         of_robot = [_rounded(figure) for figure in figures]
         robot["sensor"] = nested(robot.get("sensor", {}), of_robot, Sensor)
         if robot is new:
+            robots.append(robot)
+    for robot_id, clock in calibration.clocks.items():
+        comments.append(f"# {robot_id} clock_offset_s: {clock.value:.5g} {_uncertainty(clock)}")
+        entry: Fields = {"id": robot_id}
+        robot = next((each for each in robots if each.get("id") == robot_id), entry)
+        robot["clock_offset_s"] = _rounded(clock).value
+        if robot is entry:
             robots.append(robot)
     if robots:
         document["robots"] = robots

@@ -69,6 +69,7 @@ def calibrate(
         ("motion", found.motion),
         ("sensor", found.sensor),
         *((robot, figures) for robot, figures in found.robots.items()),
+        *((robot, (figure,)) for robot, figure in found.clocks.items()),
         ("detections", found.detections),
         ("central", found.central),
     )

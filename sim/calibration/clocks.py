@@ -1,0 +1,247 @@
+"""Estimates by how much a robot's detections and its odometry are stamped late, against its path.
+
+A detection stamped t was made at t − τ: it is compared with the true pose of that time. Where a
+robot drives straight on, an offset looks like a mount moved forward by v τ, so the mount's pose and
+an offset of the range are estimated with it; turns and other speeds tell them apart. An interval of
+odometry that is stamped late is compared with the path's turn likewise, its scale being free.
+
+`RobotConfig.clock_offset_s` moves the odometry to the detections' clock: τ of the detections less
+that of the odometry.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from central.desk.evaluation.errors import Path, on_circle
+from sim.calibration.claims import measured_and_true
+from sim.calibration.data import Reference, poses_at
+from sim.calibration.figures import Figure, huber, jackknifed
+from sim.world.streams import RobotStream, WorldStreams, robot_stream
+from team.config import Sensor
+
+LEAST = 200
+"""Least number of detections, and of turns of the odometry, from which an offset is learnt."""
+ROUNDS = 6
+STEP_NS = 10_000_000
+"""Step of the derivative by time."""
+LARGEST_S = 2.0
+"""An offset beyond this is not a clock's."""
+BEYOND_DOUBT = 4.0
+"""Number of standard deviations from which an offset is applied."""
+LEAST_S = 0.01
+"""A smaller offset [s] is not applied."""
+SETTLED_S = 1e-4
+
+UNITS = {"detections": "s", "odometry": "s", "clock_offset_s": "s"}
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The times by which a robot's detections and odometry are stamped late, and the difference."""
+
+    detections: Figure
+    odometry: Figure
+    clock_offset_s: Figure
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the two clocks differ beyond doubt."""
+        found = self.clock_offset_s
+        return abs(found.value) > max(LEAST_S, BEYOND_DOUBT * found.sigma)
+
+
+def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
+    """The clocks of each robot that has enough measurements along a known path.
+
+    Robots that turn on the spot before they drive have no speeds to tell a time by.
+    """
+    robots: dict[str, list[Reference]] = {}
+    for each in data:
+        if not each.turns_first:
+            robots.setdefault(each.robot, []).append(each)
+    found = {}
+    for robot, own in sorted(robots.items()):
+        figures = {each.name: each for each in jackknifed(_fit_of(sensor), own, UNITS)}
+        if len(figures) == len(UNITS):
+            found[robot] = Clock(**figures)
+    return found
+
+
+def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
+    """The clocks that are off, in words."""
+    return tuple(
+        f"{robot}: its detections are stamped {1e3 * clock.clock_offset_s.value:.0f} ± "
+        f"{1e3 * clock.clock_offset_s.sigma:.0f} ms {late} its odometry: clock_offset_s = "
+        f"{clock.clock_offset_s.value:.4f} moves the odometry to the detections' clock"
+        for robot, clock in clocks.items()
+        if clock.is_off
+        for late in ("late against" if clock.clock_offset_s.value > 0.0 else "ahead of",)
+    )
+
+
+def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStreams:
+    """The world with the odometry and the true path of each robot on its detections' clock, where
+    that is off.
+    """
+    streams = tuple(
+        _moved(each, clocks[each.robot])
+        if each.robot in clocks and clocks[each.robot].is_off
+        else each
+        for each in world.streams
+    )
+    return replace(world, streams=streams)
+
+
+def _moved(stream: RobotStream, clock: Clock) -> RobotStream:
+    by_ns = round(clock.clock_offset_s.value * 1e9)
+    late_ns = round(clock.detections.value * 1e9)
+    intervals = replace(stream.intervals, end_ns=stream.intervals.end_ns + by_ns)
+    first_ns = int((intervals.end_ns - intervals.duration_ns)[0])
+    return robot_stream(
+        robot=stream.robot,
+        start_ns=min(int(stream.stamps_ns[0]), first_ns),
+        start=stream.start,
+        intervals=intervals,
+        observations=stream.landmark_detections,
+        sightings=stream.teammate_detections,
+        teammates=stream.teammates,
+        truth_ns=None if stream.truth_ns is None else stream.truth_ns + late_ns,
+        truth=stream.truth,
+        notes=stream.notes,
+        clock_offset_ns=stream.clock_offset_ns + by_ns,
+    )
+
+
+def _fit_of(sensor: Sensor) -> Callable[[Sequence[Reference]], Mapping[str, float]]:
+    def fit(part: Sequence[Reference]) -> Mapping[str, float]:
+        seen, driven = _detections_late(part, sensor), _odometry_late(part)
+        if seen is None or driven is None:
+            return {}
+        return {"detections": seen, "odometry": driven, "clock_offset_s": seen - driven}
+
+    return fit
+
+
+def _at(data: Reference, late_ns: int) -> Reference:
+    """The reference with a path that is later by so much."""
+    return replace(data, path=Path(data.path.stamps_ns + late_ns, data.path.poses))
+
+
+def _detections_late(data: Sequence[Reference], sensor: Sensor) -> float | None:
+    """The time [s] by which detections are stamped late; None where it is not determined.
+
+    Iterations of the linearised fit of (mount x, y, θ, range offset, τ) under Huber's loss.
+    """
+    late = 0.0
+    for _ in range(ROUNDS):
+        late_ns = round(late * 1e9)
+        here, before, after = (
+            [measured_and_true(_at(each, late_ns + step), sensor) for each in data]
+            for step in (0, -STEP_NS, STEP_NS)
+        )
+        common = [a[0] & b[0] & c[0] for a, b, c in zip(here, before, after, strict=True)]
+        points, true, earlier, later = (
+            np.concatenate([
+                np.empty((0, 2)),
+                *(one[at][taken] for one, taken in zip(side, common, strict=True)),
+            ])
+            for side, at in ((here, 1), (here, 2), (before, 2), (after, 2))
+        )  # fmt: skip
+        if len(points) < LEAST:
+            return None
+        step = _step(points, true, (later - earlier) / (2e-9 * STEP_NS), sensor)
+        late += step
+        if abs(late) > LARGEST_S:
+            return None
+        if abs(step) < SETTLED_S:
+            break
+    return late
+
+
+def _step(
+    points: Float[np.ndarray, "n 2"],
+    true: Float[np.ndarray, "n 2"],
+    rate: Float[np.ndarray, "n 2"],
+    sensor: Sensor,
+) -> float:
+    """The further time by which the detections are late, with a mount and an offset of the range.
+
+    rate: ∂true/∂τ [m/s], of the true points relative to the sensor.
+    """
+    ranges = np.maximum(np.hypot(*points.T), 1e-3)
+    x, y = points.T
+    zero, one = np.zeros(len(x)), np.ones(len(x))
+    along = np.concatenate(points.T / ranges)
+    J = np.column_stack([
+        np.concatenate([one, zero]),
+        np.concatenate([zero, one]),
+        np.concatenate([-y, x]),
+        along,
+        -np.concatenate(rate.T),
+    ])  # fmt: skip
+    gap = np.concatenate((points - true).T)
+    sigma = np.hypot(sensor.range_sigma, sensor.bearing_sigma * ranges)
+    return float(huber(_affine(gap, J), np.concatenate([sigma, sigma]), np.zeros(5))[4])
+
+
+def _affine(
+    gap: Float[np.ndarray, " n"], J: Float[np.ndarray, "n p"]
+) -> Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " n"]]:
+    """The residual gap + J p as a function of p."""
+
+    def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        return np.asarray(gap + J @ p)
+
+    return residual
+
+
+def _odometry_late(data: Sequence[Reference]) -> float | None:
+    """The time [s] by which intervals of odometry are stamped late, by the turns of the path; None
+    where it is not determined.
+    """
+    late = 0.0
+    for _ in range(ROUNDS):
+        late_ns = round(late * 1e9)
+        parts = [_turns(each, late_ns) for each in data]
+        driven, turned, rate = (
+            np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in range(3)
+        )
+        if len(driven) < LEAST or float(np.std(driven)) == 0.0:
+            return None
+        gap, J = driven - turned, np.column_stack([driven, np.ones(len(driven)), -rate])
+        sigma = 1.4826 * float(np.median(np.abs(gap))) + 1e-9
+        step = float(huber(_affine(gap, J), np.full(len(gap), sigma), np.zeros(3))[2])
+        late += step
+        if abs(late) > LARGEST_S:
+            return None
+        if abs(step) < SETTLED_S:
+            break
+    return late
+
+
+def _turns(
+    data: Reference, late_ns: int
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Of each interval the logged turn, that of the path moved by late_ns, and its derivative by
+    that time [rad, rad, rad/s].
+    """
+    intervals = data.intervals
+
+    def turned(by_ns: int) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
+        path = Path(data.path.stamps_ns + late_ns + by_ns, data.path.poses)
+        ends: Int64[np.ndarray, " n"] = intervals.end_ns
+        (one, known), (two, also) = (
+            poses_at(path, stamps, data.gap_ns) for stamps in (ends - intervals.duration_ns, ends)
+        )
+        return on_circle(two[:, 2] - one[:, 2]), known & also
+
+    here, known = turned(0)
+    before, earlier = turned(-STEP_NS)
+    after, later = turned(STEP_NS)
+    taken = known & earlier & later
+    driven = intervals.yaw_rate * intervals.duration_ns * 1e-9
+    rate = (after - before) / (2e-9 * STEP_NS)
+    return driven[taken], here[taken], rate[taken]

@@ -1,0 +1,76 @@
+"""A clock of a robot's detections that is off is found, and is not taken for a mount."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.calibration.calibrate import against_truth, calibrated
+from sim.calibration.clocks import clocks_of
+from sim.calibration.scenario import scenario_toml, within
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.scenario import Scenario, load, with_options
+from sim.scenarios.source import streams_of
+from team.wire.arrays import floats, ids
+from tests.trials.stress_world import StressWorld, write
+
+OFFSET_S = 0.5
+SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=240.0)
+
+
+def opened(place: Path) -> Scenario:
+    return with_options(load(str(place / "scenario.toml")), dataset=place)
+
+
+def map_error(scenario: Scenario) -> float:
+    """The RMSE of the final map in the team's frame [m]."""
+    streams = streams_of(scenario)
+    fused = final_map(list(run_team(scenario, streams)))
+    assert streams.landmarks is not None
+    true = dict(zip(streams.landmark_ids.tolist(), streams.landmarks, strict=True))
+    means = floats(fused.means, "means").reshape(-1, 2)
+    off = [m - true[i] for m, i in zip(means, ids(fused.ids, "ids").tolist(), strict=True)]
+    return float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A data set whose clocks are right, and the same with late detections of r2."""
+    late = StressWorld(**{**vars(SMALL), "late": {"r2": OFFSET_S}})
+    root = tmp_path_factory.mktemp("sets")
+    return write(SMALL, root / "right"), write(late, root / "late")
+
+
+def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_good(
+    places: tuple[Path, Path],
+) -> None:
+    """The scenario has a part of the offset already; the rest adds to it."""
+    right, late = (opened(place) for place in places)
+    begun = places[1] / "begun.toml"
+    robots = '[[robots]]\nid = "r1"\n\n[[robots]]\nid = "r2"\nclock_offset_s = 0.1\n'
+    begun.write_text(f"{(places[1] / 'scenario.toml').read_text()}\n{robots}")
+    scenario = with_options(load(str(begun)), dataset=places[1])
+    found = calibrated([("late", streams_of(scenario))], scenario, lambda _: None)
+    assert list(found.clocks) == ["r2"]
+    figure = found.clocks["r2"]
+    assert abs(figure.value - OFFSET_S) < max(3.0 * figure.sigma, 0.01)
+    assert 0.0 < figure.sigma < 0.05
+    assert not [note for note in found.notes if "sensor.mount" in note]
+    assert [note for note in found.notes if note.startswith("r2: its detections are stamped")]
+    learnt = places[1] / "learnt.toml"
+    learnt.write_text(within(str(begun), found, ["late"], learnt))
+    after = with_options(load(str(learnt)), dataset=places[1])
+    assert [robot.clock_offset_s for robot in after.robots] == [
+        0.0,
+        pytest.approx(figure.value, rel=1e-4),
+    ]
+    assert map_error(after) < 1.5 * map_error(right) < 0.75 * map_error(late)
+    assert "clock_offset_s" in scenario_toml(found, late, ["late"])
+
+
+def test_clocks_that_are_right_are_left_alone(places: tuple[Path, Path]) -> None:
+    right = opened(places[0])
+    data = against_truth([("right", streams_of(right))], right)[0]
+    clocks = clocks_of(data, right.robots[0].sensor)
+    assert list(clocks) == ["r1", "r2"]
+    assert not any(clock.is_off for clock in clocks.values())
