@@ -71,8 +71,9 @@ class Calibration:
     the user.
 
     robots: figures of single robots' sensors, where robots differ. detections: what is clutter and
-    what is missed, where there are detections without identities. clocks: `clock_offset_s` of the
-    robots whose odometry has another clock than their detections.
+    what is missed, where there are detections without identities. clocks: `clock_offset_s` of
+    every robot, where the odometry of one has another clock than its detections: a scenario that
+    names one robot names all of the team.
     """
 
     motion: tuple[Figure, ...]
@@ -116,8 +117,7 @@ def _by_truth(
 ) -> Calibration:
     data, notes = against_truth(worlds, scenario)
     found = clocks.clocks_of(data, scenario.robots[0].sensor)
-    off = {robot: clock.clock_offset_s for robot, clock in found.items() if clock.is_off}
-    if off:
+    if any(clock.is_off for clock in found.values()):
         worlds = [(label, clocks.on_one_clock(world, found)) for label, world in worlds]
         data, notes = against_truth(worlds, scenario)
     notes += clocks.clock_notes(found)
@@ -149,8 +149,12 @@ def _by_truth(
     findings = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
     known = {robot.id: robot.clock_offset_s for robot in scenario.robots}
     of_clocks = {
-        robot: replace(figure, value=known.get(robot, 0.0) + figure.value)
-        for robot, figure in off.items()
+        robot: replace(
+            clock.clock_offset_s,
+            value=known.get(robot, 0.0) + (clock.clock_offset_s.value if clock.is_off else 0.0),
+        )
+        for robot, clock in found.items()
+        if any(each.is_off for each in found.values())
     }
     return Calibration(
         of_motion, of_sensor, True, findings, of_central, own.robots, clocks=of_clocks
