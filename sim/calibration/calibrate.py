@@ -72,8 +72,8 @@ class Calibration:
 
     robots: figures of single robots' sensors, where robots differ. detections: what is clutter and
     what is missed, where there are detections without identities. clocks: `clock_offset_s` of
-    every robot, where the odometry of one has another clock than its detections: a scenario that
-    names one robot names all of the team.
+    every robot that has enough measurements, where the odometry of one has another clock than its
+    detections. team: the robots of the data.
     """
 
     motion: tuple[Figure, ...]
@@ -84,6 +84,7 @@ class Calibration:
     robots: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)
     detections: tuple[Figure, ...] = ()
     clocks: Mapping[str, Figure] = field(default_factory=dict)
+    team: tuple[str, ...] = ()
 
 
 def calibrated(
@@ -98,6 +99,8 @@ def calibrated(
         found = _by_truth(worlds, scenario, progress)
     else:
         found = _by_the_map(worlds, scenario, progress)
+    robots = dict.fromkeys(stream.robot for _, world in worlds for stream in world.streams)
+    found = replace(found, team=tuple(robots))
     windows = [
         each
         for _, world in worlds

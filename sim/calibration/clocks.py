@@ -83,8 +83,8 @@ def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
 
 
 def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStreams:
-    """The world with the odometry and the true path of each robot on its detections' clock, where
-    that is off.
+    """The world with odometry and detections on the clock of the true path, for each robot whose
+    two clocks differ: the paths of teammates stay comparable.
     """
     streams = tuple(
         _moved(each, clocks[each.robot])
@@ -96,22 +96,24 @@ def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStrea
 
 
 def _moved(stream: RobotStream, clock: Clock) -> RobotStream:
-    by_ns = round(clock.clock_offset_s.value * 1e9)
-    late_ns = round(clock.detections.value * 1e9)
-    intervals = replace(stream.intervals, end_ns=stream.intervals.end_ns + by_ns)
+    seen_ns, driven_ns = (round(each.value * 1e9) for each in (clock.detections, clock.odometry))
+    intervals = replace(stream.intervals, end_ns=stream.intervals.end_ns - driven_ns)
+    observations, sightings = (
+        replace(each, stamps_ns=each.stamps_ns - seen_ns)
+        for each in (stream.landmark_detections, stream.teammate_detections)
+    )
     first_ns = int((intervals.end_ns - intervals.duration_ns)[0])
     return robot_stream(
         robot=stream.robot,
-        start_ns=min(int(stream.stamps_ns[0]), first_ns),
+        start_ns=min(int(stream.stamps_ns[0]) - seen_ns, first_ns),
         start=stream.start,
         intervals=intervals,
-        observations=stream.landmark_detections,
-        sightings=stream.teammate_detections,
+        observations=observations,
+        sightings=sightings,
         teammates=stream.teammates,
-        truth_ns=None if stream.truth_ns is None else stream.truth_ns + late_ns,
+        truth_ns=stream.truth_ns,
         truth=stream.truth,
         notes=stream.notes,
-        clock_offset_ns=stream.clock_offset_ns + by_ns,
     )
 
 

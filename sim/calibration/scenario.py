@@ -51,7 +51,8 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
     `output`.
 
     What was learnt is every robot's, so no robot has another value of it except one learnt for that
-    robot. All other fields stay.
+    robot. All other fields stay. A scenario that names one robot names all of the team: where the
+    user's names none and one robot has a figure of its own, all robots of the data are named.
     """
     document = own_document(own)
     world = document.get("world", {})
@@ -85,6 +86,10 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
         robot["clock_offset_s"] = _rounded(clock).value
         if robot is entry:
             robots.append(robot)
+    if robots and "robots" not in document:
+        document.pop("robot_count", None)
+        named = {robot.get("id") for robot in robots}
+        robots += [{"id": robot} for robot in calibration.team if robot not in named]
     if robots:
         document["robots"] = robots
     return "\n".join([*_head(calibration, sources), *comments, "", tomli_w.dumps(document)])

@@ -29,7 +29,11 @@ def calibrate(
         Path | None, typer.Option("--json", help="Write the figures as JSON, too.")
     ] = None,
 ) -> None:
-    """Learn odometry and sensor models from measurements; every figure with its uncertainty."""
+    """Learn odometry and sensor models from measurements; every figure with its uncertainty.
+
+    With a ground truth also by how much detections are stamped late against the odometry
+    (clock_offset_s).
+    """
     import json
     from dataclasses import asdict, replace
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sim.calibration import calibrate
-from sim.calibration.calibrate import against_truth, calibrated
-from sim.calibration.clocks import clocks_of
+from sim.calibration.calibrate import Calibration, against_truth, calibrated
+from sim.calibration.clocks import Clock, clocks_of, on_one_clock
+from sim.calibration.figures import Figure
 from sim.calibration.scenario import scenario_toml, within
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, load, with_options
@@ -76,7 +77,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
         for robot, clock in zip(late.robots, clocks, strict=True)
     ]
     on_time = msgspec.structs.replace(late, robots=tuple(robots))
-    assert map_error(on_time) < 1.1 * map_error(right) < 0.1 * map_error(late)
+    assert map_error(on_time) < 1.1 * map_error(right) < 0.3 * map_error(late)
     assert "clock_offset_s" in scenario_toml(found, late, ["late"])
 
 
@@ -86,3 +87,30 @@ def test_clocks_that_are_right_are_left_alone(places: tuple[Path, Path]) -> None
     clocks = clocks_of(data, right.robots[0].sensor)
     assert list(clocks) == ["r1", "r2"]
     assert not any(clock.is_off for clock in clocks.values())
+
+
+def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path: Path) -> None:
+    """A scenario that names one robot names all of the team."""
+    own = tmp_path / "scenario.toml"
+    for robot in ("r1", "r2", "r3"):
+        (tmp_path / robot).mkdir()
+        (tmp_path / robot / "odometry.csv").touch()
+    own.write_text('base = "recorded"\n[world]\nkind = "folder"\npath = "."\n')
+    late = Figure("clock_offset_s", 0.5, 0.01, "s")
+    found = Calibration((), (), True, (), clocks={"r2": late}, team=("r1", "r2", "r3"))
+    learnt = tmp_path / "learnt.toml"
+    learnt.write_text(within(str(own), found, ["set"], learnt))
+    clocks = {robot.id: robot.clock_offset_s for robot in load(str(learnt)).robots}
+    assert clocks == {"r1": 0.0, "r2": 0.5, "r3": 0.0}
+
+
+def test_a_late_robot_is_compared_with_its_teammates_at_one_time(places: tuple[Path, Path]) -> None:
+    """Detections and odometry are moved to the clock of the true paths, which all robots share."""
+    streams = streams_of(opened(places[0]))
+    late = Clock(*(Figure(name, s, 0.01, "s") for name, s in (("a", 0.3), ("b", -0.2), ("c", 0.5))))
+    before, after = (world.streams[1] for world in (streams, on_one_clock(streams, {"r2": late})))
+    assert after.truth_ns is before.truth_ns
+    moved = after.landmark_detections.stamps_ns - before.landmark_detections.stamps_ns
+    assert np.unique(moved).tolist() == [-300_000_000]
+    moved = after.intervals.end_ns - before.intervals.end_ns
+    assert np.unique(moved).tolist() == [200_000_000]
