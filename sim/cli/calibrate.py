@@ -31,8 +31,7 @@ def calibrate(
 ) -> None:
     """Learn odometry and sensor models from measurements; every figure with its uncertainty.
 
-    With a ground truth also by how much detections are stamped late against the odometry
-    (clock_offset_s).
+    With a ground truth also clock_offset_s, by which detections are stamped late.
     """
     import json
     from dataclasses import asdict, replace
