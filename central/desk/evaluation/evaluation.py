@@ -7,6 +7,7 @@ radians; NEES is per degree of freedom, 1 where the covariance is right.
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import PurePath
 from typing import Any
@@ -20,6 +21,7 @@ from central.desk.evaluation.association import (
     association_json,
     association_result,
 )
+from central.desk.evaluation.clocks import Timed, clock_warning
 from central.desk.evaluation.errors import (
     MapErrors,
     Path,
@@ -43,8 +45,9 @@ from central.desk.evaluation.verdicts import verdicts_given
 from central.desk.names import in_order, not_joined, short
 from central.team_config import TeamConfig, team_config
 from team import translate
-from team.config import UNNAMED
+from team.config import UNNAMED, RobotConfig
 from team.estimation.gaussian import Matrix
+from team.former_names import with_current_names
 from team.pairs import PAIRS
 from team.recording.check import holes
 from team.recording.reader import Log
@@ -146,7 +149,8 @@ class Evaluation:
     truth's, and only aligned errors are meaningful. decisions: closures and merges by landmarks
     without identities, from the final map. verdicts: an operator's on such landmarks, in words.
     states: of every robot of the team in the final map. data_set: the name of its folder or file;
-    empty for a simulated world.
+    empty for a simulated world. clocks: the robots whose detections are late or early beyond doubt,
+    in words.
     """
 
     scenario: TeamConfig | None
@@ -168,15 +172,16 @@ class Evaluation:
     gps_median_m: float | None = None
     data_set: str = ""
     states: Mapping[str, RobotState] = field(default_factory=dict)
+    clocks: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """The warnings about a run's result, for every command that shows it: robots that are not
-        in the map, and the map's own.
+        in the map, the map's own, and clocks that are off.
         """
         reasons = () if self.map is None else self.map.reasons
         of_map = (short(each) for each in reasons if not any(not_joined([each])))
-        return (*not_in_the_map(self.states), *of_map)
+        return (*not_in_the_map(self.states), *of_map, *self.clocks)
 
     @property
     def title(self) -> str:
@@ -269,7 +274,30 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         verdicts=verdicts_given(log),
         data_set=_data_set(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
+        clocks=_clocks(log),
     )
+
+
+def _clocks(log: Collected) -> tuple[str, ...]:
+    """The warnings about the robots' clocks, each by its incarnation with most measurements."""
+    longest: dict[str, Timed] = {}
+    for (robot, _), timed in sorted(log.timed.items()):
+        if robot not in longest or len(timed.ids) > len(longest[robot].ids):
+            longest[robot] = timed
+    found = (
+        clock_warning(robot, longest[robot], _config(log, robot)) for robot in in_order(longest)
+    )
+    return tuple(filter(None, found))
+
+
+def _config(log: Collected, robot: str) -> RobotConfig:
+    """The configuration that a robot announced; the default one where the log has none."""
+    announced = log.sound(log.latest.get(ch.ROBOT_CONFIG.key(robot)))
+    if isinstance(announced, m.Configuration):
+        with suppress(msgspec.MsgspecError):
+            text = with_current_names(msgspec.json.decode(announced.configuration))
+            return msgspec.convert(text, RobotConfig)
+    return RobotConfig(robot)
 
 
 def _frames(log: Collected) -> TruthFrames:

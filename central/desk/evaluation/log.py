@@ -1,7 +1,8 @@
 """Collects from a log's samples, in one pass, what an evaluation needs.
 
-Most of a log is sensor measurements; only their head (robot, incarnation, measurement) is decoded,
-to count them. All other messages are decoded and checked by `shown`.
+Most of a log is sensor measurements: each is counted by its head (robot, incarnation, measurement)
+and adds its stamp and numbers to its stream's `Timed`. All other messages are decoded and checked
+by `shown`.
 """
 
 from collections import defaultdict
@@ -11,17 +12,23 @@ from dataclasses import dataclass, field
 import msgspec
 
 from central.desk.agreement import as_centre_final
+from central.desk.evaluation.clocks import Timed
 from central.desk.names import in_order
 from central.desk.peers_as_centre import PeersAsCentre
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, shown
 from team.wire.channels import Channel, channel_of
-from team.wire.codec import WireError
+from team.wire.codec import WireError, decoded
 
 _SENSORS = frozenset(channel.name for channel in ch.SENSORS)
+_TIMED: tuple[type[m.AnyOdometry | m.AnyScan], ...] = (
+    m.Odometry, m.Increment, m.Steering, m.Observations, m.Points,
+)  # fmt: skip
+_TIMED_TAGS = frozenset(str(each.__struct_config__.tag) for each in _TIMED)
 _NEWEST = (
-    ch.CONCLUDED, ch.WORLD_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END, ch.STATUS, ch.OWN_MAP,
+    ch.CONCLUDED, ch.WORLD_CONFIG, ch.ROBOT_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END,
+    ch.STATUS, ch.OWN_MAP,
 )  # fmt: skip
 _LATEST = frozenset(channel.name for channel in _NEWEST)
 _COLLECTED = frozenset(
@@ -89,16 +96,17 @@ class Measurements:
 class Collected:
     """The contents of a log, by channel and robot.
 
-    samples: by key, as payloads that are decoded on demand. first_ns: the wall clock of the first
-    sample that has one. unsound: samples that are no valid message of their channel; they count as
-    traffic only. disagreement: of a team without a centre, the peers whose final map differs, in
-    words.
+    samples: by key, as payloads that are decoded on demand. timed: by (robot, incarnation).
+    first_ns: the wall clock of the first sample that has one. unsound: samples that are no valid
+    message of their channel; they count as traffic only. disagreement: of a team without a centre,
+    the peers whose final map differs, in words.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
     measurements: dict[str, Measurements] = field(default_factory=lambda: defaultdict(Measurements))
     latest: dict[str, Sample] = field(default_factory=dict)
     samples: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
+    timed: dict[tuple[str, int], Timed] = field(default_factory=lambda: defaultdict(Timed))
     unsound: int = 0
     disagreement: tuple[str, ...] = ()
     first_ns: int | None = None
@@ -181,9 +189,21 @@ class Collected:
             self._refuse(sample)
             return
         of_robot = self.measurements[robot]
-        of_robot.all.add((head.incarnation, head.number))
+        name = (head.incarnation, head.number)
+        if name not in of_robot.all and head.tag in _TIMED_TAGS:
+            self._time(sample, robot)
+        of_robot.all.add(name)
         if odometry:
-            of_robot.odometry.add((head.incarnation, head.number))
+            of_robot.odometry.add(name)
+
+    def _time(self, sample: Sample, robot: str) -> None:
+        """Add a measurement to its stream's; an invalid one is counted only."""
+        try:
+            message = decoded(sample.payload, *_TIMED)
+        except WireError:
+            return
+        if message.robot == robot:
+            self.timed[robot, message.incarnation].take(message)
 
 
 def collected(samples: Iterable[Sample]) -> Collected:

@@ -126,6 +126,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows += _association_rows(evaluation)
     rows += [("joined", short(words)) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
+    rows += [("note", words) for words in evaluation.clocks]
     rows += [("verdict", words) for words in evaluation.verdicts]
     meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
     if meetings:

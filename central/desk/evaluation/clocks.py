@@ -1,0 +1,319 @@
+"""Estimates by how much a robot's detections are stamped late against its odometry, without truth.
+
+A landmark that is measured at t_i and again at t_j is at the points b_i and b_j of the robot's
+base. With the motion D(τ) by odometry from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise: where
+the speeds at t_i and t_j differ, D depends on τ. Neither a map nor the true path is needed.
+
+Causes that could be taken for τ are estimated with it: the sensor's mount, an offset of the range,
+and the scales and the drift of odometry. The variance is the sandwich over stretches of time (Liang
+and Zeger 1986), so errors may be correlated within a stretch.
+"""
+
+import math
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from team import translate
+from team.config import RobotConfig, Sensor
+from team.estimation.odometry import moved, steered
+from team.wire import messages as m
+from team.wire.arrays import floats
+
+APART_NS = 2_000_000_000
+"""Greatest time between two measurements of a landmark that are compared."""
+STRETCH_NS = 5_000_000_000
+LEAST_STRETCHES = 12
+"""Least effective number of stretches, 1/Σ share² of the information on τ, from which a variance is
+computed: where few turns carry all of it, the variance is too uncertain.
+"""
+STEP_NS = 250_000_000
+"""Step of the derivative by τ: over it the noise of single intervals averages out. It is central,
+so that the noise in the derivative is uncorrelated with that of D.
+"""
+HUBER = 2.0
+"""The loss is linear beyond this number of standard deviations."""
+ROUNDS = 20
+SETTLED_NS = 1_000_000
+LEAST_SLOPE = 0.2
+"""Least share of the derivative that is motion rather than noise of odometry."""
+LARGEST_NS = 2_000_000_000
+"""A greater offset is not a clock's."""
+NEAR_M = 1.0
+"""Errors of points grow with their distance beyond this one [m]."""
+BEYOND_DOUBT = 5.0
+"""Number of standard deviations from which an offset is reported."""
+LEAST_S = 0.02
+"""A smaller offset [s] is not reported."""
+
+
+@dataclass
+class Timed:
+    """The stamps, motions and measurements of named landmarks of one stream, in any order.
+
+    motions: (forward [m/s], left [m/s], turn [rad/s]) of each interval, or (wheel speed [m/s],
+    steering [rad], –) where `steered`. seen: (range [m], bearing [rad]) of each measurement.
+    """
+
+    ends_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    durations_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    motions: "array[float]" = field(default_factory=lambda: array("d"))
+    steered: "array[int]" = field(default_factory=lambda: array("b"))
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    ids: "array[int]" = field(default_factory=lambda: array("q"))
+    seen: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def take(self, message: m.AnyOdometry | m.AnyScan) -> None:
+        """Add an interval of odometry or the measurements of a scan."""
+        if isinstance(message, m.AnyScan):
+            scan = translate.scan_of(message)
+            self.stamps_ns.extend([message.stamp_ns] * len(scan.ids))
+            self.ids.extend(scan.ids.tolist())
+            self.seen.extend(np.column_stack([scan.ranges, scan.bearings]).ravel().tolist())
+            return
+        self.ends_ns.append(message.stamp_ns)
+        self.durations_ns.append(message.duration_ns)
+        self.motions.extend(_speeds(message))
+        self.steered.append(isinstance(message, m.Steering))
+
+
+def _speeds(message: m.AnyOdometry) -> tuple[float, float, float]:
+    """The row of `Timed.motions` of an interval."""
+    match message:
+        case m.Odometry():
+            return message.forward, 0.0, message.yaw_rate
+        case m.Steering():
+            return message.wheel_speed, message.steering, 0.0
+        case m.Increment():
+            per_s = 1.0 / max(1e-9 * message.duration_ns, 1e-9)
+            increment = floats(message.increment, "increment").astype(np.float64)
+            forward, left, turn = (per_s * moved(increment, None).twist).tolist()
+            return forward, left, turn
+
+
+@dataclass(frozen=True)
+class Late:
+    """The time by which detections are stamped late against odometry, and its σ [s]."""
+
+    offset_s: float
+    sigma_s: float
+
+    @property
+    def is_beyond_doubt(self) -> bool:
+        """Whether the offset is to be reported."""
+        return abs(self.offset_s) > max(LEAST_S, BEYOND_DOUBT * self.sigma_s)
+
+
+def clock_warning(robot: str, timed: Timed, config: RobotConfig) -> str | None:
+    """The warning about a robot whose clocks differ beyond doubt; None without one."""
+    found = lateness(timed, config)
+    if found is None or not found.is_beyond_doubt:
+        return None
+    late = "late against" if found.offset_s > 0.0 else "ahead of"
+    return (
+        f"{robot}: its detections are stamped {abs(found.offset_s):.2f} ± {found.sigma_s:.2f} s "
+        f"{late} its odometry: correct the stamps, or set clock_offset_s = "
+        f"{config.clock_offset_s + found.offset_s:.2f} (`teamslam calibrate` learns it where there "
+        "is a ground truth)"
+    )
+
+
+def lateness(timed: Timed, config: RobotConfig) -> Late | None:
+    """The time by which a robot's detections are late, beyond its `clock_offset_s`; None where the
+    measurements do not determine it.
+
+    Gauss–Newton iterations under Huber's loss. Noise in the derivative makes a step too short by
+    the slope of the step in τ, and σ is divided by it.
+    """
+    if not timed.ends_ns or not timed.ids:
+        return None
+    with np.errstate(all="ignore"):
+        pairs = _pairs(timed, config)
+        if pairs is None:
+            return None
+        late_ns = 0
+        for _ in range(ROUNDS):
+            step, sigma = pairs.step(late_ns)
+            if not abs(late_ns + 1e9 * step) < LARGEST_NS:
+                return None
+            late_ns += round(1e9 * step)
+            if abs(1e9 * step) < SETTLED_NS:
+                break
+        else:
+            return None
+        (before, _), (after, _) = pairs.step(late_ns - STEP_NS), pairs.step(late_ns + STEP_NS)
+        slope = min((before - after) / (2e-9 * STEP_NS), 1.0)
+        return Late(1e-9 * late_ns, sigma / slope) if slope > LEAST_SLOPE else None
+
+
+@dataclass(frozen=True)
+class _DeadReckoning:
+    """The path by odometry alone: the pose at the start of each interval, and its twist per
+    second.
+    """
+
+    starts_ns: Int64[np.ndarray, " n"]
+    ends_ns: Int64[np.ndarray, " n"]
+    rates: Float[np.ndarray, "n 3"]
+    poses: Float[np.ndarray, "n 3"]
+
+    def at(self, stamps_ns: Int64[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
+        """The poses at these times; between two intervals the robot stands."""
+        k = np.maximum(np.searchsorted(self.starts_ns, stamps_ns, "right") - 1, 0)
+        seconds = 1e-9 * (np.minimum(stamps_ns, self.ends_ns[k]) - self.starts_ns[k])
+        return _after(self.poses[k], self.rates[k] * np.maximum(seconds, 0.0)[:, np.newaxis])
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Two measurements each of one landmark, at the points b_i and b_j of the base; stretch: the
+    stretch of time of each pair.
+    """
+
+    path: _DeadReckoning
+    t_i: Int64[np.ndarray, " k"]
+    t_j: Int64[np.ndarray, " k"]
+    b_i: Float[np.ndarray, "k 2"]
+    b_j: Float[np.ndarray, "k 2"]
+    stretch: Int64[np.ndarray, " k"]
+
+    def step(self, late_ns: int) -> tuple[float, float]:
+        """The further time [s] by which the detections are late, and its σ; NaN: undetermined."""
+        d, turn = self._motion(late_ns)
+        q, way = _turned(self.b_i - d, -turn), _turned(d, -turn)
+        before, after = (self._again(late_ns + by) for by in (-STEP_NS, STEP_NS))
+        ahead, left = (np.broadcast_to(each, q.shape) for each in ((1.0, 0.0), (0.0, 1.0)))
+        r_i, r_j = (np.maximum(np.hypot(*b.T), 1e-3)[:, np.newaxis] for b in (self.b_i, self.b_j))
+        turns, seconds = turn[:, np.newaxis], 1e-9 * (self.t_j - self.t_i)[:, np.newaxis]
+        columns = (
+            (before - after) / (2e-9 * STEP_NS),
+            way,  # scale of the way, then of the turn, then drift
+            turns * (_across(q) - 0.5 * _across(way)),
+            seconds * _across(q),
+            ahead - _turned(ahead, -turn),  # mount
+            left - _turned(left, -turn),
+            _across(self.b_j) - _turned(_across(self.b_i), -turn),
+            self.b_j / r_j - _turned(self.b_i / r_i, -turn),  # offset of the range
+        )
+        scale = np.maximum(r_j, NEAR_M)
+        J = np.stack(columns, axis=2) / scale[:, :, np.newaxis]
+        return _first_of_fit((self.b_j - q) / scale, J, self.stretch)
+
+    def _motion(self, late_ns: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
+        """Translation and turn of D(τ)."""
+        one, two = self.path.at(self.t_i - late_ns), self.path.at(self.t_j - late_ns)
+        return _turned(two[:, :2] - one[:, :2], -one[:, 2]), two[:, 2] - one[:, 2]
+
+    def _again(self, late_ns: int) -> Float[np.ndarray, "k 2"]:
+        """D(τ)⁻¹ b_i."""
+        d, turn = self._motion(late_ns)
+        return _turned(self.b_i - d, -turn)
+
+
+def _pairs(timed: Timed, config: RobotConfig) -> _Pairs | None:
+    """The pairs of subsequent measurements of a landmark; None where there are too few."""
+    path = _dead_reckoning(timed, config)
+    stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
+    order = np.lexsort((stamps, names))
+    stamps, names = stamps[order], names[order]
+    points = _on_base(np.array(timed.seen).reshape(-1, 2)[order], config.sensor)
+    apart = np.diff(stamps)
+    chosen = (np.diff(names) == 0) & (apart > 0) & (apart <= APART_NS)
+    chosen &= stamps[:-1] > int(path.starts_ns[0]) + LARGEST_NS
+    chosen &= stamps[1:] < int(path.ends_ns[-1]) - LARGEST_NS
+    i = np.flatnonzero(chosen)
+    stretches, which = np.unique(stamps[i] // STRETCH_NS, return_inverse=True)
+    if len(stretches) < LEAST_STRETCHES:
+        return None
+    return _Pairs(path, stamps[i], stamps[i + 1], points[i], points[i + 1], which)
+
+
+def _dead_reckoning(timed: Timed, config: RobotConfig) -> _DeadReckoning:
+    """The path from the origin by a robot's odometry, on the detections' clock."""
+    ends = np.array(timed.ends_ns, np.int64) + round(1e9 * config.clock_offset_s)
+    rates = np.array(timed.motions).reshape(-1, 3)
+    for k in np.flatnonzero(np.array(timed.steered)).tolist():
+        forward, turn = steered(config.motion, float(rates[k, 0]), float(rates[k, 1]))
+        rates[k] = forward, 0.0, turn
+    order = np.argsort(ends, kind="stable")
+    ends, rates = ends[order], rates[order]
+    starts = ends - np.array(timed.durations_ns, np.int64)[order]
+    starts[1:] = np.maximum(starts[1:], ends[:-1])
+    twists = rates * (1e-9 * (ends - starts))[:, np.newaxis]
+    headings = np.cumsum(twists[:, 2]) - twists[:, 2]
+    steps = _after(np.column_stack([np.zeros((len(ends), 2)), headings]), twists)[:, :2]
+    places = np.cumsum(steps, axis=0) - steps
+    return _DeadReckoning(starts, ends, rates, np.column_stack([places, headings]))
+
+
+def _on_base(seen: Float[np.ndarray, "k 2"], sensor: Sensor) -> Float[np.ndarray, "k 2"]:
+    """The measured points in the frame of the base, by the sensor's calibration and mount."""
+    x, y, heading = sensor.mount
+    ranges = (seen[:, 0] - sensor.range_offset) / sensor.range_scale
+    angles = seen[:, 1] - sensor.bearing_offset + heading
+    return np.column_stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles)])
+
+
+def _after(
+    poses: Float[np.ndarray, "k 3"], twists: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """The poses after the motions Exp(twist), whose chord is at half the turn."""
+    half = 0.5 * twists[:, 2]
+    chord = np.sinc(half / math.pi)[:, np.newaxis] * twists[:, :2]
+    places = poses[:, :2] + _turned(chord, poses[:, 2] + half)
+    return np.column_stack([places, poses[:, 2] + twists[:, 2]])
+
+
+def _turned(
+    points: Float[np.ndarray, "k 2"], angles: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k 2"]:
+    """The points rotated by the angles."""
+    c, s = np.cos(angles), np.sin(angles)
+    x, y = points.T
+    return np.column_stack([c * x - s * y, s * x + c * y])
+
+
+def _across(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
+    """The points rotated by a quarter turn to the left."""
+    return np.column_stack([-points[:, 1], points[:, 0]])
+
+
+def _first_of_fit(
+    e: Float[np.ndarray, "k 2"],
+    J: Float[np.ndarray, "k 2 p"],
+    stretch: Int64[np.ndarray, " k"],
+) -> tuple[float, float]:
+    """The first component of the p that minimises Huber's loss of e + J p, and its σ; NaN where
+    it is not determined.
+
+    Iteratively reweighted least squares; the scale of the errors is their median's. σ² = Σ (s/(1 −
+    h))² over stretches, with the influence s of a stretch and its share h of the information: about
+    the jackknife's (Bell and McCaffrey 2002).
+    """
+    errors, rows = e.reshape(-1), J.reshape(len(e) * 2, -1)
+    norms = np.linalg.norm(rows, axis=0)
+    if not (np.isfinite(norms).all() and np.isfinite(errors).all() and norms[0] > 0.0):
+        return math.nan, math.nan
+    used = norms > 0.0
+    rows = rows[:, used] / norms[used]
+    p = np.zeros(rows.shape[1])
+    for _ in range(ROUNDS):
+        r = errors + rows @ p
+        lengths = np.hypot(*r.reshape(-1, 2).T)
+        sigma = float(np.median(lengths)) / math.sqrt(2.0 * math.log(2.0)) + 1e-12
+        w = np.repeat(np.minimum(1.0, HUBER * sigma / np.maximum(lengths, 1e-12)), 2)
+        # Directions without motion have no part in p.
+        inverse = np.linalg.pinv(rows.T @ (w[:, np.newaxis] * rows), rcond=1e-10, hermitian=True)
+        change = -inverse @ (rows.T @ (w * r))
+        p += change
+        if np.abs(change).max() < 1e-4 * sigma:
+            break
+    r = errors + rows @ p
+    gain = rows @ inverse[0]
+    share = np.bincount(stretch, (w * gain * gain).reshape(-1, 2).sum(axis=1)) / inverse[0, 0]
+    sums = np.bincount(stretch, (w * gain * r).reshape(-1, 2).sum(axis=1)) / (1.0 - share)
+    if not float(share @ share) * LEAST_STRETCHES < 1.0:
+        return math.nan, math.nan
+    return float(p[0] / norms[0]), math.sqrt(float(sums @ sums)) / float(norms[0])
