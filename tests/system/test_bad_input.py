@@ -132,7 +132,8 @@ async def launch(team: Processes, dataset: Path) -> tuple[Process, dict[str, obj
         *("launch", "--dataset", dataset, "--robots", "3", "--speed", "max"),
         *("--output", "run", "--json", "result.json"),
     )
-    assert await process.ended() == 0, process.said()
+    assert await process.ended() == 1, process.said()  # not every robot is in the result
+    assert "not joined" in process.said()
     await team.none_left(0.0)
     return process, json.loads((team.folder / "result.json").read_text())
 
