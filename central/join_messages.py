@@ -22,6 +22,7 @@ from team.estimation.map_joining.associating import IslandView
 from team.estimation.map_joining.distinctness import lost, maybe_the_same, missed, weakly_placed
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
+from team.estimation.map_joining.misfits import worst_landmark
 from team.estimation.map_joining.refusal import refusals
 from team.estimation.map_joining.repetition import Repetition, repetitions
 from team.wire import channels as ch
@@ -155,7 +156,12 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
 
 
 def reasons(
-    fold: Fold, shown: Shown, biases: Sequence[BiasEstimate], landmark_submaps: int
+    fold: Fold,
+    shown: Shown,
+    biases: Sequence[BiasEstimate],
+    landmark_submaps: int,
+    *,
+    final: bool,
 ) -> tuple[str, ...]:
     """Why robots and landmarks are not in the map, and warnings about it, in words."""
     return (
@@ -164,6 +170,7 @@ def reasons(
         *fold.warnings,
         *_lost(shown),
         *_repeated(shown),
+        *(_misfitting(fold) if final else ()),
         *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
@@ -175,6 +182,16 @@ def _lost(shown: Shown) -> Iterator[str]:
         yield (
             f"{named(stream)} was lost: its heading is known to {np.degrees(sigma):.0f}° at worst; "
             "its path there is not to be trusted"
+        )
+
+
+def _misfitting(fold: Fold) -> Iterator[str]:
+    """The landmark that the submaps place most differently, in words."""
+    found = worst_landmark(fold.main) if fold.contributions else None
+    if found is not None:
+        yield (
+            f"landmark {found.landmark} does not fit: cost {found.cost:.0f} per degree of freedom "
+            f"where landmarks have {found.median:.1f}; it was moved, or two have its number"
         )
 
 

@@ -156,7 +156,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         )
         self.finding = found.with_biases(biases)
         shown = shown_landmarks(fold, self.config, tail)
-        self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps)
+        self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps, final=final)
         fused = team_map(
             fold,
             tail,
