@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from central.config import CentralConfig
 from central.members import Members
-from team.estimation.contribution import Stream, named
+from team.estimation.contribution import Contribution, Stream, named
 from team.estimation.map_joining.association.landmarks import Verdict
 from team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
 from team.estimation.map_joining.relinearising import relinearised
@@ -73,6 +73,17 @@ class FoldInputs:
     def size(self, tick: int, without: Collection[str]) -> int:
         """Number of submaps of a tick, those of some robots left out."""
         return len(self._members.keys(tick, without))
+
+    def chains(self, robot: str) -> Mapping[Stream, Sequence[Contribution]]:
+        """The submaps of each of a robot's streams within the bounds, in order."""
+        found: dict[Stream, list[Contribution]] = {}
+        for tick in self._members.behind(-math.inf):
+            for key in self._members.keys(tick, ()):
+                if key[1] == robot:
+                    each = self._members.contribution(key)
+                    if submap_beyond(each.local, self._bounds) is None:
+                        found.setdefault(each.stream, []).append(each)
+        return found
 
     def raised(self, without: Collection[str]) -> Mapping[str, int]:
         """By robot, how many folded submaps have had their covariance raised to the least one."""

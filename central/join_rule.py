@@ -156,7 +156,10 @@ class JoinRule(FusionRule[SubmapInputs]):
         )
         self.finding = found.with_biases(biases)
         shown = shown_landmarks(fold, self.config, tail)
-        self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps, final=final)
+        self.reasons = (
+            *(map(str, ticks.carried_off(fold)) if final else ()),
+            *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
+        )
         fused = team_map(
             fold,
             tail,

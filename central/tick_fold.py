@@ -33,6 +33,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from central.carried_off import CarriedOff, carried_off
 from central.checkpoints import Checkpoints
 from central.config import CentralConfig
 from central.fold_inputs import FoldInputs
@@ -444,6 +445,20 @@ class TickFold:
             self._begin_again(other._conviction)
         self.undecided = other.undecided
         return fold
+
+    def carried_off(self, fold: Fold) -> list[CarriedOff]:
+        """Where the robots that the fold has withdrawn were carried off, as far as their submaps
+        show it; fold: one without them.
+        """
+        limit = self._config.withdraw_above
+        if limit is None:
+            return []
+        found = (
+            carried_off(fold, chain, limit)
+            for robot in sorted(self.convicted)
+            for _, chain in sorted(self._inputs.chains(robot).items())
+        )
+        return [each for each in found if each is not None]
 
     @property
     def raised(self) -> Mapping[str, int]:

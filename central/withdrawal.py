@@ -133,6 +133,12 @@ def convicted(agreement: Agreement, limit: float, without: Without) -> Trial:
     )
 
 
+def cost_share(chi2: float, dof: float, chance: float) -> float:
+    """The cost per degree of freedom, at most 1 where a probability above e^−chance explains it."""
+    share = _share(chi2, dof, chance)
+    return 1.0 if share is None else share
+
+
 def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
     return alone is not None and disagreement(alone).get(robot, 0.0) > limit
 

@@ -1,0 +1,242 @@
+"""Finds where a withdrawn robot was carried off, or slipped, and by how much.
+
+Each submap of the robot that has enough named landmarks of the map without it is aligned to that
+map twice: in the frame of its start pose, and in that of its end pose. The end of one submap and
+the start of the next are one pose: a seam. A robot that was carried off contradicts the map at
+exactly one seam; before and after it every submap fits the map and every seam is closed. A sensor
+or an odometry that is wrong deforms the submaps, or opens many seams: then nothing is found.
+
+A submap takes up a small motion shortly before its end: the seam behind it then shows only a part.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
+from team.config import UNNAMED
+from team.estimation import dense, elementary
+from team.estimation.contribution import Contribution, moment
+from team.estimation.gaussian import NotACovarianceError, information
+from team.estimation.geometry import compose, wrapped
+from team.estimation.map_joining.alignment import Alignment, aligned
+from team.estimation.map_joining.joining import Fold
+from team.estimation.map_joining.landmark_view import known
+from team.estimation.map_joining.marginals import landmark_blocks
+from team.estimation.submap import LocalMap
+
+LEAST_SHARED = 3
+"""Least number of a submap's landmarks that the map has: two fit their mirror image, too."""
+LEAST_SIDE = 2
+"""Least number of submaps before the open seam, and after it, that fit the map."""
+SEAM_DOF = 3.0
+"""Degrees of freedom of a seam."""
+MOST_SHARED = 40
+"""Most landmarks of a submap that are aligned: those with the smallest ids."""
+MOST_SUBMAPS = 2000
+"""Longer streams are not examined: it would take seconds."""
+
+Pose = Float[np.ndarray, "3"]
+Covariance = Float[np.ndarray, "3 3"]
+Matrix = Float[np.ndarray, "m m"]
+
+
+class CarriedOff(NamedTuple):
+    """A motion of a robot that its odometry did not measure.
+
+    before, after: numbers of the last submap before it and of the first one after it. begin_ns,
+    end_ns: the end of the one and the beginning of the other, equal where none is between them.
+    by: the motion, in the map's frame (x [m], y [m], turn [rad]); in_all: the robot's own way from
+    the one to the other is part of it, since the submap between them is spoilt.
+    """
+
+    robot: str
+    before: int
+    after: int
+    begin_ns: int
+    end_ns: int
+    by: tuple[float, float, float]
+    in_all: bool
+
+    def __str__(self) -> str:
+        """The motion in words."""
+        dx, dy, turn = self.by
+        begin, end = moment(self.begin_ns), moment(self.end_ns)
+        when = f"at t = {begin}" if begin == end else f"between t = {begin} and {end}"
+        own = ", its own way in that time included" if self.in_all else ""
+        return (
+            f"{self.robot} was carried off or slipped {when}, between its submaps {self.before} "
+            f"and {self.after}: by about ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°"
+            f"{own}; before and after that its submaps agree with the map without it"
+        )
+
+
+class _Placed(NamedTuple):
+    """A submap that fits the map: its place in the chain, and where it starts and ends."""
+
+    at: int
+    start: Alignment
+    end: Alignment
+
+
+class _Seam(NamedTuple):
+    """Two submaps that follow each other, by their places in the chain.
+
+    gap: the motion from the end of the one to the start of the other that is not the robot's own,
+    in the map's frame; chi2: its χ².
+    """
+
+    before: int
+    after: int
+    gap: Pose
+    chi2: float
+
+
+def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> CarriedOff | None:
+    """Find the seam at which a robot was carried off; None where its submaps do not show just that.
+
+    rest: the team without the robot. chain: the submaps of one of its streams, in order. limit: the
+    cost per degree of freedom above which a seam is open, where chance does not explain it. The
+    other seams agree if theirs, all in all, is at most the share AGREEING of it or within chance,
+    and less than that of the open one. A submap in which the robot was carried off may fit nothing,
+    or leave both its seams open.
+    """
+    if not rest.home or len(chain) > MOST_SUBMAPS:
+        return None
+    placed, misfits = _placed(rest, chain, limit)
+    seams = [_seam(chain, one, two) for one, two in pairwise(placed)]
+    opened = [each for each in seams if cost_share(each.chi2, SEAM_DOF, SUSPICION) > limit]
+    if (
+        not opened
+        or len(opened) > 2
+        or opened[0].after not in (opened[-1].before, opened[-1].after)
+    ):
+        return None
+    before, after = opened[0].before, opened[-1].after
+    spoilt = [*misfits, *(each.after for each in opened[:-1])]
+    at = {each.before for each in opened}
+    closed = [each.chi2 for each in seams if each.before not in at]
+    others = math.fsum(closed)
+    if (
+        len(spoilt) > 1
+        or any(not before < k < after for k in spoilt)
+        or sum(each.at <= before for each in placed) < LEAST_SIDE
+        or sum(each.at >= after for each in placed) < LEAST_SIDE
+        or cost_share(others, SEAM_DOF * len(closed), ACCORD) > AGREEING * limit
+        or others > max(each.chi2 for each in opened)
+    ):
+        return None
+    start = next(each.start for each in placed if each.at == after).a_from_b
+    end = next(each.end for each in placed if each.at == before).a_from_b
+    by = start - end if spoilt else opened[0].gap
+    return CarriedOff(
+        robot=chain[before].robot,
+        before=chain[before].sequence,
+        after=chain[after].sequence,
+        begin_ns=chain[before].end_ns,
+        end_ns=chain[after - 1].end_ns,
+        by=(float(by[0]), float(by[1]), wrapped(float(by[2]))),
+        in_all=bool(spoilt),
+    )
+
+
+def _placed(
+    rest: Fold, chain: Sequence[Contribution], limit: float
+) -> tuple[list[_Placed], list[int]]:
+    """The submaps that fit the map, and the places in the chain of those that do not.
+
+    limit: the cost per degree of freedom above which one does not, where chance does not explain
+    it. Submaps that share too few landmarks with the map are neither. The map's landmarks count as
+    independent: an error that they share moves both sides of a seam alike.
+    """
+    ids, points, blocks = landmark_blocks(rest, [i for i in known(rest.main) if i < UNNAMED])
+    placed, misfits = [], []
+    for at, each in enumerate(chain):
+        _, in_map, own = np.intersect1d(ids, each.local.ids, return_indices=True)
+        in_map, own = in_map[:MOST_SHARED], own[:MOST_SHARED]
+        if len(own) < LEAST_SHARED:
+            continue
+        covariance = rest.main.settings.covariance_factor * each.local.covariance
+        spread = _block_diagonal(blocks[in_map])
+        try:
+            start = aligned(points[in_map], spread, *_from_start(each.local, covariance, own))
+            end = aligned(points[in_map], spread, *_from_end(each.local, covariance, own))
+        except NotACovarianceError:
+            misfits.append(at)
+            continue
+        if cost_share(start.chi2, float(start.dof), SUSPICION) > limit:
+            misfits.append(at)
+        else:
+            placed.append(_Placed(at, start, end))
+    return placed, misfits
+
+
+def _block_diagonal(blocks: Float[np.ndarray, "n 2 2"]) -> Matrix:
+    n = len(blocks)
+    matrix = np.zeros((n, 2, n, 2))
+    matrix[np.arange(n), :, np.arange(n)] = blocks
+    return matrix.reshape(2 * n, 2 * n)
+
+
+def _from_start(
+    local: LocalMap, covariance: Matrix, own: Int64[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "k k"]]:
+    """Some landmarks of a submap in the frame of its start pose, and their covariance."""
+    at = _numbers(local, own)
+    return local.landmarks[own], covariance[np.ix_(at, at)]
+
+
+def _from_end(
+    local: LocalMap, covariance: Matrix, own: Int64[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "k k"]]:
+    """Some landmarks of a submap in the frame of its end pose e: Rᵀ(l − e), and their covariance.
+
+    ∂/∂l = Rᵀ, ∂/∂e = −Rᵀ, and ∂/∂θ = (y, −x) of the result.
+    """
+    s, c = elementary.sin_and_cos(float(local.end_pose[2]))
+    back = np.array([[c, s], [-s, c]])
+    points = dense.product(local.landmarks[own] - local.end_pose[:2], back.T)
+    n = len(own)
+    jacobian = np.zeros((n, 2, 3 + 2 * n))
+    jacobian[:, :, :2] = -back
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = points[:, 1], -points[:, 0]
+    for k in range(n):
+        jacobian[k, :, 3 + 2 * k : 5 + 2 * k] = back
+    J = jacobian.reshape(2 * n, 3 + 2 * n)
+    at = np.concatenate([np.arange(3), _numbers(local, own)])
+    return points, dense.product(dense.product(J, covariance[np.ix_(at, at)]), J.T)
+
+
+def _numbers(local: LocalMap, own: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+    """The places of some landmarks' numbers in a submap's mean."""
+    first = len(local.mean) - 2 * len(local.ids)
+    return (first + 2 * own[:, None] + np.arange(2)).ravel()
+
+
+def _seam(chain: Sequence[Contribution], one: _Placed, two: _Placed) -> _Seam:
+    """The seam between two submaps; the motion of those between them is added to the first one's
+    end.
+    """
+    pose, covariance = one.end.a_from_b, one.end.covariance
+    for each in chain[one.at + 1 : two.at]:
+        step = each.local.end_pose
+        s, c = elementary.sin_and_cos(float(pose[2]))
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        after = compose(pose, step)
+        lever = np.eye(3)
+        lever[0, 2], lever[1, 2] = pose[1] - after[1], after[0] - pose[0]
+        covariance = dense.product(dense.product(lever, covariance), lever.T) + dense.product(
+            dense.product(turned, each.local.covariance[:3, :3]), turned.T
+        )
+        pose = after
+    gap = two.start.a_from_b - pose
+    gap[2] = wrapped(float(gap[2]))
+    try:
+        metric = information(covariance + two.start.covariance, "a seam")
+    except NotACovarianceError:
+        return _Seam(one.at, two.at, gap, math.inf)
+    return _Seam(one.at, two.at, gap, float(dense.product(dense.product(gap, metric), gap)))

@@ -1,0 +1,118 @@
+"""A withdrawn robot that was carried off is named with the time and the motion; no other one is."""
+
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from central.tick_fold import TickFold
+from sim.in_memory.team import final_map, run_team
+from sim.scenarios.scenario import load, with_options
+from sim.scenarios.source import streams_of
+from team import translate
+from team.estimation.geometry import compose, inverse
+from team.wire import messages as m
+from team.wire.arrays import floats, from_floats, stamps
+from tests.central.test_withdrawal import messages, scenario, team_run
+from tests.trials.stress_world import CarriedOff, StressWorld, write
+
+FIRST, LAST = 4, 6
+"""The submaps of r3 that are left out: it is carried from the end of submap 3 to the start of 7."""
+
+
+def chain() -> list[m.Submap]:
+    own = [each for each in messages(team_run(), m.Submap) if each.robot == "r3"]
+    return sorted(own, key=lambda each: each.sequence)
+
+
+def carried() -> list[m.Submap]:
+    """The submaps of r3, as if it had been carried the way of those that are left out."""
+    own = [each for each in chain() if not FIRST <= each.sequence <= LAST]
+    gone = LAST + 1 - FIRST
+    return [
+        each if each.sequence < FIRST else renumbered(each, each.sequence - gone) for each in own
+    ]
+
+
+def renumbered(submap: m.Submap, sequence: int) -> m.Submap:
+    return msgspec.structs.replace(submap, sequence=sequence, sightings=0)
+
+
+def mirrored() -> list[m.Submap]:
+    """The submaps of r3, as if its camera and its gyro had the wrong sign."""
+    found = []
+    for each in chain():
+        poses = 1 + len(stamps(each.nodes, "nodes"))
+        mean = floats(each.mean, "mean").copy()
+        sign = np.ones(len(mean))
+        sign[1 : 3 * poses : 3] = sign[2 : 3 * poses : 3] = sign[3 * poses + 1 :: 2] = -1.0
+        rows, columns = np.triu_indices(len(mean))
+        covariance = floats(each.covariance, "covariance") * sign[rows] * sign[columns]
+        found.append(
+            msgspec.structs.replace(
+                each, mean=from_floats(mean * sign), covariance=from_floats(covariance), sightings=0
+            )
+        )
+    return found
+
+
+def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
+    """The fold of the team's submaps with these of r3 in the place of its own."""
+    ticks = TickFold(scenario().central)
+    for start in messages(team_run(), m.InitialPose):
+        ticks.know_start(translate.start_of(start))
+    rest = [each for each in messages(team_run(), m.Submap) if each.robot != "r3"]
+    for each in sorted([*rest, *own], key=lambda each: each.stamp_ns, reverse=backwards):
+        ticks.add(each, bytes(8))
+    return ticks
+
+
+def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried() -> None:
+    ticks = folded(carried())
+    fold = ticks.solved()
+    assert set(ticks.convicted) == {"r3"}
+    (found,) = ticks.carried_off(fold)
+    assert (found.robot, found.before, found.after) == ("r3", FIRST - 1, FIRST)
+    assert found.begin_ns == found.end_ns == chain()[FIRST - 1].stamp_ns
+    way = np.zeros(3)
+    for each in chain()[FIRST : LAST + 1]:
+        way = compose(way, floats(each.mean, "mean")[:3])
+    assert math.hypot(*found.by[:2]) == pytest.approx(math.hypot(*way[:2]), abs=0.3)
+    assert math.remainder(found.by[2] - way[2], 2 * math.pi) == pytest.approx(0.0, abs=0.05)
+    assert not found.in_all
+    other = folded(carried(), backwards=True)
+    assert other.carried_off(other.solved()) == [found], "the order of arrival changes nothing"
+
+
+def test_nothing_is_said_of_a_robot_whose_camera_and_gyro_are_mirrored() -> None:
+    ticks = folded(mirrored())
+    fold = ticks.solved()
+    assert set(ticks.convicted) == {"r3"}
+    assert ticks.carried_off(fold) == []
+
+
+def test_nothing_is_said_of_a_robot_whose_wheels_are_a_third_too_large() -> None:
+    final = final_map(list(team_run("odometry")))
+    assert final.withdrawn == ("r3",)
+    assert not any("carried off" in each for each in final.reasons)
+
+
+def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_path: Path) -> None:
+    """A scan of the stress world every 0.5 s: none lies between the seam at 50 s and 50.2 s."""
+    off = CarriedOff("r2", 4.0, 0.6, 50.2)
+    folder = write(StressWorld(seed=5, seconds=100.0, carried_off=(off,)), tmp_path)
+    of = with_options(load(folder / "scenario.toml"), dataset=folder)
+    final = final_map(list(run_team(of, streams_of(of))))
+    assert final.withdrawn == ("r2",)
+    (text,) = (each for each in final.reasons if "carried off" in each)
+    assert "r2 was carried off or slipped at t = 50.0 s, between its submaps 4 and 5" in text
+    rows = np.loadtxt(folder / "r2" / "truth.csv", delimiter=",", skiprows=1)
+    (at,) = np.flatnonzero(np.abs(rows[:, 0] - off.at_s) < 0.01)
+    before, after = rows[at - 1, 1:], rows[at, 1:]
+    x, y = (float(each) for each in text.split("by about (")[1].split(") m")[0].split(", "))
+    turn = float(text.split(" m and ")[1].split("°")[0])
+    dx, dy, _ = after - before
+    assert math.hypot(x - dx, y - dy) < 0.5
+    assert math.radians(turn) == pytest.approx(float(inverse(before)[2] + after[2]), abs=0.1)
