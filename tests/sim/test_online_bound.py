@@ -1,27 +1,21 @@
 """The bound of online poses is one: its errors are what its covariances say, and no less."""
 
-import importlib.util
-from pathlib import Path
-
 import msgspec
 import numpy as np
 
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from team.estimation.consistency import chi2_interval
+from tests.trials.online_bound import bounds
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "online_bound.py"
 SEEDS = range(2000, 2020)
 
 
 def bounds_of(seed, believed=lambda scenario: scenario):
-    spec = importlib.util.spec_from_file_location("online_bound", FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     scenario = with_options(load("thesis-b"), seed=seed)
     world = msgspec.structs.replace(scenario.world, steps=60)
     scenario = msgspec.structs.replace(scenario, world=world)
-    return module.bounds(believed(scenario), streams_of(scenario))
+    return bounds(believed(scenario), streams_of(scenario))
 
 
 def halved(scenario):

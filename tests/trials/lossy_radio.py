@@ -152,7 +152,7 @@ def radio(loss: int, delay_ms: int, seed: str) -> Iterator[tuple[str, str, Radio
             run_ip("ip", "-n", name, "link", "set", "lo", "up")
         link = Radio((home, away), loss, delay_ms, seed)
         for name, address in ((home, HOME), (away, AWAY)):
-            run_ip("ip", "-n", name, "addr", "add", f"{address}/24", "dev", "radio")
+            run_ip(*f"ip -n {name} addr add {address}/24 dev radio".split())
             run_ip("ip", "-n", name, "link", "set", "radio", "up")
         yield home, away, link
     finally:
