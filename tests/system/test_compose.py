@@ -136,7 +136,7 @@ async def test_the_services_on_a_network_of_their_own_bring_the_fused_map_to_eve
         match opened(sample):
             case _, _, m.FusedMap() as fused:
                 broadcast.add(fused.digest)
-            case _, robot, m.PoseEstimate() as pose:
+            case _, robot, m.PoseEstimate() as pose if pose.in_team_frame:
                 given[robot].add(pose.map_digest)
     for robot, digests in given.items():
         assert digests, f"{robot} gave no pose in the team's map"
