@@ -243,7 +243,7 @@ def robot_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tupl
     position = None if errors is None else errors.position_rmse_m
     if arbitrary:
         errors, mark, position = None, "", robot.aligned_rmse_m
-    outside = robot.outside and robot.smoothed is None
+    outside = robot.outside and not robot.smoothed_path.stamps_ns.size
     return (
         name,
         str(used.steps),
