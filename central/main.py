@@ -156,7 +156,7 @@ class CentralShell:
             self._shell.take([self._shell.sample_of(order)])
 
     def _awaited(self) -> tuple[str, ...]:
-        """What the set's file lacks, and the absent robots that the final map waits for."""
+        """The members missing in the set's file, and the absent robots that the map awaits."""
         now = time.monotonic()
         warnings = [] if self._stored is None else [*self._stored.warnings]
         for robot in self.node.awaited:

@@ -28,7 +28,7 @@ class StoredSet:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the file lacks, for the centre's status."""
+        """The members missing in the file, for the centre's status."""
         return self._keeper.warnings
 
     def samples(self) -> list[Sample]:

@@ -314,7 +314,7 @@ class Shell:
         return time.monotonic() - self._recorder_since >= BACK_S
 
     def _lacks(self) -> str:
-        """What the recorder lacks, in words."""
+        """The messages missing in the log, in words."""
         if not self._recorder_is_there:
             return "it is away"
         if not self._lacking:

@@ -96,7 +96,7 @@ class Agreement:
 
     @property
     def disagreement(self) -> tuple[str, ...]:
-        """Who differs from the final map that most robots have, in words; empty where all agree,
+        """Robots whose final map differs from that of most robots, in words; empty where all agree,
         and where nobody has one.
         """
         largest = self.largest

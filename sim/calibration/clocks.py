@@ -227,7 +227,7 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
 def _turns(
     data: Reference, late_ns: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Of each interval the logged turn, that of the path moved by late_ns, and its derivative by
+    """The logged turn of each interval, that of the path moved by late_ns, and its derivative by
     that time [rad, rad, rad/s].
     """
     intervals = data.intervals

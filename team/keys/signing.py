@@ -3,8 +3,8 @@
 ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member; verified
 with the node's certificate, which the team's authority has issued. A node may have had several
 certificates: each renewal issues one of the same generation, and the first one after a revocation
-begins the next generation. What a certificate proves does not depend on the time at which it is
-checked.
+begins the next generation. The proof of a certificate does not depend on the time of the
+check.
 """
 
 import re

@@ -3,9 +3,9 @@
 After eight bytes that say what it is come records: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A record that a crash has
 truncated is cut off when the file is opened again. Behind a damaged record reading continues at the
-next one whose CRC fits; the file is then written anew without the damage, which is named. What is
-lost comes from other peers, or is computed again. A record is in the hands of the operating system
-when `append` returns: a process that is killed loses nothing, a computer without power the last
+next one whose CRC fits; the file is then written anew without the damage, which is named. Lost
+members come from other peers, or are computed again. A record is in the hands of the operating
+system when `append` returns: a process that is killed loses nothing, a computer without power the last
 seconds.
 """
 
@@ -244,7 +244,7 @@ class Keeper:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the file lacks, for the status of its process."""
+        """The members missing in the file, for the status of its process."""
         lost = "" if self._store is None else self._store.lost
         failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not kept"
         return tuple(text for text in (failure, lost) if text)

@@ -55,8 +55,8 @@ class Received:
     def lacking(self, tally: m.Tally, awaited: set[str]) -> dict[str, int]:
         """The keys of a process of which samples are lacking, each with the number that is there.
 
-        awaited: keys with samples that their publisher may still have. Of the others the newest one
-        is enough: what came before it is gone.
+        awaited: keys with samples that their publisher may still have. For other keys the
+        newest sample is enough: earlier ones are gone.
         """
         found = {}
         for key, count in zip(tally.keys, tally.counts, strict=True):

@@ -171,8 +171,8 @@ class Translator:
         """Whether detections in a frame are this robot's.
 
         shared: whether other robots have the topic; None: it has transforms, which may be of robots
-        that the file of topics does not have. Of several frames there, one that hangs from no base
-        is not decided.
+        that the file of topics does not have. If the file has several
+        frames, a frame that hangs from no base is undecided.
         """
         owner = self.owners.owner(frame)
         if owner == self.robot:

@@ -1,7 +1,7 @@
 r"""Makes texts of others safe to print: they may hold terminal escapes or forge lines.
 
 C0 and C1 control characters (line ends among them), bidirectional overrides and other invisible
-format characters are written as `\x1b` or `\u202e`. What is stored keeps its bytes.
+format characters are written as `\x1b` or `\u202e`. Stored texts keep their bytes.
 """
 
 import unicodedata

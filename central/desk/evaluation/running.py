@@ -33,7 +33,7 @@ BATCHES = 20_000
 class TruthFrames:
     """The frames in which truth is given: those that a known initial pose fixes.
 
-    What is in another frame is not compared with the truth. Without initial poses every frame is
+    Estimates in another frame are not compared with the truth. Without initial poses every frame is
     taken for one of them, as is that of a message that names none: both are of earlier versions.
     """
 

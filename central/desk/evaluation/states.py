@@ -1,4 +1,4 @@
-"""What became of each robot of a team in the final map."""
+"""The state of each robot of a team in the final map."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -63,7 +63,7 @@ def _withdrawals(log: Collected) -> Iterator[tuple[str, str]]:
 
 
 def _reason_in(fused: m.FusedMap, name: str) -> str:
-    """What a map of another rule than join says of a robot that is not in it."""
+    """Reason of a robot's absence in a map of another rule than `join`."""
     found = (each.partition(": ") for each in fused.reasons)
     return next((why for who, _, why in found if who == name), "")
 

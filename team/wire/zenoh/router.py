@@ -30,8 +30,9 @@ REFUSALS = "error,zenoh_link_tls=warn"
 PUSH_US = 2_000_000
 """Time [us] that a message waits for a subscriber whose queue is full: then its link is closed.
 
-It delays all others meanwhile. Whoever is cut off so connects again and fetches what it missed. A
-message of S bytes needs a link of (S - 5 MB) in that time.
+It delays all others meanwhile. A process that is cut off connects again and fetches the missed
+samples.
+A message of S bytes needs a link of (S - 5 MB) in that time.
 """
 QUEUE_BATCHES = 16
 """Batches of 64 kB in the queue to each subscriber, Zenoh's largest number."""

@@ -1,8 +1,8 @@
 """The samples of a team that a router stores for processes that were absent: ends and orders.
 
 A stored sample keeps its key, bytes and attachment, so that its author remains who published it:
-with keys the router's access control has let only that node publish on the key. What a sample
-means is decided where it is received. A sample is decoded and checked before it is stored, and an
+with keys the router's access control has let only that node publish on the key. Its receiver
+interprets a sample. A sample is decoded and checked before it is stored, and an
 end that another author publishes replaces no end but its own.
 
 Ends (`ENDS`: the centre's final map; without a centre each robot's own final map and conclusion)
