@@ -5,8 +5,8 @@ little-endian; the body is a MessagePack array [key, payload, signature]. A reco
 truncated is cut off when the file is opened again. Behind a damaged record reading continues at the
 next one whose CRC fits; the file is then written anew without the damage, which is named. Lost
 members come from other peers, or are computed again. A record is in the hands of the operating
-system when `append` returns: a process that is killed loses nothing, a computer without power the last
-seconds.
+system when `append` returns: a process that is killed loses nothing, a computer without power the
+last seconds.
 """
 
 import logging
