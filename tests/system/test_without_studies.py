@@ -17,8 +17,18 @@ PACKAGES = ("team", "central", "sim")
 PATIENCE_S = 300.0
 """Of one command: where no test before has compiled the kernels, the launch does."""
 REMOVABLE = ("sim/studies",)
-WITHOUT_CHECKOUT = """import sys
-sys.meta_path[:] = [f for f in sys.meta_path if getattr(f, "__name__", "") != "_EditableFinder"]
+REMOVED = """import sys
+
+
+class Removed:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if f"{name}.".startswith("sim.studies."):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return None
+
+
+sys.meta_path.insert(0, Removed)
 """
 """Every process of the test begins with it: an editable install finds a removed package, which is
 a direct child of another, in the checkout.
@@ -46,7 +56,7 @@ def without_studies(folder: Path) -> Path:
         shutil.copytree(ROOT / package, folder / package)
     for name in REMOVABLE:
         shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / "sitecustomize.py").write_text(WITHOUT_CHECKOUT)
+    (folder / "sitecustomize.py").write_text(REMOVED)
     return folder
 
 

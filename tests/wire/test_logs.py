@@ -30,7 +30,7 @@ def test_a_log_line_is_escaped_whoever_formats_it(caplog: pytest.LogCaptureFixtu
 
 
 def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    request: pytest.FixtureRequest, caplog: pytest.LogCaptureFixture
 ) -> None:
     now, made = [1000.0], logging.getLogRecordFactory()
 
@@ -39,7 +39,8 @@ def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
         found.created = now[0]
         return found
 
-    monkeypatch.setattr(logging, "_logRecordFactory", record)
+    request.addfinalizer(lambda: logging.setLogRecordFactory(made))
+    logging.setLogRecordFactory(record)
     for k in range(30_000):
         if k == 29_999:
             now[0] += 1.0 / logs.PER_S
