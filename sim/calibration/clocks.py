@@ -132,14 +132,30 @@ def _at(data: Reference, late_ns: int) -> Reference:
     return replace(data, path=Path(data.path.stamps_ns + late_ns, data.path.poses))
 
 
+def _settled(step_at: Callable[[int], float | None]) -> float | None:
+    """Add steps to a time [s] until one is below SETTLED_S; None where a step is not determined or
+    the time is beyond LARGEST_S.
+
+    step_at: the further time [s] at a time [ns].
+    """
+    late = 0.0
+    for _ in range(ROUNDS):
+        step = step_at(round(late * 1e9))
+        if step is None or abs(late + step) > LARGEST_S:
+            return None
+        late += step
+        if abs(step) < SETTLED_S:
+            break
+    return late
+
+
 def _detections_late(data: Sequence[Reference], sensor: Sensor) -> float | None:
     """The time [s] by which detections are stamped late; None where it is not determined.
 
     Iterations of the linearised fit of (mount x, y, θ, range offset, τ) under Huber's loss.
     """
-    late = 0.0
-    for _ in range(ROUNDS):
-        late_ns = round(late * 1e9)
+
+    def step_at(late_ns: int) -> float | None:
         here, before, after = (
             [measured_and_true(_at(each, late_ns + step), sensor) for each in data]
             for step in (0, -STEP_NS, STEP_NS)
@@ -154,13 +170,9 @@ def _detections_late(data: Sequence[Reference], sensor: Sensor) -> float | None:
         )  # fmt: skip
         if len(points) < LEAST:
             return None
-        step = _step(points, true, (later - earlier) / (2e-9 * STEP_NS), sensor)
-        late += step
-        if abs(late) > LARGEST_S:
-            return None
-        if abs(step) < SETTLED_S:
-            break
-    return late
+        return _step(points, true, (later - earlier) / (2e-9 * STEP_NS), sensor)
+
+    return _settled(step_at)
 
 
 def _step(
@@ -204,9 +216,8 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
     """The time [s] by which intervals of odometry are stamped late, by the turns of the path; None
     where it is not determined.
     """
-    late = 0.0
-    for _ in range(ROUNDS):
-        late_ns = round(late * 1e9)
+
+    def step_at(late_ns: int) -> float | None:
         parts = [_turns(each, late_ns) for each in data]
         driven, turned, rate = (
             np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in range(3)
@@ -215,13 +226,9 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
             return None
         gap, J = driven - turned, np.column_stack([driven, np.ones(len(driven)), -rate])
         sigma = 1.4826 * float(np.median(np.abs(gap))) + 1e-9
-        step = float(huber(_affine(gap, J), np.full(len(gap), sigma), np.zeros(3))[2])
-        late += step
-        if abs(late) > LARGEST_S:
-            return None
-        if abs(step) < SETTLED_S:
-            break
-    return late
+        return float(huber(_affine(gap, J), np.full(len(gap), sigma), np.zeros(3))[2])
+
+    return _settled(step_at)
 
 
 def _turns(
