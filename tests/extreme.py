@@ -47,7 +47,7 @@ NUMBERS = (0, 1, 2, 7, 2**16, 2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1)
 WORDS = {"ids", "counts", "labels", "identities", "locals", "sequences", "rows", "landmarks"}
 """Fields of uint32."""
 FLAWS = ("robot", "incarnation", "number", "node", "name")
-"""What decides whether a node looks at a message at all; it stays in half of them."""
+"""A node decides by these fields whether to look at a message; they are rarely changed."""
 
 
 def extreme(rng: np.random.Generator, message: m.Message) -> m.Message:

@@ -175,7 +175,7 @@ ENDS = {
     ),
     "orders the end": (ch.END_ORDER, "", m.TeamEnd(stamp_ns=0, by="operator", reason="so")),
 }
-"""What the router would store of r2, if r2 could publish it."""
+"""Messages that the router would store, if r2 could publish them."""
 OWN_END = Outgoing(ch.TEAM_FINAL, "r2", FINAL)
 
 

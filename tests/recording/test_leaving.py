@@ -82,7 +82,7 @@ def test_a_centre_stays_until_a_slow_recorder_has_every_trajectory(
 
 
 def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path: Path) -> None:
-    """What the recorder did not receive comes from the cache of the centre, which leaves last."""
+    """Messages that the recorder missed come from the cache of the centre, which leaves last."""
     path = tmp_path / "log.mcap"
     with router() as at, ZenohBus("t", at) as centre, ZenohBus("t", at) as there:
         loop = RecordLoop(there, Recorder(path, "t", {}), ())

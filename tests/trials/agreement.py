@@ -67,7 +67,7 @@ def scenario_of(case: str, utias: Path) -> Scenario:
 
 @dataclass
 class Storm:
-    """What happens when: deaths, a late joiner, a centre, an order; `reach` for the air."""
+    """The events of a run: deaths, a late joiner, a centre, an order; `reach` for the air."""
 
     scenario: Scenario
     way: str

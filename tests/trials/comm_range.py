@@ -1,4 +1,4 @@
-"""What communication buys: error of each robot's own map and pose, by the range of its radio.
+"""The gain by communication: error of each robot's own map and pose, by the range of its radio.
 
 `python -m tests.trials.comm_range [--steps N] [--picture docs/static/comm_range.png]`: `random-10`
 without a centre, in memory, with radios that reach 5, 10, 20, 40 m and everyone. Against the truth,
@@ -98,7 +98,7 @@ def _true(stream: RobotStream, stamp_ns: int) -> NDArray[np.float64]:
 def _held(
     times: NDArray[np.float64], said: list[Any], column: int, before: float = np.nan
 ) -> NDArray[np.float64]:
-    """What was said last, at each time."""
+    """The last message at each time."""
     stamps = [each[0] for each in said]
     at = np.searchsorted(stamps, times, side="right") - 1
     values = np.array([each[column] for each in said] or [before])

@@ -36,7 +36,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NU
 
 @dataclass
 class Run:
-    """What became of one run; cuts: at [s after the start], whose link, for how long [s]."""
+    """The result of one run; cuts: at [s after the start], whose link, for how long [s]."""
 
     number: int
     cuts: list[tuple[float, str, float]] = field(default_factory=list)

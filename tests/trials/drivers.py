@@ -44,7 +44,7 @@ kind = "live"
 
 @dataclass
 class Run:
-    """What became of one run; at [s after the start of the drivers], who, for how long [s]."""
+    """The result of one run; at [s after the start of the drivers], who, for how long [s]."""
 
     number: int
     kills: list[tuple[float, str]] = field(default_factory=list)
@@ -71,7 +71,7 @@ def tables(folder: Path, seconds: float) -> None:
 
 
 def commands(folder: Path, pace: float) -> dict[str, list[str]]:
-    """What runs in each namespace."""
+    """The processes in each namespace."""
     router = f"tcp/{NET}.1:{PORT}"
     there, lab = ["--connect", router], str(folder / "lab.toml")
     found = {

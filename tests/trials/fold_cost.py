@@ -1,4 +1,4 @@
-"""What a peer's fold costs: CPU of a robot that folds always, on request, or at the end only.
+"""The cost of a peer's fold: CPU of a robot that folds always, on request, or at the end only.
 
 `python -m tests.trials.fold_cost [SCENARIO] [--steps N]`, in memory, everyone in reach. The first
 robot folds as the set grows; the second when it is asked to, once a third of the way and once two

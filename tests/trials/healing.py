@@ -1,4 +1,4 @@
-"""What it takes until all have everything again, after two halves of a team have been apart.
+"""The effort until all robots have all data again, after two halves of a team have been apart.
 
 `python -m tests.trials.healing [--teams 2 5] [--topologies all line]`: the peers of
 `benchmarks.peers`, which close their submaps one after the other, each one every 10 s; two
@@ -22,7 +22,7 @@ WITHIN_S = 600
 
 
 def healed(topology: str, robots: int) -> dict[str, float]:
-    """What it takes after two halves have been apart: until everyone has all that was there then.
+    """The effort after two halves were apart, until all robots have all data of that time.
 
     seconds: by the last of them; said_kb, heard_kb: of each robot meanwhile, in the mean, of which
     news_kb are what each lacked when it healed.

@@ -55,7 +55,7 @@ GAVE_UP = re.compile(r"(\S+) \(pid \d+\) ended with exit status \d+")
 
 @dataclass
 class Run:
-    """What became of one run; hit: who was killed or stopped, and when [s after the launch]."""
+    """The result of one run; hit: who was killed or stopped, and when [s after the launch]."""
 
     number: int
     hit: list[tuple[float, str]] = field(default_factory=list)

@@ -68,7 +68,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
         _rule("ask at the door", "ingress", ("query",), door),
         _rule("be told at the door", "egress", ("reply",), door),
     ]
-    # Who has no other rule, as a revoked certificate, is told so.
+    # A node without a rule of its own, as one with a revoked certificate, is told so here.
     subjects: list[dict[str, object]] = [{"id": "any certificate", "link_protocols": ["tls"]}]
     policies = [
         {"rules": ["ask at the door", "be told at the door"], "subjects": ["any certificate"]}
