@@ -45,7 +45,7 @@ test: $(VENV)/.dev
 # Of their own folder, since a kernel's cached code does not name the option; some ten minutes at first.
 bounds: $(VENV)/.dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/bounds TEAMSLAM_STORM=20 \
-	  $(BIN)/pytest -o faulthandler_timeout=0 --numprocesses 3 tests/test_hostile_messages.py tests/robot/test_total.py tests/central/test_total.py
+	  $(BIN)/pytest -o faulthandler_timeout=0 --numprocesses 3 tests/hostile
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -28,6 +28,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
+from tests import build
 
 LANDMARKS = np.array([[5.0, 3.0], [9.0, -2.0], [14.0, 4.0], [20.0, -3.0], [3.0, -4.0]])
 STEP_NS = 1_000_000_000
@@ -129,9 +130,7 @@ def published(each: RobotStream) -> list[m.Measurement]:
     world = WorldNode(
         world_of(each),
         frozenset(),
-        m.Configuration(
-            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
-        ),
+        build.configuration(node="world", incarnation=0),
     )
     out: list[Outgoing] = []
     while not world.ended:
@@ -208,9 +207,7 @@ class Team:
     def __post_init__(self) -> None:
         names = [c.id for c in self.configs]
         rule = msgspec.structs.replace(self.central, fusion=self.configs[0].fusion)
-        announced = m.Configuration(
-            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
-        )
+        announced = build.configuration(node="world", incarnation=0)
         self.world = WorldNode(
             self.streams,
             expected_nodes(names, recorder=False),
@@ -292,12 +289,8 @@ class Team:
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.request()
             if wanted is None and not node.finished and not node._inbox.waiting:
-                wanted = m.MeasurementsRequest(
-                    stamp_ns=0,
-                    robot=node.robot,
-                    incarnation=node.incarnation,
-                    first=node.next_measurement,
-                    last=-1,
+                wanted = build.measurements_request(
+                    robot=node.robot, incarnation=node.incarnation, first=node.next_measurement
                 )
             if wanted is None:
                 continue

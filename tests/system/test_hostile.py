@@ -9,7 +9,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.zenoh.bus import ZenohBus
-from tests.hostile_team import OF_THE_RUN, mutated, payloads
+from tests.hostile.drawing import OF_THE_RUN, mutated, payloads
 from tests.system.processes import Processes, until
 from tests.system.scenarios import short
 

@@ -34,7 +34,7 @@ from team.wire import channels as ch
 from team.wire.bus import BusError, Sample, opened
 from team.wire.codec import WireError
 from team.wire.zenoh.bus import ZenohBus
-from tests.hostile_team import OF_THE_RUN, PAIR, mutated, payloads
+from tests.hostile.drawing import OF_THE_RUN, PAIR, mutated, payloads
 from tests.trials.kills import PROGRAM, await_text, children, expected_of, final_in, shortened
 
 PATIENCE_S = 600.0

@@ -73,7 +73,7 @@ class GrowingBatch:
     @property
     def cost(self) -> float:
         """Σ of χ² of all factors, under the loss; about `dof` where the models are right."""
-        return 2.0 * float(self._graph.error(self._values))
+        return 2.0 * float(self._graph.error(self.values))
 
     @property
     def dof(self) -> int:
@@ -86,7 +86,7 @@ class GrowingBatch:
     def newton_decrement(self) -> float:
         """√(gᵀH⁻¹g): the length of the next Newton step in standard deviations."""
         try:
-            return newton_step(load_gtsam(), self._graph.linearize(self._values))[1]
+            return newton_step(load_gtsam(), self._graph.linearize(self.values))[1]
         except RuntimeError as error:
             raise UnsolvableError(str(error).strip()) from error
 
@@ -95,7 +95,7 @@ class GrowingBatch:
         return self.newton_decrement <= least_decrement
 
     @cached_property
-    def _values(self) -> Any:
+    def values(self) -> Any:
         gtsam = load_gtsam()
         values = gtsam.Values()
         for k, pose in enumerate(self.poses):
@@ -138,7 +138,7 @@ class GrowingBatch:
     def marginals(self) -> Any:
         """GTSAM's marginals; raises `UnsolvableError` where an unknown is not determined."""
         try:
-            return load_gtsam().Marginals(self._graph, self._values)
+            return load_gtsam().Marginals(self._graph, self.values)
         except RuntimeError as error:
             raise UnsolvableError(str(error).strip()) from error
 
@@ -214,8 +214,8 @@ def _descended(
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-13)
     parameters.setAbsoluteErrorTol(1e-11)
-    graph = batch._graph if scale == batch.robust_c else batch.graph(scale)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, batch._values, parameters)
+    graph = batch.graph(scale)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, batch.values, parameters)
     try:
         values = optimizer.optimize()
     except RuntimeError as error:

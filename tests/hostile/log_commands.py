@@ -1,6 +1,6 @@
 """Every command that opens a log, in one process, on hostile ones: how much memory it takes.
 
-    python -m tests.recording.hostile FOLDER LOG …
+    python -m tests.hostile.log_commands FOLDER LOG …
 
 Prints a JSON table: log -> command -> [exit status, growth of the peak memory in MiB, last line].
 """

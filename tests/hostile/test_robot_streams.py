@@ -22,7 +22,8 @@ from team.rejection import Rejection
 from team.robot.node import RobotNode
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, ids
-from tests.hostile_team import S, hostile_stream, robot_session
+from tests import build
+from tests.hostile.drawing import S, hostile_stream, robot_session
 
 SESSIONS = int(os.environ.get("TEAMSLAM_STORM", "3"))
 LANDMARKS = {1: (5.0, 0.0), 2: (0.0, 6.0), 3: (-4.0, 3.0)}
@@ -57,32 +58,13 @@ def drive(
     steps: int, odd: dict[int, m.Message] | None = None, *, sees: bool = True
 ) -> list[m.Message]:
     """A circle at 1 m/s, three landmarks each second; `odd`: what comes in place of a second's."""
-    out: list[m.Message] = [
-        m.InitialPose(
-            stamp_ns=0,
-            robot="r1",
-            incarnation=1,
-            number=0,
-            pose=from_floats([0.0, 0.0, 0.0]),
-            covariance=b"",
-        )
-    ]
+    out: list[m.Message] = [build.initial_pose(pose=from_floats([0.0, 0.0, 0.0]))]
     for k in range(1, steps + 1):
-        own = m.Odometry(
-            stamp_ns=k * S,
-            robot="r1",
-            incarnation=1,
-            number=2 * k,
-            duration_ns=S,
-            forward=1.0,
-            yaw_rate=0.1,
-        )
+        own = build.odometry(stamp_ns=k * S, number=2 * k)
         scan = [(i, float(np.hypot(*p)), 0.3 * i - 1.0) for i, p in LANDMARKS.items()]
         seen, ranges, bearings = zip(*scan, strict=True) if sees else ((), (), ())
-        look = m.Observations(
+        look = build.observations(
             stamp_ns=k * S,
-            robot="r1",
-            incarnation=1,
             number=2 * k - 1,
             ids=from_ids(seen),
             ranges=from_floats(ranges),
@@ -109,15 +91,7 @@ def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
 
 @pytest.mark.parametrize("speed", [1e3, 1e7, 1e300])
 def test_an_interval_that_is_too_fast_is_rejected_and_the_robot_drives_on(speed):
-    glitch = m.Odometry(
-        stamp_ns=15 * S,
-        robot="r1",
-        incarnation=1,
-        number=30,
-        duration_ns=S,
-        forward=speed,
-        yaw_rate=0.0,
-    )
+    glitch = build.odometry(stamp_ns=15 * S, number=30, forward=speed, yaw_rate=0.0)
     _, submaps, ledger = lived(drive(40, {15: glitch}, sees=False))
     assert ledger[Rejection.SPEED.disposition] == 1
     _, good, _ = lived(drive(40, sees=False))
@@ -129,33 +103,9 @@ def test_an_interval_that_is_too_fast_is_rejected_and_the_robot_drives_on(speed)
 
 def test_time_that_stands_goes_back_or_leaps_is_rejected():
     odd = {
-        12: m.Odometry(
-            stamp_ns=11 * S,
-            robot="r1",
-            incarnation=1,
-            number=24,
-            duration_ns=S,
-            forward=1.0,
-            yaw_rate=0.1,
-        ),
-        14: m.Odometry(
-            stamp_ns=3 * S,
-            robot="r1",
-            incarnation=1,
-            number=28,
-            duration_ns=S,
-            forward=1.0,
-            yaw_rate=0.1,
-        ),
-        16: m.Odometry(
-            stamp_ns=16 * S + 10**18,
-            robot="r1",
-            incarnation=1,
-            number=32,
-            duration_ns=S,
-            forward=1.0,
-            yaw_rate=0.1,
-        ),
+        12: build.odometry(stamp_ns=11 * S, number=24),
+        14: build.odometry(stamp_ns=3 * S, number=28),
+        16: build.odometry(stamp_ns=16 * S + 10**18, number=32),
     }
     node, submaps, ledger = lived(drive(40, odd))
     assert node.status().stamp_ns == 40 * S, "a last word 30 years away is refused by the centre"
@@ -166,28 +116,15 @@ def test_time_that_stands_goes_back_or_leaps_is_rejected():
 
 def test_a_clock_that_has_truly_leapt_is_followed_from_the_second_interval_on():
     away = 10**16
-    odd = {
-        k: m.Odometry(
-            stamp_ns=k * S + away,
-            robot="r1",
-            incarnation=1,
-            number=2 * k,
-            duration_ns=S,
-            forward=1.0,
-            yaw_rate=0.1,
-        )
-        for k in range(21, 41)
-    }
+    odd = {k: build.odometry(stamp_ns=k * S + away, number=2 * k) for k in range(21, 41)}
     _, submaps, ledger = lived(drive(40, odd))
     assert ledger[Rejection.TIME.disposition] == 1
     assert submaps[-1].stamp_ns == 40 * S + away
 
 
 def test_a_range_beyond_the_bounds_is_not_taken():
-    far = m.Observations(
+    far = build.observations(
         stamp_ns=5 * S,
-        robot="r1",
-        incarnation=1,
         number=9,
         ids=from_ids([1]),
         ranges=from_floats([9e5]),
@@ -206,10 +143,8 @@ def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bo
             n = 2000 if k == 21 else 60
             seen = np.arange(1, n + 1) + 60 * k
             ranges = np.linspace(1.0, 50.0, n)
-            each = m.Observations(
+            each = build.observations(
                 stamp_ns=each.stamp_ns,
-                robot="r1",
-                incarnation=1,
                 number=k,
                 ids=from_ids(seen),
                 ranges=from_floats(ranges),

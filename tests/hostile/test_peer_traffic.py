@@ -20,6 +20,7 @@ from team.peers.store import Store
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
+from tests import build
 from tests.peers.teams import member, parcel, start
 
 ROBOTS = ("r1", "r2", "r3")
@@ -165,9 +166,7 @@ def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one() -> None:
 
 def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> None:
     node = node_of()
-    last = m.Done(
-        stamp_ns=0, robot="r2", incarnation=1, measurements=1, steps=0, submaps=1, ledger=()
-    )
+    last = build.done(robot="r2", measurements=1, submaps=1)
     node.take(member(ch.ROBOT_DONE, last), "robot/r2")
     request = m.MembersRequest(stamp_ns=0, node=LIAR, requested=(), statements=("r2",) * 10_000)
     (reply,) = node.answer(encoded(request))
@@ -197,9 +196,7 @@ def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold
     assert len(begun) == 2
     fold.refresh()
     assert len(begun) == 2, "it is begun anew for a change only"
-    last = m.Done(
-        stamp_ns=10**6, robot="r2", incarnation=1, measurements=10, steps=0, submaps=1, ledger=()
-    )
+    last = build.done(stamp_ns=10**6, robot="r2", measurements=10, submaps=1)
     node.take(member(ch.ROBOT_DONE, last), "robot/r2")
     smallest = min(
         (member(ch.SUBMAP, msgspec.structs.replace(own, gated=k)) for k in range(400, 4000)),

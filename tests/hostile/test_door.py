@@ -15,6 +15,7 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
 from team.wire.digest import configured
+from tests import build
 from tests.support import examples, submap
 from tests.teams import Submaps, of, published, stream, world_of
 
@@ -42,13 +43,8 @@ def given(
 
 
 def progress(robot: str, measurements: int, submaps: int, stamp_s: float = 12.0) -> m.Progress:
-    return m.Progress(
-        stamp_ns=round(stamp_s * 1e9),
-        node=f"robot/{robot}",
-        robot=robot,
-        incarnation=1,
-        measurements=measurements,
-        submaps=submaps,
+    return build.progress(
+        stamp_ns=round(stamp_s * 1e9), robot=robot, measurements=measurements, submaps=submaps
     )
 
 
@@ -62,14 +58,12 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
         said += [(ch.SUBMAP, name, submap) for submap in submaps]
         said.append((ch.ROBOT_PROGRESS, name, progress(name, count, len(submaps))))
     for name, submaps in SUBMAPS.items():
-        done = m.Done(
+        done = build.done(
             stamp_ns=12 * 10**9,
             robot=name,
-            incarnation=1,
             measurements=len(MEASUREMENTS[name]),
             steps=12,
             submaps=len(submaps),
-            ledger=(),
         )
         said.append((ch.ROBOT_DONE, name, done))
     return [*said, (ch.END, "", END)]
@@ -87,17 +81,13 @@ ATTACKS = [
     (
         ch.ROBOT_DONE,
         "r1",
-        m.Done(
-            stamp_ns=0, robot="r1", incarnation=HUGE, measurements=0, steps=0, submaps=0, ledger=()
-        ),
+        build.done(incarnation=HUGE),
         f"of incarnation {HUGE}",
     ),
     (
         ch.ROBOT_DONE,
         "r1",
-        m.Done(
-            stamp_ns=0, robot="r1", incarnation=1, measurements=5, steps=0, submaps=HUGE, ledger=()
-        ),
+        build.done(measurements=5, submaps=HUGE),
         f"counts to {HUGE}",
     ),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, HUGE), f"counts to {HUGE}"),
@@ -106,9 +96,7 @@ ATTACKS = [
     (
         ch.ROBOT_PROGRESS,
         "r1",
-        m.Progress(
-            stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=5, submaps=1
-        ),
+        build.progress(node="central", measurements=5, submaps=1),
         "a message of 'central'",
     ),
     (ch.END, "", m.End(stamp_ns=0, streams=()), "an end that does not know of r1, r2"),
@@ -183,22 +171,16 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     out = given(boundary, node, *measurements[:8])
     odometry = next(each for each in MEASUREMENTS["r1"][8:] if isinstance(each, m.Odometry))
     far = msgspec.structs.replace(odometry, stamp_ns=odometry.stamp_ns + 2 * LATE_NS)
-    acknowledged = m.Progress(
-        stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=10**6
-    )
+    acknowledged = build.progress(node="central", submaps=10**6)
     attacks = [
         (
             ch.START,
-            m.InitialPose(
-                stamp_ns=0, robot="r1", incarnation=HUGE, number=0, pose=b"", covariance=b""
-            ),
+            build.initial_pose(incarnation=HUGE),
             f"of incarnation {HUGE}",
         ),
         (
             ch.START,
-            m.InitialPose(
-                stamp_ns=0, robot="r1", incarnation=100, number=0, pose=b"", covariance=b""
-            ),
+            build.initial_pose(incarnation=100),
             "of incarnation 100, while 1 is in",
         ),
         (ch.ODOMETRY, msgspec.structs.replace(odometry, number=HUGE), f"counts to {HUGE}"),
@@ -236,9 +218,7 @@ def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own() 
         (
             ch.RECORDER_PROGRESS,
             "r1",
-            m.Progress(
-                stamp_ns=0, node="recorder", robot="r1", incarnation=7, measurements=1, submaps=1
-            ),
+            build.progress(node="recorder", incarnation=7, measurements=1, submaps=1),
             "incarnation 7",
         ),
         (ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=True), "before the end"),
@@ -257,34 +237,8 @@ def test_what_a_team_can_say_is_refused_in_no_order(order: int) -> None:
     door = Door(["r1", "r2"])
     said = [message for _, _, message in run()]
     assert [door.refusal(message) for message in said[::order]] == [None] * len(said)
-    assert (
-        door.refusal(
-            m.Done(
-                stamp_ns=0,
-                robot="r1",
-                incarnation=MOST_LIVES,
-                measurements=MOST_COUNT,
-                steps=0,
-                submaps=0,
-                ledger=(),
-            )
-        )
-        is None
-    )
-    assert (
-        door.refusal(
-            m.Done(
-                stamp_ns=0,
-                robot="r1",
-                incarnation=MOST_LIVES + 1,
-                measurements=0,
-                steps=0,
-                submaps=0,
-                ledger=(),
-            )
-        )
-        is not None
-    )
+    assert door.refusal(build.done(incarnation=MOST_LIVES, measurements=MOST_COUNT)) is None
+    assert door.refusal(build.done(incarnation=MOST_LIVES + 1)) is not None
 
 
 def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there():
@@ -306,10 +260,9 @@ def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there
 
 
 def done_of(robot: str, incarnation: int, measurements: int, submaps: int) -> m.Done:
-    return m.Done(
-        stamp_ns=0, robot=robot, incarnation=incarnation, measurements=measurements, steps=0,
-        submaps=submaps, ledger=(),
-    )  # fmt: skip
+    return build.done(
+        robot=robot, incarnation=incarnation, measurements=measurements, submaps=submaps
+    )
 
 
 def end_of(robot: str, incarnation: int, measurements: int) -> m.End:
@@ -318,9 +271,7 @@ def end_of(robot: str, incarnation: int, measurements: int) -> m.End:
     return m.End(stamp_ns=0, streams=(mine, other))
 
 
-FAR_START = m.InitialPose(
-    stamp_ns=2**61, robot="r1", incarnation=1, number=0, pose=b"", covariance=b""
-)
+FAR_START = build.initial_pose(stamp_ns=2**61)
 FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
     "last words of a later incarnation": [(ch.ROBOT_DONE, "r1", done_of("r1", 900, 5, 0))],
     "last words of submaps that never were": [(ch.ROBOT_DONE, "r1", done_of("r1", 1, 5, 9))],

@@ -17,7 +17,8 @@ from team.config import FusionRule
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from team.wire.codec import decoded, encoded
-from tests.hostile_team import (
+from tests import build
+from tests.hostile.drawing import (
     CONFIG,
     ROBOTS,
     S,
@@ -58,11 +59,8 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
 
 
 def start(robot, pose=(0.0, 0.0, 0.0), spread=None):
-    return m.InitialPose(
-        stamp_ns=0,
+    return build.initial_pose(
         robot=robot,
-        incarnation=1,
-        number=0,
         pose=b"" if pose is None else from_floats(pose),
         covariance=b"" if spread is None else from_floats(spread),
     )
@@ -73,10 +71,9 @@ def good(robot, count=4, **known):
 
 
 def sighting(by, of, stamp_ns, spread):
-    return m.SightingFactor(
+    return build.sighting_factor(
         stamp_ns=stamp_ns,
         robot=by,
-        incarnation=1,
         sequence=stamp_ns // (10 * S),
         config=CONFIG,
         teammate=of,
@@ -249,24 +246,20 @@ def test_rules_on_whole_maps_fuse_what_they_can(fusion: FusionRule, seed: int):
         for robot in ROBOTS:
             ids = np.unique(rng.integers(1, 6, 4)).astype(np.uint32)
             n = 2 * len(ids)
-            made = m.MapEstimate(
+            made = build.map_estimate(
                 stamp_ns=exchange * S,
                 robot=robot,
-                incarnation=1,
                 sequence=exchange,
                 exchange=exchange,
-                joint=True,
                 ids=from_ids(ids),
                 means=from_floats(numbers(rng, n)),
                 covariance=packed(covariance(rng, n)),
             )
-            tame = m.MapEstimate(
+            tame = build.map_estimate(
                 stamp_ns=exchange * S,
                 robot=robot,
-                incarnation=1,
                 sequence=exchange,
                 exchange=exchange,
-                joint=True,
                 ids=from_ids(ids),
                 means=from_floats(np.zeros(n)),
                 covariance=packed(np.eye(n)),
@@ -276,16 +269,7 @@ def test_rules_on_whole_maps_fuse_what_they_can(fusion: FusionRule, seed: int):
             except ValueError:
                 messages.append(tame)
     messages += [
-        m.Done(
-            stamp_ns=2 * S,
-            robot=robot,
-            incarnation=1,
-            measurements=1000,
-            steps=500,
-            submaps=0,
-            ledger=(),
-            last_map=2,
-        )
+        build.done(stamp_ns=2 * S, robot=robot, measurements=1000, steps=500, last_map=2)
         for robot in ROBOTS
     ]
     messages.append(

@@ -15,6 +15,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import encoded
+from tests import build
 from tests.support import packed, spd
 
 LARGEST_FILE = 16 * 1024
@@ -91,11 +92,9 @@ def far_counters(path: Path) -> Path:
     """Sound messages whose counters speak of 10¹⁸ measurements."""
     far = 2**60
     joint = from_floats([0.0] * 5)
-    submap = m.Submap(
+    submap = build.submap(
         stamp_ns=9,
         robot="alpha",
-        incarnation=1,
-        sequence=0,
         first_measurement=0,
         last_measurement=far,
         start_ns=1,
@@ -108,49 +107,23 @@ def far_counters(path: Path) -> Path:
         (
             ch.START,
             "alpha",
-            m.InitialPose(
-                stamp_ns=0, robot="alpha", incarnation=1, number=0, pose=b"", covariance=b""
-            ),
+            build.initial_pose(robot="alpha"),
         ),
         (
             ch.ODOMETRY,
             "alpha",
-            m.Odometry(
-                stamp_ns=5,
-                robot="alpha",
-                incarnation=1,
-                number=1,
-                duration_ns=5,
-                forward=0.5,
-                yaw_rate=0.1,
-            ),
+            build.odometry(stamp_ns=5, robot="alpha", number=1, duration_ns=5, forward=0.5),
         ),
         (
             ch.ODOMETRY,
             "alpha",
-            m.Odometry(
-                stamp_ns=2**61,
-                robot="alpha",
-                incarnation=1,
-                number=far,
-                duration_ns=5,
-                forward=0.5,
-                yaw_rate=0.1,
-            ),
+            build.odometry(stamp_ns=2**61, robot="alpha", number=far, duration_ns=5, forward=0.5),
         ),
         (ch.SUBMAP, "alpha", submap),
         (
             ch.ROBOT_DONE,
             "alpha",
-            m.Done(
-                stamp_ns=9,
-                robot="alpha",
-                incarnation=1,
-                measurements=far,
-                steps=far,
-                submaps=1,
-                ledger=(),
-            ),
+            build.done(stamp_ns=9, robot="alpha", measurements=far, steps=far, submaps=1),
         ),
         (
             ch.END,

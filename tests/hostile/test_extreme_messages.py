@@ -32,8 +32,9 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import WireError, decoded, encoded
-from tests.extreme import CHANNELS, samples
-from tests.hostile_team import ROBOTS, S, mutated
+from tests import build
+from tests.hostile.drawing import CHANNELS, ROBOTS, S, mutated
+from tests.hostile.drawing import extreme_samples as samples
 
 COUNT = int(os.environ.get("TEAMSLAM_STORM", "6"))
 MOST_MIB = 150
@@ -71,15 +72,10 @@ def beginning() -> list[Sample]:
     """A stream of each robot, so that extreme messages meet a window that is open."""
     out = []
     for robot in ROBOTS:
-        start = m.InitialPose(
-            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
-        )
+        start = build.initial_pose(robot=robot)
         out.append(Outgoing(ch.START, robot, start))
         for k in range(1, 12):
-            motion = m.Odometry(
-                stamp_ns=k * S, robot=robot, incarnation=1, number=k, duration_ns=S, forward=1.0,
-                yaw_rate=0.1,
-            )  # fmt: skip
+            motion = build.odometry(stamp_ns=k * S, robot=robot, number=k)  # fmt: skip
             out.append(Outgoing(ch.ODOMETRY, robot, motion))
     return [Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, 0) for each in out]
 

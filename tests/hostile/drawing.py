@@ -1,10 +1,13 @@
-"""Messages that are valid on the wire and hardly of this world, and sessions of nodes with them.
+"""Hostile messages, and sessions of nodes that receive them.
 
-Everything is drawn from a NumPy generator, so that a seed names a session.
+`Team` and `hostile_stream` draw sessions that are valid on the wire: singular covariances, clocks
+that leap, coordinates of 1e200 m. `extreme_samples` draws messages of every type with fields at the
+bounds of their types. `mutated` changes bytes. Everything is drawn from a seeded generator.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from random import Random
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,6 +21,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing
 from team.wire.codec import WireError, decoded, encoded
+from tests import build
 from tests.support import examples
 
 S = 1_000_000_000
@@ -33,6 +37,11 @@ OF_THE_RUN = (
 )  # fmt: skip
 """What only keys can keep a stranger from: he ends the run or makes it wait, or lies of a fault."""
 SKIPPED = (*ch.QUERIES, ch.VIEW, ch.ALIVE)
+CHANNELS = {
+    kind: [row for row in ch.CHANNELS if row not in SKIPPED and kind in row.kinds]
+    for kind in m.BY_TAG.values()
+}
+"""The channels that carry a message type; a request or a reply has none."""
 
 
 def valid(message: m.Message) -> m.Message | None:
@@ -78,6 +87,11 @@ def packed(P: np.ndarray) -> bytes:
     return from_floats(P[np.triu_indices(len(P))])
 
 
+def initial_pose(robot: str) -> m.InitialPose:
+    """An unknown initial pose."""
+    return m.InitialPose(stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b"")
+
+
 class Team:
     """The robots of a hostile team: chains of submaps that continue, so that a set takes them.
 
@@ -98,34 +112,15 @@ class Team:
             self.messages.append(found)
         return found is not None
 
-    def start(self, robot: str, incarnation: int = 1) -> m.InitialPose:
+    def start(self, robot: str) -> m.InitialPose:
         rng = self._rng
+        unknown = initial_pose(robot)
         if rng.random() < 0.5:
-            return m.InitialPose(
-                stamp_ns=0, robot=robot, incarnation=incarnation, number=0, pose=b"", covariance=b""
-            )
-        pose = np.append(numbers(rng, 2), rng.uniform(-3.0, 3.0))
+            return unknown
+        pose = from_floats(np.append(numbers(rng, 2), rng.uniform(-3.0, 3.0)))
         spread = b"" if rng.random() < 0.5 else from_floats(covariance(rng, 3))
-        exact = m.InitialPose(
-            stamp_ns=0,
-            robot=robot,
-            incarnation=incarnation,
-            number=0,
-            pose=from_floats(pose),
-            covariance=spread,
-        )
-        return (
-            exact
-            if valid(exact)
-            else m.InitialPose(
-                stamp_ns=0,
-                robot=robot,
-                incarnation=incarnation,
-                number=0,
-                pose=from_floats(pose),
-                covariance=b"",
-            )
-        )
+        drawn = msgspec.structs.replace(unknown, pose=pose, covariance=spread)
+        return drawn if valid(drawn) else msgspec.structs.replace(unknown, pose=pose)
 
     def submap(self, robot: str) -> m.Submap:
         rng, k = self._rng, self._next[robot]
@@ -140,10 +135,9 @@ class Team:
         poses = 3 * (1 + len(nodes))
         mean[2:poses:3] = np.clip(mean[2:poses:3], -3.1, 3.1)
         biases = ("bearing", "range_scale") if rng.random() < 0.2 else ()
-        return m.Submap(
+        return build.submap(
             stamp_ns=(k + 1) * 10 * S,
             robot=robot,
-            incarnation=1,
             sequence=k,
             first_measurement=k * 20 + (k > 0),
             last_measurement=k * 20 + 20,
@@ -195,10 +189,9 @@ class Team:
         rng = self._rng
         teammate = str(rng.choice([r for r in ROBOTS if r != submap.robot]))
         distance = float(abs(numbers(rng, 1)[0])) or 1.0
-        return m.SightingFactor(
+        return build.sighting_factor(
             stamp_ns=stamp_ns,
             robot=submap.robot,
-            incarnation=1,
             sequence=submap.sequence,
             config=CONFIG,
             teammate=teammate,
@@ -215,13 +208,8 @@ class Team:
 
 def progress(robot: str, submaps: int) -> m.Progress:
     """What a robot says that has published so many submaps of ten seconds."""
-    return m.Progress(
-        stamp_ns=submaps * 10 * S,
-        node=f"robot/{robot}",
-        robot=robot,
-        incarnation=1,
-        measurements=1000,
-        submaps=submaps,
+    return build.progress(
+        stamp_ns=submaps * 10 * S, robot=robot, measurements=1000, submaps=submaps
     )
 
 
@@ -230,14 +218,12 @@ def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
     out: list[m.Message] = []
     for robot, count in submaps.items():
         said = progress(robot, count)
-        done = m.Done(
+        done = build.done(
             stamp_ns=said.stamp_ns,
             robot=robot,
-            incarnation=1,
             measurements=said.measurements,
             steps=500,
             submaps=count,
-            ledger=(),
         )
         out += [said, done]
     streams = tuple(m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS)
@@ -345,10 +331,9 @@ def prior(rng: np.random.Generator, robot: str) -> m.Prior:
     ids = np.unique(rng.integers(1, 8, int(rng.integers(0, 5)))).astype(np.uint32)
     n = 3 + 2 * len(ids)
     sequence = int(rng.integers(-1, 4))
-    return m.Prior(
+    return build.prior(
         stamp_ns=sequence * 10 * S,
         robot=robot,
-        incarnation=1,
         sequence=sequence,
         digest=CONFIG,
         ids=from_ids(ids),
@@ -380,14 +365,7 @@ def robot_session(
         answers = [each.message for each in out if isinstance(each.message, m.Submap)]
         if answers:
             out += node.handle(
-                m.Progress(
-                    stamp_ns=0,
-                    node="central",
-                    robot=node.robot,
-                    incarnation=1,
-                    measurements=0,
-                    submaps=len(answers),
-                ),
+                build.progress(node="central", robot=node.robot, submaps=len(answers)),
                 0,
             )
     for each in [*out, Outgoing(out[0].channel, "", node.status())]:
@@ -396,44 +374,21 @@ def robot_session(
 
 
 def payloads(rng: Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
-    """Sound messages of every kind, and what hostile teams send, each on its channel."""
-    of_type: dict[type, list[ch.Channel]] = {}
-    for channel in ch.CHANNELS:
-        if channel not in SKIPPED:
-            for kind in channel.kinds:
-                of_type.setdefault(kind, []).append(channel)
+    """Hostile sessions and extreme messages of every type, each on its channels, without end."""
     while True:
         numbers = np.random.default_rng(rng.getrandbits(32))
         team = Team(numbers)
         for _ in range(20):
             team.grow()
         robot = rng.choice(PAIR)
-        said = [*team.messages, *team.ends(), *hostile_stream(numbers, robot, 60)]
-        said += [found for _ in range(10) if (found := valid(prior(numbers, robot)))]
-        said += [elsewhere(rng, each) for each in examples()]
-        for message in said:
-            for channel in of_type.get(type(message), ()):
+        drawn = [*team.messages, *team.ends(), *hostile_stream(numbers, robot, 60)]
+        drawn += [found for _ in range(10) if (found := valid(prior(numbers, robot)))]
+        for message in drawn:
+            for channel in CHANNELS.get(type(message), ()):
                 name = getattr(message, "robot", getattr(message, "node", robot)) or robot
-                named = "{" in channel.template
-                yield channel, name if named else "", encoded(message)
-
-
-def elsewhere(rng: Random, message: m.Message) -> m.Message:
-    """An example as one of the team's, with other numbers where it stays valid."""
-    changes: dict[str, object] = {}
-    for name in message.__struct_fields__:
-        value = getattr(message, name)
-        if name == "robot" and isinstance(value, str):
-            changes[name] = rng.choice(PAIR)
-        elif isinstance(value, int) and not isinstance(value, bool) and rng.random() < 0.3:
-            changes[name] = rng.choice([0, 1, 2, 7, 2**31, 2**53, 2**62, -1])
-        elif isinstance(value, float) and rng.random() < 0.3:
-            changes[name] = rng.choice([0.0, 1e-300, 1.0, -1.0, 1e9, 1e300])
-    try:
-        changed = msgspec.structs.replace(message, **changes)
-        return valid(changed) or message
-    except (ValueError, TypeError):
-        return message
+                yield channel, name if "{" in channel.template else "", encoded(message)
+        for kind in CHANNELS:
+            yield from extreme_samples(numbers, kind, 1)
 
 
 def mutated(rng: Random, payload: bytes) -> bytes:
@@ -457,3 +412,130 @@ def mutated(rng: Random, payload: bytes) -> bytes:
             case _:
                 data[at : at + 8] = rng.choice([b"\0" * 8, b"\xff" * 8, b"\0\0\0\0\0\0\xf8\x7f"])
     return bytes(data)
+
+
+INTEGERS = (
+    0,
+    1,
+    2,
+    7,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**40,
+    2**53,
+    2**62 - 1,
+    2**63 - 1,
+    -1,
+    -(2**62),
+)
+FLOATS = (0.0, -0.0, 1.0, -1.0, 5e-324, 1e-300, 1e-12, 3.2, 1e9, -1e9, 1e154, 1e300, -1e300)
+TEXTS = (
+    "",
+    "\x1b]0;owned\x07",
+    "\x1b[2J",
+    "\u202e\u2066",
+    "r1",
+    "robot/r1",
+    "\0",
+    "a" * 20_000,
+    "<b>&",
+)
+NAMES = (*ROBOTS, "a", "z" * 32, "stranger_0")
+NUMBERS = (0, 1, 2, 7, 2**16, 2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1)
+"""Ids and counts: 32 bits."""
+WORDS = {"ids", "counts", "labels", "identities", "locals", "sequences", "rows", "landmarks"}
+"""Fields of uint32."""
+FLAWS = ("robot", "incarnation", "number", "node", "name")
+"""A node decides by these fields whether to look at a message; they are rarely changed."""
+
+
+def extreme(rng: np.random.Generator, message: m.Message) -> m.Message:
+    """The message with some of its fields at extremes, as far as its door lets them through."""
+    rate = rng.choice([0.1, 0.3, 0.9])
+    for name in rng.permutation(list(message.__struct_fields__)).tolist():
+        if rng.random() > rate or (name in FLAWS and rng.random() < 0.7):
+            continue
+        changed = msgspec.structs.replace(
+            message, **{name: _other(rng, name, getattr(message, name))}
+        )
+        try:
+            message = valid(changed) or message
+        except (TypeError, ValueError):
+            continue
+    return message
+
+
+def _other(rng: np.random.Generator, name: str, value: Any) -> Any:
+    match value:
+        case bool():
+            return not value
+        case int():
+            return (
+                int(rng.choice(INTEGERS))
+                if rng.random() < 0.8
+                else value + int(rng.integers(-2, 3))
+            )
+        case float():
+            return float(rng.choice(FLOATS))
+        case str():
+            return str(rng.choice(NAMES if rng.random() < 0.5 else TEXTS))
+        case bytes():
+            return _array(rng, name, value)
+        case tuple():
+            return _row(rng, name, value)
+        case dict():
+            return {str(key): float(rng.choice(FLOATS)) for key in rng.choice(TEXTS, 3)}
+        case msgspec.Struct():
+            chosen = str(rng.choice(value.__struct_fields__))
+            return msgspec.structs.replace(
+                value, **{chosen: _other(rng, chosen, getattr(value, chosen))}
+            )
+        case _:
+            return value
+
+
+def _array(rng: np.random.Generator, name: str, value: bytes) -> bytes:
+    if name in WORDS:
+        count = len(value) // 4
+        return from_ids(np.sort(rng.choice(NUMBERS, count, replace=count > len(NUMBERS))))
+    if name in ("stamps", "nodes"):
+        return from_stamps(np.sort(rng.integers(-(2**62), 2**62, len(value) // 8)))
+    if len(value) % 8 or rng.random() < 0.1:
+        return rng.bytes(len(value))
+    old = np.frombuffer(value, "<f8")
+    with np.errstate(all="ignore"):
+        scaled = old * rng.choice([0.0, 1e-150, 1e-9, 1e9, 1e150, -1.0])
+    return from_floats(scaled if rng.random() < 0.6 else rng.choice(FLOATS, len(old)))
+
+
+def _row(rng: np.random.Generator, name: str, value: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not value or rng.random() < 0.2:
+        return ()
+    some = [_other(rng, name, each) if rng.random() < 0.5 else each for each in value]
+    return tuple(some * (500 if rng.random() < 0.1 else 1))
+
+
+def extreme_samples(
+    rng: np.random.Generator, kind: type[m.Message], count: int
+) -> Iterator[tuple[ch.Channel, str, bytes]]:
+    """Channel, name and payload of so many extreme messages of a class, on each of its channels."""
+    (example,) = (each for each in examples() if type(each) is kind)
+    for _ in range(count):
+        robot = str(rng.choice(ROBOTS))
+        own: dict[str, object] = {"robot": robot} if "robot" in kind.__struct_fields__ else {}
+        if "incarnation" in kind.__struct_fields__:
+            own["incarnation"] = 1
+        if "stamp_ns" in kind.__struct_fields__:
+            own["stamp_ns"] = int(rng.integers(0, 100)) * S
+        base = valid(msgspec.structs.replace(example, **own)) or example
+        for channel in CHANNELS[kind]:
+            name = (
+                getattr(base, "robot", robot) if "{robot}" in channel.template else f"robot/{robot}"
+            )
+            publisher = channel.publisher(name if "{" in channel.template else "")
+            if "node" in kind.__struct_fields__ and rng.random() < 0.7:
+                base = valid(msgspec.structs.replace(base, node=publisher)) or base
+            message = extreme(rng, base)
+            name = getattr(message, "robot", name) if "{robot}" in channel.template else name
+            yield channel, name if "{" in channel.template else "", encoded(message)

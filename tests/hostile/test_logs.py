@@ -9,7 +9,7 @@ import pytest
 
 from team.recording import records
 from team.recording.reader import LogError, open_log
-from tests.recording.hostile_logs import KINDS, LARGEST_FILE, many_small
+from tests.hostile.logs import KINDS, LARGEST_FILE, many_small
 from tests.support import ROOT
 
 MOST_MIB = 300
@@ -22,7 +22,7 @@ def test_no_command_lets_a_small_file_take_much_memory_or_end_in_a_traceback(
     files = [kind(tmp_path / f"{kind.__name__}.mcap") for kind in KINDS]
     assert max(file.stat().st_size for file in files) <= LARGEST_FILE
     done = subprocess.run(
-        [sys.executable, "-m", "tests.recording.hostile", str(tmp_path), *map(str, files)],
+        [sys.executable, "-m", "tests.hostile.log_commands", str(tmp_path), *map(str, files)],
         cwd=ROOT, capture_output=True, text=True, timeout=300, check=True,
     )  # fmt: skip
     found = json.loads(done.stdout.splitlines()[-1])

@@ -1,0 +1,57 @@
+"""Builders of messages for tests: every field that a test does not state has an ordinary value."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+from team.wire import messages as m
+
+S = 1_000_000_000
+"""One second [ns]."""
+M = TypeVar("M", bound=m.Message)
+ORDINARY: dict[str, Any] = {
+    "stamp_ns": 0, "robot": "r1", "incarnation": 1, "sequence": 0, "exchange": 0, "steps": 0,
+    "measurements": 0, "submaps": 0, "ledger": (), "number": 0, "pose": b"", "covariance": b"",
+    "duration_ns": S, "forward": 1.0, "yaw_rate": 0.1, "alive": True, "joint": True,
+    "digest": bytes(8), "config": bytes(8), "map_digest": bytes(8), "configuration": "{}",
+    "by": "operator", "reason": "a test", "figures": {}, "warnings": (), "first": 0, "last": -1,
+    "final": False, "provisional": False, "rule": "join", "frame": "r1/1", "members": (),
+    "missing": (), "chi2": 0.0, "dof": 0, "reasons": (),
+}  # fmt: skip
+
+
+def _built(kind: Callable[..., M], **fields: object) -> M:
+    """A message of this class; its node is the robot's, where a test names no other."""
+    names: tuple[str, ...] = getattr(kind, "__struct_fields__")  # noqa: B009 - msgspec's
+    required = names[: len(names) - len(getattr(kind, "__struct_defaults__"))]  # noqa: B009
+    values = {name: ORDINARY[name] for name in required if name in ORDINARY} | fields
+    if "node" in required and "node" not in values:
+        values["node"] = f"robot/{values.get('robot', 'r1')}"
+    return kind(**values)
+
+
+initial_pose = partial(_built, m.InitialPose)
+odometry = partial(_built, m.Odometry)
+observations = partial(_built, m.Observations)
+liveliness = partial(_built, m.Liveliness)
+progress = partial(_built, m.Progress)
+done = partial(_built, m.Done)
+submap = partial(_built, m.Submap)
+sighting_factor = partial(_built, m.SightingFactor)
+map_estimate = partial(_built, m.MapEstimate)
+pose_estimate = partial(_built, m.PoseEstimate)
+prior = partial(_built, m.Prior)
+fused_map = partial(_built, m.FusedMap)
+configuration = partial(_built, m.Configuration)
+status = partial(_built, m.Status)
+withdrawal = partial(_built, m.Withdrawal)
+measurements_request = partial(_built, m.MeasurementsRequest)
+
+
+def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:
+    """The end of the run: the number of measurements of each robot's stream."""
+    streams = (
+        m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+        for robot, count in measurements.items()
+    )
+    return m.End(stamp_ns=stamp_ns, streams=tuple(streams))
