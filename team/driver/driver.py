@@ -1,8 +1,8 @@
-"""The driver: takes a robot's measurements from a program and delivers them to the robot's process.
+"""The driver delivers a program's measurements to the robot's process.
 
-Each measurement is checked, written to the robot's file and then published by a separate thread, so
-that a call never waits for the network. The robot's process and the recorder request measurements
-that they have missed; the driver answers from the file.
+Each measurement is checked, written to the robot's file and published by a separate thread: a call
+never waits for the network. Receivers request missed measurements; the driver answers from the
+file.
 """
 
 import logging
@@ -40,15 +40,14 @@ GAP_S = 2.0
 BRIDGE_S = 5.0
 """A gap between intervals up to this [s] is bridged, by a motion with a large covariance."""
 AWAY_S = 60.0
-"""A difference of odometry poses is used up to this interval [s]; beyond it the odometry may have
-been reset."""
+"""Longest interval [s] over which two odometry poses are differenced; the odometry may have been
+reset within a longer one."""
 JUMP_S = 86_400.0
-"""Odometry that is stamped so much later [s] than the last comes from another clock."""
+"""A later stamp than this [s] after the last odometry is from another clock."""
 AHEAD_S = 10.0
-"""A landmark measurement may be stamped this far [s] ahead of the odometry; beyond it the two are
-taken to have different clocks."""
+"""A landmark measurement stamped further [s] ahead of the odometry is from another clock."""
 LIKELY_RAD_S = 4.0 * np.pi
-"""A yaw rate beyond two turns a second is taken to be in degrees, unless bounds are given."""
+"""A faster yaw rate is refused as one in degrees, unless bounds are given."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -57,20 +56,19 @@ class DriverError(RuntimeError):
 
 
 class Driver:
-    """Delivers one robot's measurements to its team; used as `with Driver(…) as robot`.
+    """Deliver one robot's measurements to its team; use as `with Driver(…) as robot`.
 
-    robot: its name. team: the team's, a scenario's `team` or name. connect: where the router is.
-    keys: a folder with the certificate `source-<robot>`. file: where all measurements are kept;
-    default: `<robot>.stream` in the working folder. Started again with the same file the driver
-    goes on where it was. start: (x [m], y [m], theta [rad]) in the team's frame, None where nobody
-    knows; start_covariance: 3 × 3, None where it is exactly known. landmarks: their numbers, if
-    they are known beforehand. latency_s: what is seen may come so much later than newer odometry.
-    patience_s: how long to wait for the router where the file is new; 0: not at all, it may come
-    later. bounds: what is physically sensible; without them a yaw rate beyond LIKELY_RAD_S is
-    refused, too.
+    robot: name of the robot. team: name of the team, as in the scenario. connect: endpoint of the
+    router. keys: folder with the certificate `source-<robot>`. file: file of all measurements,
+    default `<robot>.stream`; a driver started again with the same file continues its stream.
+    start: (x [m], y [m], theta [rad]) in the team's frame; None: unknown. start_covariance: 3 × 3;
+    None: exactly known. landmarks: all landmark ids, if known. latency_s: longest delay of a
+    detection behind the odometry of its time. patience_s: time to wait for the router with a new
+    file; 0: connect later. bounds: physical limits of the robot; without them a yaw rate beyond
+    LIKELY_RAD_S is refused, too.
 
-    Times `t` are seconds of one clock for the whole team, as of Unix time. Raises DriverError where
-    it can not begin; each call raises MeasurementError for what can not be a measurement.
+    Times `t` are seconds on one clock for the whole team, such as Unix time. Raises DriverError if
+    the driver can not start; each call raises MeasurementError for an impossible value.
     """
 
     def __init__(
@@ -125,14 +123,12 @@ class Driver:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End the stream. If the block raised, only leave: the stream continues at the next
-        start.
-        """
+        """End the stream; after an exception only leave, so that the next start continues it."""
         if kind is None and not self._closed:
             self.end()
         self.close()
 
-    # What is measured.
+    # Measurements.
 
     def odometry(
         self,
@@ -141,9 +137,9 @@ class Driver:
         yaw_rate: float,
         duration: float | Decimal | None = None,
     ) -> None:
-        """Take odometry: mean speed [m/s] and yaw rate [rad/s] over the `duration` seconds until t.
+        """Add odometry: mean speed [m/s] and yaw rate [rad/s] over the `duration` seconds until t.
 
-        Without a duration: since the last call; the first such call says when the robot begins.
+        Without a duration: since the last call; the first such call sets the start time.
         """
         stamp_ns, length_ns = _times(t, duration, "odometry")
         what = f"odometry of {self.robot} at {t} s"
@@ -171,10 +167,9 @@ class Driver:
         covariance: ArrayLike | None = None,
         duration: float | Decimal | None = None,
     ) -> None:
-        """Take odometry: the motion (ahead [m], left [m], turn [rad]) over `duration` seconds until
-        t.
+        """Add odometry: a motion (ahead [m], left [m], turn [rad]) over `duration` seconds until t.
 
-        In the frame of its beginning; covariance: 3 × 3, of an error in the frame of its end.
+        The motion is in the frame of its start pose; covariance (3 × 3) in that of its end pose.
         """
         stamp_ns, length_ns = _times(t, duration, "odometry_increment")
         step = measured.pose_of(increment, f"odometry_increment of {self.robot} at {t} s")
@@ -194,10 +189,9 @@ class Driver:
         theta: float,
         covariance: ArrayLike | None = None,
     ) -> None:
-        """Take odometry: the pose at t in the odometry's own frame [m, rad]; its differences are
-        used.
+        """Add odometry: the pose at t in the odometry's own frame [m, rad]; differences are used.
 
-        covariance: 3 × 3, of the motion since the last call, in the frame of its end.
+        covariance: 3 × 3, of the motion since the last call, in the frame of its end pose.
         """
         stamp_ns = measured.stamp_of(t, "odometry_pose")
         pose = measured.pose_of((x, y, theta), f"odometry_pose of {self.robot} at {t} s")
@@ -207,7 +201,7 @@ class Driver:
             if lasts_ns is not None and before is None:  # by speeds before, or a stream anew
                 self._begin_anew(stamp_ns - lasts_ns, stamp_ns)
             elif lasts_ns is not None and before is not None:
-                step = self._going_on(between(before, pose), lasts_ns, stamp_ns, pose)
+                step = self._bridge_reset(between(before, pose), lasts_ns, stamp_ns, pose)
                 self._odometer.judge(step, lasts_ns, "odometry_pose", stamp_ns)
                 told = self._increment(stamp_ns, lasts_ns, step, covariance)
             if not self._incarnation:
@@ -223,9 +217,9 @@ class Driver:
         bearings: ArrayLike,
         covariances: ArrayLike | None = None,
     ) -> None:
-        """Take landmarks seen at t: numbers, ranges [m] and bearings [rad] from the sensor's axis.
+        """Add a scan of landmarks at t: ids, ranges [m] and bearings [rad] from the sensor's axis.
 
-        covariances: of each its own 2 × 2 of (range, bearing); without: the sensor's.
+        covariances: L × 2 × 2 of (range, bearing); None: the sensor's noise.
         """
         stamp_ns = measured.stamp_of(t, "observe")
         seen = measured.observations(self.robot, stamp_ns, ids, (ranges, bearings), covariances)
@@ -239,10 +233,9 @@ class Driver:
         xy: ArrayLike,
         covariances: ArrayLike | None = None,
     ) -> None:
-        """Take landmarks seen at t: numbers, and points (ahead [m], left [m]) in the sensor's
-        frame.
+        """Add a scan of landmarks at t: ids and points (ahead [m], left [m]) in the sensor's frame.
 
-        covariances: of each its own 2 × 2; without: the sensor's noise of range and bearing.
+        covariances: L × 2 × 2; None: the sensor's noise of range and bearing.
         """
         stamp_ns = measured.stamp_of(t, "observe_points")
         seen = measured.points(self.robot, stamp_ns, ids, xy, covariances)
@@ -256,7 +249,7 @@ class Driver:
         bearings: ArrayLike,
         covariances: ArrayLike | None = None,
     ) -> None:
-        """Take one scan of landmarks without identities at t: ranges [m] and bearings [rad]."""
+        """Add a scan of landmarks without identities at t: ranges [m] and bearings [rad]."""
         stamp_ns = measured.stamp_of(t, "detect")
         seen = measured.detections(self.robot, stamp_ns, (ranges, bearings), covariances)
         self._see(j.OBSERVATIONS, seen)
@@ -264,51 +257,48 @@ class Driver:
     def sight(
         self, t: float | Decimal, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
     ) -> None:
-        """Take inter-robot measurements at t: teammates' names, ranges [m] and bearings [rad]."""
+        """Add inter-robot measurements at t: teammates' names, ranges [m] and bearings [rad]."""
         stamp_ns = measured.stamp_of(t, "sight")
         seen = measured.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
         self._see(j.SIGHTINGS, seen)
 
-    # What a program may want to know.
+    # State.
 
     @property
     def path(self) -> Path:
-        """The file that has all measurements."""
+        """The file of all measurements."""
         return self._journal.path
 
     @property
     def last_time(self) -> float | None:
-        """The newest time in the file [s]; None where nothing was measured."""
+        """The newest time in the file [s]; None: the file is empty."""
         return 1e-9 * self._journal.newest_ns if self._journal.incarnation else None
 
     @property
     def team_has_ended(self) -> bool:
-        """True once the team's final map is out or an operator has ended the team; nothing more is
-        taken.
-        """
+        """Whether the run is over: the final map is out, or an operator has ended the team."""
         return self._node.finished or self._node.ordered_to_end
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """(t, (x, y, theta)) of the robot in the team's frame, as last published by its process.
+        """(t, (x, y, theta)), the robot's last published pose in the team's frame.
 
-        None while the robot is not in the team's map: before it is joined, and once it has left
-        again, so that its pose in the team's frame is not known.
+        None while the robot is not joined to the team's map.
         """
         return self._node.team_pose
 
     @property
     def sensor_mount(self) -> tuple[float, float, float] | None:
-        """Where the robot's process has its sensor (x [m], y [m], yaw [rad]); None: not heard."""
+        """The sensor's pose on the robot (x [m], y [m], yaw [rad]); None: not yet announced."""
         models = self._node.models
         return None if models is None else models.sensor.mount
 
     def status(self) -> m.Status:
-        """The state of the stream: counts, who has received them, and problems."""
+        """The stream's state: counts, receivers' progress and problems."""
         return self._link.status()
 
     def tell(self, figures: Mapping[str, float], warnings: Iterable[str]) -> None:
-        """Figures and warnings of what feeds this driver; they are in its status from now on."""
+        """Add the figures and warnings of this driver's input to its status."""
         self._node.fed = dict(figures), tuple(warnings)
 
     # The end.
@@ -316,8 +306,7 @@ class Driver:
     def end(self, patience_s: float | None = None) -> bool:
         """End the stream and wait until the robot's process and a recorder have all of it.
 
-        Returns False if that took longer than patience_s. The file is complete then, too, and a
-        driver that is started again with it delivers the rest.
+        Returns False after patience_s; a driver started again with the file delivers the rest.
         """
         self._check_open()
         with self._lock:
@@ -341,9 +330,7 @@ class Driver:
         return True
 
     def close(self) -> None:
-        """Leave the team without ending the stream; a driver started with the same file continues
-        it.
-        """
+        """Leave the team; a driver started with the same file continues the stream."""
         if self._closed:
             return
         self._closed = True
@@ -353,21 +340,19 @@ class Driver:
         self._link.close()
         self._journal.close()
 
-    # How it is kept.
+    # The stream and its file.
 
     def _check_open(self) -> None:
         if self._closed:
             raise DriverError(f"the driver of {self.robot} is closed: make another one")
         if self._link.failure is not None:
             raise DriverError(
-                f"the driver of {self.robot} says nothing any more, {self._link.failure}: start it "
-                f"again; {self._journal.path} has what was measured"
+                f"the driver of {self.robot} has stopped, {self._link.failure}: start it again; "
+                f"all measurements are in {self._journal.path}"
             )
 
     def _resume(self, stamp_ns: int) -> None:
-        """After a start with an old file: whether the program repeats its calls or continues
-        them.
-        """
+        """Decide at the first call with an old file whether the program repeats or continues it."""
         self._check_open()
         if self.team_has_ended:
             raise DriverError(
@@ -389,9 +374,7 @@ class Driver:
         self._odometer.pose = self._journal.pose
 
     def _put(self, kind: int, stamp_ns: int, payload: bytes) -> None:
-        """Write to the file unless it is there already: a program may hand over everything
-        again.
-        """
+        """Append to the file, unless the program repeats a call that the file has."""
         if self._again is not None and self._again >= 0:
             calls = self._journal.calls
             if self._again < len(calls):
@@ -417,8 +400,8 @@ class Driver:
             if late_s > AWAY_S:
                 remedy = "all that a robot measures needs one clock"
             raise MeasurementError(
-                f"{self.robot} at {1e-9 * stamp_ns:.3f} s: it comes when there is something "
-                f"{late_s:.3f} s newer, and its turn is over: {remedy}"
+                f"{self.robot} at {1e-9 * stamp_ns:.3f} s: too late, measurements up to "
+                f"{late_s:.3f} s newer have been published: {remedy}"
             )
         self._journal.append(kind, stamp_ns, payload)
 
@@ -427,7 +410,7 @@ class Driver:
         self._put(kind, message.stamp_ns, encoded(named))
 
     def _begin(self, stamp_ns: int, *, known: bool) -> None:
-        """Begin the stream, or a further incarnation of it, at this time."""
+        """Begin the stream, or its next incarnation, at this time."""
         first = self._journal.first_incarnation
         self._incarnation = self._incarnation + 1 if self._incarnation else first
         pose, covariance = self._start if known else (b"", b"")
@@ -442,31 +425,29 @@ class Driver:
         self._put(j.START, stamp_ns, encoded(start))
 
     def _begin_anew(self, end_ns: int, stamp_ns: int) -> None:
-        """Begin a further incarnation: without odometry only landmarks tie it to the one before."""
+        """Begin the next incarnation, which only landmarks tie to the one before."""
         self._warn(
             f"gap{stamp_ns}",
             f"{self.robot}: no odometry from {1e-9 * end_ns:.3f} to {1e-9 * stamp_ns:.3f} s: its "
-            "stream begins anew at an unknown pose, and the landmarks have to place it; odometry "
-            "should cover all of the time",
+            "stream begins again at an unknown pose, which the landmarks have to determine; "
+            "odometry should cover all of the time",
         )
         self._begin(stamp_ns, known=False)
         self._odometer = Odometer(self.robot, self._bounds)
 
-    def _going_on(self, step: Pose, lasts_ns: int, stamp_ns: int, pose: Pose) -> Pose:
-        """The motion between two odometry poses; the one before goes on where they were reset."""
+    def _bridge_reset(self, step: Pose, lasts_ns: int, stamp_ns: int, pose: Pose) -> Pose:
+        """Replace the motion between two poses by the last motion if the odometry was reset."""
         if not self._odometer.was_reset(step, lasts_ns, pose):
             return step
         self._warn(
             f"reset{stamp_ns}",
             f"{self.robot}: the odometry's pose jumps by {np.hypot(*step[:2]):.1f} m at "
-            f"{1e-9 * stamp_ns:.3f} s: it was reset, and is taken to have moved on as before",
+            f"{1e-9 * stamp_ns:.3f} s: a reset; the robot is assumed to have moved as before",
         )
         return self._odometer.as_before(lasts_ns)
 
     def _head(self, stamp_ns: int) -> dict[str, Any]:
-        """The fields that every measurement has; incarnation and number are set when it is
-        ordered.
-        """
+        """Fields of every measurement; ordering sets incarnation and number."""
         return {"stamp_ns": stamp_ns, "robot": self.robot, "incarnation": 0, "number": 0}
 
     def _increment(
@@ -486,8 +467,9 @@ class Driver:
     def _until(
         self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
     ) -> int | None:
-        """Length of the interval that ends now; None where there is none: a gap is left that
-        `_drive` bridges, or a further incarnation is begun.
+        """The length of the interval that ends now [ns].
+
+        None: no interval; `_drive` bridges the gap, or the next incarnation begins.
         """
         self._resume(stamp_ns)
         end_ns = self._odometer.end_ns
@@ -495,8 +477,8 @@ class Driver:
         if end_ns is not None and away_ns > JUMP_S * 1e9:
             raise MeasurementError(
                 f"{call} of {self.robot} at {1e-9 * stamp_ns:.3f} s: {away_ns * 1e-9:.0f} s after "
-                f"the last odometry, {1e-9 * end_ns:.3f} s: that is another clock. Give all times "
-                "on one, in seconds; for a stream on the other give another file"
+                f"the last odometry, {1e-9 * end_ns:.3f} s: another clock. Use one clock for all "
+                "times, in seconds; use another file for a stream on another clock"
             )
         if length_ns is None and end_ns is not None and away_ns > longest_s * 1e9:
             if away_ns <= BRIDGE_S * 1e9:
@@ -508,9 +490,7 @@ class Driver:
     def _drive(
         self, stamp_ns: int, told: m.AnyOdometry | None, step: Pose, pose: Pose | None = None
     ) -> None:
-        """Write an odometry interval to the file, and the interval that bridges the gap before
-        it.
-        """
+        """Append an odometry interval to the file, after one that bridges the gap before it."""
         lasts_ns = 0 if told is None else told.duration_ns
         begin_ns = stamp_ns - lasts_ns
         gap_ns = self._odometer.gap_ns
@@ -522,15 +502,15 @@ class Driver:
             self._warn(
                 f"gap{begin_ns}",
                 f"{self.robot}: no odometry from {1e-9 * (begin_ns - gap_ns):.3f} to "
-                f"{1e-9 * begin_ns:.3f} s: it is taken to have gone on as before, which nobody "
-                "knows; odometry should cover all of the time",
+                f"{1e-9 * begin_ns:.3f} s: the robot is assumed to have moved as before, with a "
+                "large covariance; odometry should cover all of the time",
             )
             over, covariance = self._odometer.bridge()
             bridged = self._increment(begin_ns, gap_ns, over, np.reshape(covariance, (3, 3)))
             self._message(j.ODOMETRY, bridged)
         if told is not None:
             self._message(j.ODOMETRY, told)
-        self._odometer.taken(stamp_ns, step, lasts_ns, pose)
+        self._odometer.add(stamp_ns, step, lasts_ns, pose)
 
     def _see(self, kind: int, seen: m.Measurement) -> None:
         with self._lock:
@@ -541,8 +521,8 @@ class Driver:
             ahead_s = 0.0 if driven_ns is None else 1e-9 * (seen.stamp_ns - driven_ns)
             if ahead_s > AHEAD_S:
                 raise MeasurementError(
-                    f"{self.robot} saw something at {1e-9 * seen.stamp_ns:.3f} s, {ahead_s:.0f} s "
-                    "after its last odometry: both need one clock"
+                    f"{self.robot}: a detection at {1e-9 * seen.stamp_ns:.3f} s, {ahead_s:.0f} s "
+                    "after the last odometry: both need one clock"
                 )
             self._message(kind, seen)
 
@@ -555,8 +535,8 @@ class Driver:
         if len(ids) > 1 and not (ids[1:] > ids[:-1]).all():
             self._warn(
                 "order",
-                f"{self.robot}: ids are not ascending, or one occurs twice; they are taken as they "
-                "are: each has the range and bearing in its own place",
+                f"{self.robot}: ids are not ascending, or one occurs twice; each is used with the "
+                "range and bearing at its index",
             )
 
     def _warn(self, what: str, text: str) -> None:
@@ -568,7 +548,7 @@ class Driver:
 def _times(
     t: float | Decimal, duration: float | Decimal | None, call: str
 ) -> tuple[int, int | None]:
-    """The end and the length of an interval [ns]."""
+    """Convert the end and the length of an interval to [ns]."""
     length_ns = None if duration is None else measured.stamp_of(duration, "a duration")
     return measured.stamp_of(t, call), length_ns
 
@@ -576,7 +556,7 @@ def _times(
 def _start_of(
     robot: str, start: Sequence[float] | None, covariance: ArrayLike | None
 ) -> tuple[bytes, bytes]:
-    """The initial pose as the message has it."""
+    """Encode the initial pose and its covariance for the message."""
     if start is None:
         return b"", b""
     what = f"the start of {robot}"

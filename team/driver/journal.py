@@ -1,10 +1,9 @@
-"""A driver's file: holds every measurement, in order of arrival, before it is published.
+"""A driver's file of all measurements, in order of arrival, written before they are published.
 
-The file only grows. It begins with a head (MessagePack); a record is `<IBq`: the payload's length,
-its kind, its stamp [ns]; then the payload, an encoded measurement with number 0, and its CRC-32.
-A record that a crash has cut off is left out; a file that a crash has left empty, or with a part of
-its head, is begun anew. The numbers follow from the records by `Sorter`, so a driver that is
-started again goes on where it was.
+The file is append-only: a head (MessagePack), then records `<IBq` (payload length, kind, stamp
+[ns]), the payload (a measurement with number 0) and its CRC-32. An incomplete last record is
+removed; a file with an incomplete head is started again. `Sorter` reconstructs the numbers from the
+records, so a restarted driver continues its stream.
 """
 
 import fcntl
@@ -30,35 +29,35 @@ from team.wire import messages as m
 from team.wire.codec import decoded
 
 START, OBSERVATIONS, SIGHTINGS, ODOMETRY, MARK, POSE = range(6)
-"""Kinds of records; of equal stamps the smaller one comes first. The last two are no measurements:
-whether the stream goes on, and a pose in the odometry's frame, three floats.
+"""Kinds of records, in their order at equal stamps. MARK: state of the stream. POSE: a pose in the
+odometry's frame, three floats.
 """
 State = Literal["open", "left", "ended"]
 MAGIC = b"teamslam stream 1\n"
 OLD_S = 86_400.0
-"""A stream that is not delivered and has not grown for this long [s] is set aside: its next
-odometry would be refused as of another clock. Not where the wall clock was set meanwhile.
+"""An undelivered stream without measurements for this long [s] is set aside, since its next
+odometry would be refused; not if the wall clock was set meanwhile.
 """
 _HEAD = struct.Struct("<IBq")
 _CHECK = struct.Struct("<I")
 _POSE = struct.Struct("<3d")
 _LONGEST = 9
-"""Bytes of the longest number in a head."""
+"""Length of the longest number in a head [bytes]."""
 
 
 class JournalError(RuntimeError):
-    """A driver's file can not be used; the text says which, why and what to do."""
+    """A driver's file can not be used; the text names file, reason and remedy."""
 
 
 @dataclass
 class Journal:
-    """One robot's file, open for appending; `opened` makes it. Any thread may read.
+    """One robot's file, open for appending (`opened`). Any thread may read.
 
-    incarnation: the one in progress; 0 before anything was measured. state: of the stream, as in
-    its head. delivered: every receiver has all of it. calls: the offsets of all records but marks,
-    in order of arrival. driven_ns, pose: end of the last odometry interval, and the odometry pose.
-    cut: bytes behind the last whole record; is_damaged: they are no incomplete one. clock: the
-    wall clock at the last mark.
+    incarnation: the one in progress; 0: none. state: state of the stream, as in its head.
+    delivered: every receiver has all of it. calls: offsets of all records but marks, in order of
+    arrival. driven_ns, pose: end of the last odometry interval, and the odometry pose there. cut:
+    number of bytes behind the last whole record; is_damaged: they are no incomplete record. clock:
+    the wall clock at the last mark.
     """
 
     path: Path
@@ -109,12 +108,12 @@ class Journal:
         return os.pread(self._file, length, at + _HEAD.size)
 
     def too_late(self, stamp_ns: int, kind: int) -> bool:
-        """Whether a measurement behind this place has been numbered already."""
+        """Whether a measurement of a later place already has its number."""
         released = self._sorter.released
         return released is not None and (stamp_ns, kind) < released
 
     def append(self, kind: int, stamp_ns: int, payload: bytes) -> None:
-        """Write a record to the file, then number the measurements whose order is settled."""
+        """Append a record, then number the measurements whose order is final."""
         record = _HEAD.pack(len(payload), kind, stamp_ns) + payload
         record += _CHECK.pack(zlib.crc32(record))
         at = self._size
@@ -140,10 +139,9 @@ class Journal:
         incarnation: int | None = None,
         delivered: bool = False,
     ) -> None:
-        """Record the stream's state; all measurements that wait for their order are numbered.
+        """Append the stream's state and number all waiting measurements.
 
-        incarnation: number of the first incarnation of an empty file. delivered: every receiver has
-        all of the stream.
+        incarnation: number of the first incarnation of an empty file.
         """
         said = {
             "state": state,
@@ -187,11 +185,11 @@ class Journal:
 
     @property
     def next_incarnation(self) -> int:
-        """The number of the incarnation that begins next."""
+        """The number of the next incarnation."""
         return self.incarnation + 1 if self.incarnation else self.first_incarnation
 
     def read(self) -> None:
-        """Read the records of the file up to the first one that is not whole."""
+        """Read the records up to the first incomplete or damaged one."""
         at, end = self._size, os.fstat(self._file).st_size
         while at + _HEAD.size <= end:
             head = os.pread(self._file, _HEAD.size, at)
@@ -206,10 +204,9 @@ class Journal:
         self.cut, self._size = end - at, at
 
     def cut_off(self) -> str:
-        """Remove the bytes behind the last whole record; returns what was removed, in words.
+        """Remove the bytes behind the last whole record; returns a description.
 
-        A killed process leaves an incomplete record. Damage in the middle of the file is another
-        matter: a copy with what is behind it is kept.
+        A killed process leaves an incomplete record. After damage within the file a copy is kept.
         """
         if not self.cut:
             return ""
@@ -225,16 +222,16 @@ class Journal:
 
 
 def pose_payload(pose: tuple[float, float, float]) -> bytes:
-    """The payload of a pose in the odometry's frame."""
+    """Encode a pose in the odometry's frame."""
     return _POSE.pack(*pose)
 
 
 def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
-    """The robot's journal, opened for appending, and a description of what it contains.
+    """Open a robot's journal for appending; returns it with a description of its contents.
 
-    A stream that has ended and is delivered, or that has not grown for OLD_S, is moved aside; the
-    new one begins with the next incarnation number, so that the two are not confused. Raises
-    JournalError for a file of another robot or of no driver, or one that another driver has open.
+    A delivered stream, or one that has not grown for OLD_S, is moved aside; the new one begins with
+    the next incarnation number. Raises JournalError for a file of another robot or of no driver,
+    or one that another driver has open.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _locked(path, robot)
@@ -265,7 +262,7 @@ def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
 
 
 def _read_whole(journal: Journal) -> bool:
-    """Read an open file; False if nothing is in it. Raises JournalError for one of others."""
+    """Read an open file; returns False for an empty one. Raises JournalError."""
     found = _head_of(journal)
     if found is not None:
         journal.first_incarnation, journal._size = found
@@ -274,7 +271,7 @@ def _read_whole(journal: Journal) -> bool:
 
 
 def _first_after(aside: Path | None, robot: str) -> int:
-    """The first incarnation of a new file beside one that was set aside: they are not confused."""
+    """The first incarnation of a new file: the next one after those of the file set aside."""
     if aside is not None:
         with suppress(JournalError, OSError):
             earlier = _locked(aside, robot)
@@ -287,7 +284,7 @@ def _first_after(aside: Path | None, robot: str) -> int:
 
 
 def _begun(journal: Journal, latency_ns: int) -> Journal:
-    """A journal with its head, and nothing else."""
+    """Write the head of an empty journal."""
     head = MAGIC + msgpack.packb({"robot": journal.robot, "incarnation": journal.first_incarnation})
     os.ftruncate(journal._file, 0)
     journal._write(head, 0)
@@ -310,9 +307,9 @@ def _locked(path: Path, robot: str) -> Journal:
 
 
 def _head_of(journal: Journal) -> tuple[int, int] | None:
-    """The first incarnation of an open file, and the length of its head; None: nothing is in it.
+    """The first incarnation in a file's head, and the head's length; None: an empty file.
 
-    A crash leaves a file empty, or with a part of its head and zeros. Raises JournalError for a
+    A crash may leave a part of the head and zeros, which count as empty. Raises JournalError for a
     file of another robot or of no driver.
     """
     begin = os.pread(journal._file, 4096, 0)

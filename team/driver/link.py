@@ -1,4 +1,4 @@
-"""The driver's publishing thread: it connects to the router, and reconnects, until it is closed."""
+"""The driver's publishing thread: connect to the router, and reconnect, until closed."""
 
 import logging
 import threading
@@ -37,10 +37,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class Link:
-    """Runs a source's node on a bus of its own, through whatever the network does.
-
-    lock: held by whoever writes to the journal.
-    """
+    """Run a source's node on a bus of its own; lock: guards writes to the journal."""
 
     def __init__(
         self,
@@ -66,8 +63,9 @@ class Link:
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
 
     def open(self, patience_s: float) -> None:
-        """Start the thread; returns once the router is reached and raises the reason if it is
-        not; without patience returns at once, and the first reason is logged.
+        """Start the thread and wait for the router; raises BusError or KeysError after patience_s.
+
+        With patience_s = 0 it returns at once and logs the first failure.
         """
         self._unheard = not patience_s
         self._attempt_s = patience_s or ATTEMPT_S
@@ -86,12 +84,12 @@ class Link:
 
     @property
     def failure(self) -> str | None:
-        """The exception that ended the thread; None where it runs or was closed."""
+        """The exception that ended the thread, in words; None: running or closed."""
         failed = self._failure
         return None if failed is None else f"{type(failed).__name__}: {failed}"
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until something may have changed."""
+        """Wait for a change of the node's state, at most this long."""
         with self._moved:
             self._moved.wait(timeout_s)
 
@@ -104,14 +102,14 @@ class Link:
         return msgspec.structs.replace(status, warnings=warnings)
 
     def why_it_waits(self) -> str:
-        """What `end` waits for, and what the user can do."""
+        """Describe what `end` is waiting for, with the remedy."""
         if self._trouble is not None:
             return str(self._trouble)
         robot = self._node.journal.robot
         if ch.robot_node(robot) not in self._node.alive:
             return (
-                f"{robot} waits for its process, which is not there: start `teamslam robot`; "
-                f"{self._node.journal.path} keeps what was measured"
+                f"{robot} waits for its process, which is absent: start `teamslam robot`; all "
+                f"measurements are in {self._node.journal.path}"
             )
         return f"{robot} has {self._node.delivered[1]} measurements by now"
 
@@ -126,7 +124,7 @@ class Link:
                 self._unheard = False
                 self._trouble = error
                 self._leaving.wait(AGAIN_S)
-            except Exception as error:  # whoever hands over the next measurement is told
+            except Exception as error:  # the driver's next call raises it
                 self._trouble = self._failure = error
                 raise
 
@@ -137,7 +135,7 @@ class Link:
         connect = self._connect.replace("tcp/", "tls/", 1) if own else self._connect
         with ExitStack() as stack:
             bus = stack.enter_context(ZenohBus(self._team, connect, self._attempt_s, own))
-            self._be_the_only_one(bus)
+            self._claim_name(bus)
             shell = Shell(bus, self._node, self._name, self._leaving)
             own_ends = (ch.FINAL_MAP, ch.TEAM_FINAL)  # without a centre its own robot's
             shell.the_end = TheEnd(bus, self._name, own_ends, self._node.journal.robot)
@@ -148,11 +146,11 @@ class Link:
             bus.subscribe(ch.SET_SUMMARY, ch.robot_node(self._node.journal.robot))
             bus.watch_alive()
             shell.answer(ch.MEASUREMENTS, self._node.journal.robot, self._node.measurements)
-            self._hear(shell, bus)
+            self._check_progress(shell, bus)
             others = [] if self._node.alive else bus.other_teams()
             if others:
                 _LOG.warning(
-                    "%s: nobody of the team %s is at %s, but of %s: is it the right team?",
+                    "%s: no process of team %s is at %s, but of %s: is the team's name right?",
                     self._node.journal.robot, self._team, self._connect, ", ".join(others),
                 )  # fmt: skip
             shell.begin()
@@ -160,7 +158,8 @@ class Link:
             self._trouble, self._attempt_s = None, ATTEMPT_S
             self._serve(shell, bus)
 
-    def _be_the_only_one(self, bus: ZenohBus) -> None:
+    def _claim_name(self, bus: ZenohBus) -> None:
+        """Wait until no other driver of this robot is present; raises BusError after a while."""
         deadline = time.monotonic() + SECOND_PATIENCE_S
         while bus.is_alive(self._name):
             if time.monotonic() >= deadline or self._leaving.wait(0.5):
@@ -168,10 +167,8 @@ class Link:
                     f"another process is {self._name} in this team already: stop that one first"
                 )
 
-    def _hear(self, shell: Shell, bus: ZenohBus) -> None:
-        """Hear the robot's progress: one beyond this file's counts means that another file is in
-        use.
-        """
+    def _check_progress(self, shell: Shell, bus: ZenohBus) -> None:
+        """Compare the robot's progress with the file: more means that it had another file."""
         until = time.monotonic() + HEAR_S
         journal = self._node.journal
         self._node.listening = True
@@ -186,19 +183,19 @@ class Link:
             return
         if incarnation >= MOST_LIVES:
             self._node.warnings.append(
-                f"the team is at incarnation {incarnation} of {journal.robot}, and nobody takes a "
-                "later one: start the team's processes again"
+                f"the team is at incarnation {incarnation} of {journal.robot}, the last possible "
+                "one: start the team's processes again"
             )
         elif not journal.incarnation:
             with self._lock:
                 journal.mark("open", incarnation=incarnation + 1)
             self._node.warnings.append(
-                f"{journal.robot} had measured before, into another file: its stream begins anew"
+                f"{journal.robot} had another file before: its stream begins again"
             )
         else:
             self._node.warnings.append(
-                f"the team has measurements of {journal.robot} that {journal.path} has not: stop, "
-                "and start with the file that has them, or with an empty one"
+                f"the team has measurements of {journal.robot} that are not in {journal.path}: "
+                "stop, and start with the file that has them, or with an empty one"
             )
         _LOG.warning("%s", self._node.warnings[-1])
 

@@ -1,6 +1,4 @@
-"""Checks what a program passes to its driver, and makes messages of it that are not numbered
-yet.
-"""
+"""Check a program's measurements and convert them to messages without numbers."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -18,24 +16,24 @@ M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
 NAMED = "a small letter, then small letters, digits and _ (32 at most)"
 UNNAMED = 2**31
+"""Landmark ids from here on are reserved for landmarks without identity."""
 LARGEST_SIGMA_RAD = 0.5
 """A larger standard deviation of a bearing [rad] is probably in degrees."""
-"""Landmark numbers from here on are reserved for landmarks without identity."""
 
 
 class MeasurementError(ValueError):
-    """A value can not be a measurement of this robot; the text says which, where and what to do.
+    """A value can not be a measurement; the text names it, its place and the remedy.
 
-    Nothing of the call was taken.
+    The whole call is refused.
     """
 
 
 class DriverWarning(UserWarning):
-    """A value is taken as it is, but is probably a mistake."""
+    """A value is used, but is probably a mistake."""
 
 
 def stamp_of(t: float | Decimal, what: str) -> int:
-    """A time in seconds as whole nanoseconds; a Decimal keeps every digit of Unix time."""
+    """Convert a time [s] to [ns]; a Decimal keeps every digit of Unix time."""
     if isinstance(t, Decimal):
         return int((t * 10**9).to_integral_value())
     seconds = _number(t, f"the time of {what}")
@@ -47,12 +45,12 @@ def stamp_of(t: float | Decimal, what: str) -> int:
 
 
 def pair(forward: float, yaw_rate: float, what: str) -> tuple[float, float]:
-    """Speed [m/s] and yaw rate [rad/s]."""
+    """Check a speed [m/s] and a yaw rate [rad/s]."""
     return _number(forward, f"forward of {what}"), _number(yaw_rate, f"yaw_rate of {what}")
 
 
 def pose_of(pose: Sequence[float], what: str) -> tuple[float, float, float]:
-    """x, y and theta of a pose."""
+    """Check a pose (x [m], y [m], theta [rad])."""
     if len(pose) != 3:
         raise MeasurementError(f"{what}: a pose is (x [m], y [m], theta [rad]), got {pose!r}")
     x, y, theta = (_number(each, what) for each in pose)
@@ -66,7 +64,7 @@ def observations(
     polar: tuple[ArrayLike, ArrayLike],
     covariances: ArrayLike | None,
 ) -> m.Observations:
-    """Landmarks seen: numbers below 2³¹, (ranges [m], bearings [rad]); bearings are wrapped."""
+    """Build a scan of ids below 2³¹ and (ranges [m], bearings [rad]), which are wrapped."""
     what = f"observe at {1e-9 * stamp_ns:.3f} s"
     numbers = _numbers(ids, what)
     far, angles = _polar(polar, what, len(numbers))
@@ -88,7 +86,7 @@ def observations(
 def points(
     robot: str, stamp_ns: int, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None
 ) -> m.Points:
-    """Landmarks seen: numbers below 2³¹, and points (ahead [m], left [m])."""
+    """Build a scan of ids below 2³¹ and points (ahead [m], left [m])."""
     what = f"observe_points at {1e-9 * stamp_ns:.3f} s"
     numbers = _numbers(ids, what)
     positions = np.asarray(xy, dtype=np.float64)
@@ -114,7 +112,7 @@ def points(
 def detections(
     robot: str, stamp_ns: int, polar: tuple[ArrayLike, ArrayLike], covariances: ArrayLike | None
 ) -> m.Detections:
-    """Landmarks seen without identities: (ranges [m], bearings [rad])."""
+    """Build a scan without identities: (ranges [m], bearings [rad])."""
     what = f"detect at {1e-9 * stamp_ns:.3f} s"
     far, angles = _polar(polar, what, np.asarray(polar[0]).size)
     return sound(
@@ -134,7 +132,7 @@ def detections(
 def sightings(
     robot: str, stamp_ns: int, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
 ) -> m.Sightings:
-    """Teammates seen: their names, ranges [m], bearings [rad]."""
+    """Build inter-robot measurements: teammates' names, ranges [m], bearings [rad]."""
     what = f"sight at {1e-9 * stamp_ns:.3f} s"
     names = tuple(teammates)
     for name in names:
@@ -161,7 +159,7 @@ def sightings(
 
 
 def square(covariance: ArrayLike | None, what: str) -> bytes:
-    """A 3 × 3 covariance; empty where there is none."""
+    """Encode a 3 × 3 covariance; None: empty."""
     if covariance is None:
         return b""
     matrix = np.asarray(covariance, dtype=np.float64)
@@ -171,7 +169,7 @@ def square(covariance: ArrayLike | None, what: str) -> bytes:
 
 
 def _polar_blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
-    """As `_blocks`, of (range, bearing); a bearing's deviation is in radians."""
+    """Encode covariances of (range [m], bearing [rad])."""
     packed = _blocks(covariances, count, what)
     for sigma in np.sqrt(np.asarray(covariances)[:, 1, 1]).tolist() if packed else ():
         if sigma > LARGEST_SIGMA_RAD:
@@ -183,7 +181,7 @@ def _polar_blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes
 
 
 def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
-    """A covariance for each, packed; empty where they have none of their own."""
+    """Pack the covariances, (count, 2, 2); None: empty."""
     if covariances is None or not count:
         return b""
     blocks = np.asarray(covariances, dtype=np.float64)
@@ -211,7 +209,7 @@ def definite(covariances: np.ndarray, what: str) -> None:
 
 
 def sound(message: M, what: str) -> M:
-    """The message; raises MeasurementError where a receiver would refuse it."""
+    """Return the message; raise MeasurementError if a receiver would refuse it."""
     why = unsound(message)
     if why is not None:
         raise MeasurementError(f"{what}: {why.detail}")
@@ -284,7 +282,7 @@ def _wrapped(angles: np.ndarray, what: str) -> np.ndarray:
 
 
 def wrapped(angles: np.ndarray) -> np.ndarray:
-    """The angles in (−π, π]; those that are there already keep their bits."""
+    """Wrap angles to (−π, π]; angles within keep their bits."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     turned = np.where(turned == -np.pi, np.pi, turned)
     inside: np.ndarray = np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)

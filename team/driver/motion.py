@@ -1,4 +1,4 @@
-"""Turns odometry as it arrives into intervals that follow one another without a gap."""
+"""Convert odometry to consecutive intervals without gaps."""
 
 from dataclasses import dataclass, field
 
@@ -9,23 +9,21 @@ from team.driver.measured import MeasurementError, wrapped
 from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 TOLERANCE = 0.1
-"""An interval's start may differ from the last one's end by this share of it (clock jitter)."""
+"""Clock jitter: largest share of an interval between its start and the end of the last one."""
 LEAST_NS = 2_000_000
-"""… or by this."""
+"""Clock jitter that is always accepted."""
 UNMEASURED = (1.0, 0.5)
-"""Least standard deviation [m/s, rad/s] of a motion that was not measured; otherwise it is as large
-as the motion itself."""
+"""Least standard deviation [m/s, rad/s] of a bridged motion; otherwise that of its speed."""
 Pose = tuple[float, float, float]
 
 
 @dataclass
 class Odometer:
-    """The odometry so far: the end of its last interval, and the odometry pose there if given.
+    """State of the odometry: end of the last interval, and the odometry pose there if given.
 
-    speeds: of the last interval, ahead [m/s] and turning [rad/s]. gap_ns: time before
-    the last interval that no odometry covers, beyond clock jitter; 0: none. home: the first pose.
-    steps, fastest: the number of intervals and their highest speed [m/s]. rates: of the last one,
-    (ahead, left, turn) per second.
+    speeds: forward [m/s] and yaw rate [rad/s] of the last interval. gap_ns: time before the last
+    interval without odometry, beyond clock jitter. home: first pose. steps, fastest: number of
+    intervals and their highest speed [m/s]. rates: (ahead, left, turn) per second of the last one.
     """
 
     robot: str
@@ -40,9 +38,9 @@ class Odometer:
     rates: Pose = field(default=(0.0, 0.0, 0.0), init=False)
 
     def until(self, stamp_ns: int, duration_ns: int | None, call: str) -> int | None:
-        """How long an interval is that ends now; None for a first one that does not say it.
+        """The length [ns] of the interval that ends now; None: the first, without a duration.
 
-        It begins where the last one ended, as far as clocks go. Nothing changes before `taken`.
+        An interval begins where the last one ended, within clock jitter; `add` changes the state.
         """
         end_ns, what = self.end_ns, self._what(call, stamp_ns)
         self.gap_ns = 0
@@ -69,7 +67,7 @@ class Odometer:
         return duration_ns
 
     def judge(self, step: Pose, duration_ns: int, call: str, stamp_ns: int) -> None:
-        """Refuse a motion that no robot can make; step: (ahead [m], left [m], turn [rad])."""
+        """Refuse a motion (ahead [m], left [m], turn [rad]) beyond the robot's bounds."""
         seconds, what = 1e-9 * duration_ns, self._what(call, stamp_ns)
         speed, rate = float(np.hypot(step[0], step[1])) / seconds, abs(step[2]) / seconds
         if speed > self.bounds.speed_m_s:
@@ -83,8 +81,8 @@ class Odometer:
                 "radians, not in degrees (see bounds)"
             )
 
-    def taken(self, stamp_ns: int, step: Pose, duration_ns: int, pose: Pose | None) -> None:
-        """Note that the interval has been written to the file."""
+    def add(self, stamp_ns: int, step: Pose, duration_ns: int, pose: Pose | None) -> None:
+        """Add an interval that has been written to the file."""
         self.end_ns, self.pose = stamp_ns, pose
         self.home = self.home or pose
         if duration_ns:
@@ -95,8 +93,8 @@ class Odometer:
             self.speeds = step[0] * 1e9 / duration_ns, step[2] * 1e9 / duration_ns
 
     def was_reset(self, step: Pose, duration_ns: int, pose: Pose) -> bool:
-        """Whether odometry poses begin anew: the first pose again, faster than the robot ever was,
-        or a step that is RESET_TIMES as fast.
+        """Whether the odometry was reset: a jump back to its first pose, or a step RESET_TIMES as
+        fast as the fastest one.
         """
         way, usual_m = float(np.hypot(*step[:2])), max(self.fastest, USUAL_M_S) * duration_ns * 1e-9
         home = pose == self.home and way > 2.0 * usual_m
@@ -109,9 +107,9 @@ class Odometer:
         return self.rates[0] * seconds, self.rates[1] * seconds, self.rates[2] * seconds
 
     def bridge(self) -> tuple[Pose, list[float]]:
-        """The motion over the gap at the last speeds, with a large covariance.
+        """The motion over the gap at the last speeds, and its covariance (row-major, 3 × 3).
 
-        Standard deviations: of as much as the motion is, UNMEASURED at least, within half a turn.
+        Standard deviations equal the motion, at least UNMEASURED, at most half a turn.
         """
         seconds = 1e-9 * self.gap_ns
         (v, w), (least_v, least_w) = self.speeds, UNMEASURED
@@ -126,7 +124,7 @@ class Odometer:
 
 
 def between(before: Pose, after: Pose) -> Pose:
-    """A pose in the frame of the one before: (ahead, left, turn)."""
+    """Express a pose in the frame of the one before: (ahead, left, turn)."""
     dx, dy = after[0] - before[0], after[1] - before[1]
     c, s = float(np.cos(before[2])), float(np.sin(before[2]))
     turn = float(wrapped(np.array(after[2] - before[2])))

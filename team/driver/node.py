@@ -1,6 +1,6 @@
-"""The driver's node: publishes the file's measurements, answers requests and tracks the receivers.
+"""The driver's node: publish the file's measurements, answer requests, track the receivers.
 
-It is the source of one robot's stream, as a world is of all (`sim.publisher`). It reads no clock.
+It is the source of one robot's stream, as the world is of all streams (`sim.publisher`).
 """
 
 from dataclasses import dataclass, field
@@ -25,13 +25,13 @@ Stream = tuple[int, int]
 
 @dataclass
 class SourceNode:
-    """`begin`, then `publish` and `handle` again and again, until `finished`.
+    """Call `begin`, then `publish` and `handle` in turn until `finished`.
 
-    An incarnation begins on the wire when the robot has had all of the one before: it would drop
-    the rest of that. delivered, recorded: how far the robot and a recorder are by their own word.
-    done: incarnation, measurements and submaps of the robot's last word; joined: incarnation and
-    submaps that the centre has dealt with. concluded: without a centre, the robot has its own final
-    map; is_peer: it has a set of its own. models: those that the robot's process has announced.
+    An incarnation is published once the robot has consumed the one before, since it drops the rest
+    of that. delivered, recorded: progress reported by the robot and the recorder. done:
+    incarnation, measurements and submaps of the robot's `Done`. joined: incarnation and submaps
+    acknowledged by the centre. is_peer: the robot keeps a set of its own. concluded: it has its
+    final map. models: configuration announced by the robot's process.
     """
 
     journal: Journal
@@ -57,9 +57,9 @@ class SourceNode:
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
         self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
-        """Figures and warnings of what feeds the driver, as a ROS 2 robot's topics."""
+        """Figures and warnings of the driver's input, such as a ROS 2 robot's topics."""
         self.listening = True
-        """True until the team's earlier progress with this robot is known."""
+        """True until the robot's earlier progress has been received."""
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
@@ -72,19 +72,17 @@ class SourceNode:
         ch.TEAM_END,
         ch.FINAL_MAP,
     )
-    """Channels of this robot or of the team; besides, the heads of all drivers and the robot's
-    set.
-    """
+    """Channels of this robot or the team; the link adds all heads and the robot's set summary."""
 
     def begin(self) -> list[Outgoing]:
-        """Publish the stream's initial pose again for receivers that missed it, and its head."""
+        """Publish the stream's initial pose and its head, for receivers that missed them."""
         if not self._incarnation:
             return []
         start = self.journal.message(self._incarnation, 0)
         return [Outgoing(ch.START, self._robot, start), *self.head(again=True)]
 
     def publish(self) -> list[Outgoing]:
-        """The next measurements that credit allows, at most BATCH."""
+        """Publish the next measurements that credit allows, at most BATCH."""
         out: list[Outgoing] = []
         while len(out) < BATCH and self._has_credit and (number := self._next()) is not None:
             message = self.journal.message(self._incarnation, number)
@@ -93,7 +91,7 @@ class SourceNode:
         return out
 
     def _next(self) -> int | None:
-        """The number of the next measurement; a later incarnation begins when its turn has come."""
+        """The number of the next measurement; may begin the next incarnation."""
         if self._published < self.journal.count(self._incarnation):
             return self._published
         if self._incarnation == self.journal.incarnation:
@@ -114,7 +112,7 @@ class SourceNode:
         return "recorder" not in self.alive or self._published - recorded < CREDIT_RECORDER
 
     def head(self, *, again: bool = False) -> list[Outgoing]:
-        """The stream's head if it has changed; again: in any case."""
+        """Publish the stream's head if it has changed; again: in any case."""
         if not self._incarnation:
             return []
         last = self._incarnation == self.journal.incarnation
@@ -134,18 +132,18 @@ class SourceNode:
 
     @property
     def has_new_state(self) -> bool:
-        """True when the stream has ended or its driver leaves and this is not published yet."""
+        """Whether the end of the stream, or the driver's leaving, is not yet published."""
         return self._said is not None and self._said.state != self.journal.state
 
     @property
     def has_more(self) -> bool:
-        """True when there are measurements to publish and credit for them."""
+        """Whether there are measurements to publish and credit for them."""
         return self._has_credit and self._published < self.journal.count(self._incarnation)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true of this stream: it claims more than was numbered.
+        """The reason to refuse a message that claims more than was numbered; None: accepted.
 
-        The robot's own progress is excepted until it is known whether another file is in use.
+        The robot's first progress is accepted: it may belong to another file of the same robot.
         """
         refused = absurd(message)
         if refused is not None or not isinstance(message, m.Progress | m.Done):
@@ -162,7 +160,7 @@ class SourceNode:
         return None
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take progress, liveliness, orders, the final map; the answer is mostly empty."""
+        """Update the state by progress, liveliness, orders and the final map."""
         match message:
             case m.Progress() if message.robot != self._robot:
                 pass
@@ -186,22 +184,22 @@ class SourceNode:
                 self.is_peer = True
                 self.concluded |= isinstance(message, m.Concluded) and message.robot == self._robot
             case m.PoseEstimate() | m.Configuration():
-                self._hear_robot(message)
+                self._update_robot(message)
             case m.StreamHead() if message.robot != self._robot:
                 self._compare(message)
             case _:
                 pass
         return []
 
-    def _hear_robot(self, message: m.PoseEstimate | m.Configuration) -> None:
-        """Take what the robot's process says of itself."""
+    def _update_robot(self, message: m.PoseEstimate | m.Configuration) -> None:
+        """Keep the robot's pose or its announced configuration."""
         if isinstance(message, m.PoseEstimate):
             self.pose = message
         elif message.node == ch.robot_node(self._robot):
             self.models = _models(message)
 
     def _compare(self, head: m.StreamHead) -> None:
-        """Warns when two drivers' stamps differ by a day: the team needs one clock."""
+        """Warn if two drivers' stamps differ by more than a day: the team needs one clock."""
         if not self.journal.incarnation or head.robot in self._others:
             return
         apart_ns = self.journal.newest_ns - head.stamp_ns
@@ -215,7 +213,7 @@ class SourceNode:
             )
 
     def measurements(self, request: bytes) -> list[bytes]:
-        """The answer to `MeasurementsRequest`."""
+        """Answer a `MeasurementsRequest`."""
         requested = decoded(request, m.MeasurementsRequest)
         incarnation = requested.incarnation or self._incarnation
         if requested.robot != self._robot or incarnation not in self.journal.incarnations:
@@ -225,10 +223,10 @@ class SourceNode:
 
     @property
     def is_delivered(self) -> bool:
-        """True once nobody needs this driver any more, whoever fails.
+        """Whether the driver may leave: no process can request its measurements again.
 
-        The robot has consumed all measurements, the centre all of its submaps (a peer has the final
-        map), and a recorder, if present, has everything.
+        The robot has consumed all measurements, the centre has acknowledged all its submaps (a peer
+        has its final map), and a recorder, if present, has everything.
         """
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         incarnation, measurements, submaps = self.done
@@ -237,19 +235,19 @@ class SourceNode:
 
     @property
     def recorder_lacks(self) -> bool:
-        """True while a recorder is present and lacks measurements."""
+        """Whether a present recorder lacks measurements."""
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         return "recorder" in self.alive and self.recorded < newest
 
     @property
     def waits_for(self) -> str:
-        """The nodes that are needed and absent, in words; empty where none is."""
+        """The required nodes that are absent, in words; empty: none."""
         needed = [ch.robot_node(self._robot), *([] if self.is_peer else ["central"])]
         missing = [node for node in needed if node not in self.alive]
         return " and ".join(missing)
 
     def status(self) -> m.Status:
-        """The driver's status, for people."""
+        """The driver's status."""
         figures = {
             "measurements": float(self.journal.count(self.journal.incarnation)),
             "incarnation": float(self.journal.incarnation),
@@ -271,9 +269,7 @@ class SourceNode:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """Time [s] and pose of the robot in the team's frame, as it last published them; None
-        while it is not in the team's map.
-        """
+        """Time [s] and pose last published in the team's frame; None: the robot is not joined."""
         if self.pose is None or not self.pose.in_team_frame:
             return None
         x, y, theta = (float(v) for v in floats(self.pose.pose, "pose"))
@@ -281,7 +277,7 @@ class SourceNode:
 
 
 def _models(message: m.Configuration) -> RobotConfig | None:
-    """The models in a robot's announcement; None where it is not one of this version."""
+    """Decode the configuration in an announcement; None: of another version."""
     try:
         return msgspec.json.decode(message.configuration, type=RobotConfig)
     except (msgspec.MsgspecError, ValueError):

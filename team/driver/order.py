@@ -1,8 +1,8 @@
-"""Orders measurements as a source must: by stamp, landmarks before the odometry that ends there.
+"""Order measurements by stamp, landmarks before the odometry that ends at the same time.
 
-A camera's frame may arrive tens of milliseconds after the odometry of its time. So a measurement
-waits until one newer by `latency_ns` has arrived; then its place is known. Which number a
-measurement gets depends on the order of the calls alone, so it can be found again from a file.
+A camera's frame may arrive tens of milliseconds after the odometry of its time. A measurement is
+therefore held until one newer by `latency_ns` has arrived. Its number depends on the order of the
+calls alone and can be reconstructed from the file.
 """
 
 from heapq import heappop, heappush
@@ -12,7 +12,7 @@ Place = tuple[int, int]
 
 
 class Sorter:
-    """Collects items with their places and returns them in order."""
+    """Sort items by their places, with a bounded delay."""
 
     def __init__(self, latency_ns: int) -> None:
         self.latency_ns = latency_ns
@@ -20,10 +20,10 @@ class Sorter:
         self._arrived = 0
         self._newest_ns: int | None = None
         self.released: Place | None = None
-        """Place of the last returned item; nothing may be put before it."""
+        """Place of the last returned item; earlier places are closed."""
 
     def put(self, place: Place, item: int) -> list[int]:
-        """Take an item; returns the items whose place is settled now."""
+        """Add an item; return the items whose place is now final."""
         heappush(self._waiting, (place, self._arrived, item))
         self._arrived += 1
         newest_ns = place[0] if self._newest_ns is None else max(self._newest_ns, place[0])

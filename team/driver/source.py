@@ -7,13 +7,13 @@ from team.wire import messages as m
 from team.wire.codec import encoded
 
 CREDIT_MEASUREMENTS = 4096
-"""A source is at most this many measurements ahead of its robot, while that is present."""
+"""Most measurements that a source is ahead of its robot, while that is present."""
 CREDIT_RECORDER = 16384
-"""… and at most this many, over all robots of a world, ahead of a recorder that is present."""
+"""Most measurements, over all robots, that a source is ahead of a present recorder."""
 BATCH = 256
 """Measurements published between two checks of the inbox."""
 ANSWER = 8192
-"""Measurements in one answer to a query; further ones need a further query."""
+"""Most measurements in one answer to a query."""
 FIRST_INCARNATION = 1
 
 
@@ -25,9 +25,9 @@ def channel_of(measurement: m.Measurement) -> ch.Channel:
 def answered(
     requested: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
 ) -> list[bytes]:
-    """The answer to a query: of the `count` measurements that there are those asked for.
+    """Encode the requested ones of `count` measurements, at most ANSWER.
 
-    ANSWER at most; measurement: gives one by its number.
+    measurement: returns one by its number.
     """
     last = count - 1 if requested.last < 0 else min(requested.last, count - 1)
     last = min(last, requested.first + ANSWER - 1)

@@ -94,9 +94,9 @@ REFUSED = [
     (lambda r: r.observe(9.5, [1], [1.0], [0.0]), "give a latency_s above 0.50"),
     (
         lambda r: r.observe(-99.0, [1], [1.0], [0.0]),
-        "turn is over: all that a robot measures needs",
+        "have been published: all that a robot measures needs",
     ),
-    (lambda r: r.odometry(1.7e9, 0.1, 0.0), "that is another clock. Give all times on one"),
+    (lambda r: r.odometry(1.7e9, 0.1, 0.0), "another clock. Use one clock for all times"),
     (lambda r: r.observe(10.1, [1], [1.0], [0.0], [[[1.0, 2.0], [2.0, 1.0]]]), "leave covariances"),
     (lambda r: r.observe_points(10.1, [1], [[1.0, 0.0]], [[[1.0, 0.0], [0.5, 1.0]]]), "symmetric"),
     (lambda r: r.sight(10.1, ["r1"], [1.0], [0.0]), "can not see itself"),
@@ -167,7 +167,7 @@ def test_a_short_gap_is_bridged_by_a_motion_of_which_little_is_known(alone):
     robot = alone()
     robot.odometry(1.0, 0.0, 0.0)
     robot.odometry(1.1, 0.5, 0.0)
-    with pytest.warns(DriverWarning, match=r"no odometry from 1\.100 to 1\.700 s: it is taken"):
+    with pytest.warns(DriverWarning, match=r"no odometry from 1\.100 to 1\.700 s: the robot is"):
         robot.odometry(1.8, 0.5, 0.0, duration=0.1)
     _, first, bridge, last = messages(robot)
     assert isinstance(bridge, m.Increment)
@@ -177,7 +177,7 @@ def test_a_short_gap_is_bridged_by_a_motion_of_which_little_is_known(alone):
         [0.36, 0.36, 0.09]
     )
     assert (first.incarnation, last.incarnation) == (1, 1)
-    with pytest.warns(DriverWarning, match=r"no odometry from 1\.800 to 4\.800 s: it is taken"):
+    with pytest.warns(DriverWarning, match=r"no odometry from 1\.800 to 4\.800 s: the robot is"):
         robot.odometry(4.8, 0.5, 0.0)  # longer than one call covers, and still no stream anew
     *_, again = messages(robot)
     assert (again.incarnation, again.stamp_ns, again.duration_ns) == (1, 4 * S + 800_000_000, 3 * S)
@@ -188,7 +188,7 @@ def test_poses_that_begin_anew_are_no_motion_and_the_one_before_goes_on(alone, b
     robot = alone()
     for k in range(20):
         robot.odometry_pose(Decimal(k) / 10, 0.05 * k, 0.0, 0.0)
-    with pytest.warns(DriverWarning, match=r"odometry's pose jumps by [0-9.]+ m at 2\.000 s: it w"):
+    with pytest.warns(DriverWarning, match=r"odometry's pose jumps by [0-9.]+ m at 2\.000 s: a reset"):
         robot.odometry_pose(2.0, *back)
     robot.odometry_pose(2.1, back[0], back[1], back[2] + 0.01)
     *_, before, at, after = messages(robot)
@@ -391,7 +391,7 @@ def test_a_driver_of_a_team_that_is_not_there_names_those_that_are(tmp_path, cap
     with router() as endpoint:
         there = Driver("r1", team="lab", connect=endpoint, file=tmp_path / "a")
         mistaken = Driver("r2", team="lap", connect=endpoint, file=tmp_path / "b")
-        said = f"r2: nobody of the team lap is at {endpoint}, but of lab: is it the right team?"
+        said = f"r2: no process of team lap is at {endpoint}, but of lab: is the team's name right?"
         wait_until(lambda: said in caplog.text)
         status = CliRunner().invoke(
             app, ["status", "--team", "lap2", "--connect", endpoint, "--seconds", "0.5"]
