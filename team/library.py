@@ -1,10 +1,10 @@
-"""The estimators as a library: values in, values out, no process and no network.
+"""The estimators as a library of functions on arrays, without processes or network.
 
-`from team import …` gives every name listed here. Names and meanings are stable: a removal or
-change is announced in the changelog one version before.
+`from team import …` provides every name listed here. The changelog announces a change of a name or
+its meaning one version ahead.
 
-All poses are (x [m], y [m], theta [rad]), theta counter-clockwise in (−π, π]. Landmarks are points
-with numbers, measured by range [m] and bearing [rad].
+Poses are (x [m], y [m], theta [rad]), theta counter-clockwise in (−π, π]. Landmarks are points with
+ids, measured by range [m] and bearing [rad].
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -75,16 +75,16 @@ __all__ = [
 ]
 
 _INCARNATION = 1
-"""Of every stream here: an array has one life."""
+"""Incarnation of every stream here."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Keyframe:
-    """The motion since the last keyframe, and the landmarks that were measured at its end.
+    """The motion since the last keyframe, and the landmarks measured at its end.
 
-    increment: of the odometry (`increment_of`, `Increment.then`).
-    ids:       numbers of the n landmarks; one may occur twice.
-    ranges:    [m], bearings: [rad], as the sensor reported them.
+    increment: odometry (`increment_of`, `Increment.then`).
+    ids:       ids of the n landmarks; one may occur twice.
+    ranges:    [m], bearings: [rad], as reported by the sensor.
     """
 
     increment: Increment
@@ -93,7 +93,7 @@ class Keyframe:
     bearings: Float[np.ndarray, " n"]
 
     def calibrated(self, sensor: Sensor) -> "Keyframe":
-        """The measurements within the sensor's limits, with its calibration applied."""
+        """Apply the sensor's calibration and drop measurements outside its limits."""
         valid, ranges, bearings = scanned(sensor, self.ranges, self.bearings)
         ranges, bearings = ranges[valid], bearings[valid]
         return Keyframe(
@@ -103,10 +103,7 @@ class Keyframe:
 
 @dataclass(frozen=True, kw_only=True)
 class InitialPose:
-    """Where a robot begins in the common frame: exactly (covariance None) or N(pose, covariance).
-
-    The covariance is of (x [m], y [m], theta [rad]).
-    """
+    """A robot's first pose in the common frame: N(pose, covariance); covariance None: exact."""
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"] | None = None
@@ -117,9 +114,9 @@ class JoinedMap:
     """The team's map.
 
     landmarks:    means and joint covariance in the common frame.
-    trajectories: of each robot in that frame the poses at which its submaps end.
-    chi2, dof:    how well the submaps agree: chi2/dof is about 1 where the models are right.
-    apart:        why a robot's submaps are not in the map, by robot.
+    trajectories: each robot's poses at the ends of its submaps, in that frame.
+    chi2, dof:    agreement of the submaps: chi2/dof is about 1 for right models.
+    apart:        robots whose submaps are not in the map, each with the reason.
     """
 
     landmarks: LandmarkMap
@@ -134,9 +131,9 @@ class BatchMap:
     """The least-squares solution over all measurements at once: the batch reference.
 
     landmarks:    means and joint covariance in the common frame.
-    trajectories: each robot's pose at its start and at each of its keyframes.
-    chi2, dof:    of all measurements: chi2/dof is about 1 where the models are right.
-    converged:    False where the iterations ended before the solution was reached.
+    trajectories: each robot's poses at its start and at its keyframes.
+    chi2, dof:    fit of all measurements: chi2/dof is about 1 for right models.
+    converged:    whether the iterations reached the solution.
     """
 
     landmarks: LandmarkMap
@@ -155,10 +152,10 @@ def fastslam_step(
     proposal: Proposal = "fastslam2",
     resample_below: float = 0.5,
 ) -> tuple[Particles, StepInfo]:
-    """One step of FastSLAM: the particles after a keyframe.
+    """Advance the particles by one keyframe of FastSLAM.
 
-    They are resampled first where their effective number is below `resample_below` of all.
-    proposal: "fastslam2" draws poses given the measurements, "fastslam1" by the odometry alone.
+    They are resampled first if their effective number is below `resample_below` times their number.
+    proposal: "fastslam2" draws poses given the measurements, "fastslam1" from the odometry alone.
     Raises NotACovarianceError if the increment's covariance is not positive semi-definite.
     Montemerlo 2003; Thrun et al. 2005, chapter 13.
     """
@@ -182,12 +179,11 @@ def submap_of(
     generator: np.random.Generator,
     front_end: FrontEnd | None = None,
 ) -> LocalMap:
-    """One window of Hybrid-SLAM: the Gaussian over (end pose, landmarks) that its particles become.
+    """Run one window of Hybrid-SLAM; returns the Gaussian over (end pose, landmarks).
 
-    Its frame is the pose at which the first keyframe's motion begins; that pose is exactly zero.
-    The submap depends on its arguments alone, so submaps of consecutive windows are independent.
-    front_end: number of particles and more; its rules on when a window ends are not used here.
-    Raises NotACovarianceError where the window has no sound Gaussian.
+    The frame is the pose at which the first keyframe's motion begins. The submap depends on its
+    arguments alone, so submaps of consecutive windows are independent. front_end: its rules for
+    closing a window are not used. Raises NotACovarianceError for a degenerate window.
     Brooks and Bailey 2009, HybridSLAM.
     """
     window = windows.opened(front_end or FrontEnd(), sensor)
@@ -204,12 +200,12 @@ def join(
     initial_poses: Mapping[str, InitialPose],
     settings: JoinSettings | None = None,
 ) -> JoinedMap:
-    """The team's map of each robot's consecutive submaps, by sparse nonlinear least squares.
+    """Join each robot's consecutive submaps to the team's map by sparse nonlinear least squares.
 
-    Each submap of a robot begins where its last one ended. initial_poses: of the robots of which it
-    is known; without any, the first robot's is the common frame. A robot without one is tied by
-    landmarks that it shares with the others; where these do not suffice, `apart` says why.
-    Raises ValueError without submaps, or for an initial pose of a robot that has none.
+    Each submap of a robot begins where its last one ended. initial_poses: known ones; without any,
+    the first robot's is the common frame. A robot without one is joined by landmarks that it shares
+    with the others; where these do not suffice, `apart` has the reason. Raises ValueError without
+    submaps, or for an initial pose of a robot without submaps.
     """
     unknown = sorted(set(initial_poses) - set(submaps))
     if unknown or not any(submaps.values()):
@@ -238,7 +234,7 @@ def join(
 
 
 def _ticks(submaps: Mapping[str, Sequence[LocalMap]]) -> Iterator[list[Contribution]]:
-    """The first submaps of all robots, then the second ones, and so on."""
+    """Yield the first submaps of all robots, then the second ones, and so on."""
     robots = sorted(submaps)
     for sequence, row in enumerate(zip_longest(*(submaps[robot] for robot in robots))):
         yield [
@@ -262,10 +258,10 @@ def batch_map(
     *,
     robust_c: float | None = None,
 ) -> BatchMap:
-    """All poses of all robots and one map, by least squares over every measurement.
+    """Estimate all poses and one map by least squares over every measurement.
 
-    robust_c: Cauchy's scale on √χ² of a landmark's measurement; None for plain least squares.
-    Each robot needs an initial pose. Raises ValueError for one that has none.
+    robust_c: scale of the Cauchy loss on √χ² of a landmark measurement; None: plain least squares.
+    Raises ValueError for a robot without an initial pose.
     Dellaert and Kaess 2006, Square root SAM.
     """
     solve = loaded("sim.studies.batch_map:solved_map", "batch_map")
@@ -273,19 +269,18 @@ def batch_map(
 
 
 def submap_in(payload: bytes) -> tuple[str, int, LocalMap]:
-    """(robot, sequence, submap) of a message on a key `team/…/robot/…/submap`, as it was received.
+    """Decode (robot, sequence, submap) from a message on a key `team/…/robot/…/submap`.
 
-    Raises WireError, with the reason, for bytes that are no sound submap.
+    Raises WireError with the reason for any other bytes.
     """
     message = decoded(payload, m.Submap)
     return message.robot, message.sequence, translate.local_map_of(message)
 
 
 def submaps_in(log: Log | Path | str) -> dict[str, list[LocalMap]]:
-    """Each robot's submaps in their order, from a log of a run.
+    """Read each robot's submaps in their order from a log: those of its first incarnation.
 
-    Of a robot whose stream began anew, those of its first incarnation. Raises LogError for a file
-    that is no log.
+    Raises LogError for a file that is no log.
     """
     opened = log if isinstance(log, Log) else open_log(log)
     found: dict[str, dict[int, LocalMap]] = {}
