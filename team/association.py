@@ -1,4 +1,4 @@
-"""The thresholds of data association between submaps: one profile for each kind of sensor."""
+"""Thresholds of data association between submaps, one profile for each kind of sensor."""
 
 from math import hypot
 from typing import Annotated
@@ -12,60 +12,66 @@ Few = Annotated[int, Meta(ge=1, le=1000)]
 
 
 class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Thresholds by which landmarks without identities are merged; lengths in metres.
+    """Thresholds for merging landmarks without identities; lengths in metres.
 
-    gate: χ² (2 numbers) beyond which two are not one. slack: what two submaps' places of one
-    landmark differ by beside their covariance. density: λ, landmarks to be expected per square
-    metre. llr_tight, llr_loose: the log-likelihood ratio that a pair needs where the standard
-    deviation of its difference is below `tight`, and elsewhere. odds: how much more it needs than
-    its best rival. near: up to this standard deviation old landmarks are candidates without a
-    closure. same: two landmarks nearer than this may be one that was split. recent: so many last
-    submaps of a robot are followed by tracking, and are the patch for which a closure is searched.
-    absent: the cost of a landmark that one side has and the other, which observed its place, has
-    not: −ln of the probability of that. closure_pairs, closure_llr, margin, ratio: what a closure
-    needs: pairs, evidence (the sum of their log-likelihood ratios less what is absent), how much
-    more and how many times the evidence of the best other alignment. island_pairs, island_llr: the
-    same between robots with unknown initial poses. context: least number of landmarks of both sides
-    outside the matched place, relative to the pairs; with fewer it is unknown whether the place is
-    unique. share: of the landmarks of either side near the matched places (of the side that has
-    fewer), how many are matched. A closure whose share falls below undone_below within `audited`
-    ticks is undone.
+    LLR: log-likelihood ratio of one landmark against two.
     """
 
     gate: Positive = 13.8
+    """χ² of 2 degrees of freedom beyond which two landmarks are not one."""
     slack: NonNegative = 0.03
+    """Difference between two submaps' positions of one landmark beside their covariance."""
     density: Positive = 0.5
+    """Expected landmarks per square metre, λ."""
     llr_tight: float = 1.0
+    """LLR required of a pair whose difference has a standard deviation below `tight`."""
     llr_loose: float = 8.0
+    """LLR required of any other pair."""
     odds: NonNegative = 4.0
+    """LLR required beyond that of the best rival."""
     tight: Positive = 0.15
     near: Positive = 0.35
+    """Largest standard deviation for which old landmarks are candidates without a closure."""
     same: Positive = 0.5
+    """Largest distance of two landmarks that may be one that was split."""
     recent: Few = 6
+    """Number of a robot's last submaps that are tracked and searched for closures."""
     absent: NonNegative = 1.5
+    """Cost of a landmark that the other side lacks although it observed the place: −ln of the
+    probability."""
     closure_pairs: Few = 10
+    """Fewest pairs of a closure."""
     closure_llr: float = 25.0
+    """Least evidence of a closure: the sum of the pairs' LLR less the cost of absent landmarks."""
     margin: NonNegative = 10.0
+    """Least evidence beyond that of the best other alignment."""
     ratio: Annotated[float, Meta(ge=1.0)] = 1.5
+    """Least evidence relative to that of the best other alignment."""
     island_pairs: Few = 8
+    """closure_pairs between robots with unknown initial poses."""
     island_llr: float = 15.0
+    """closure_llr between robots with unknown initial poses."""
     context: NonNegative = 2.0
+    """Fewest landmarks outside the matched place, relative to the pairs; with fewer the place may
+    not be unique."""
     share: Share = 0.7
+    """Least share of matched landmarks near the matched places, on the side with fewer."""
     undone_below: Share = 0.5
+    """A closure whose share falls below this within `audited` ticks is undone."""
     audited: Annotated[int, Meta(ge=0, le=1000)] = 12
 
 
 DEFAULT_PROFILE = AssociationProfile()
 
 SCALE_M = 0.03
-"""The sensor error [m] of the default profile at the far end of its view."""
+"""Sensor error [m] of the default profile at the far end of its view."""
 
 
 def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:
-    """The default profile in the lengths of a sensor: times its error at the far end of its view.
+    """Scale the lengths of the default profile by a sensor's error at the far end of its view.
 
-    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m; in units of it the sensors that the
-    default thresholds were found with, and simulated ones, need the same thresholds.
+    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m. In units of it all sensors need the
+    same thresholds.
     """
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)

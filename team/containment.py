@@ -1,10 +1,9 @@
-"""The fault boundary around a node: a message whose handling raises an exception is set aside and
-named.
+"""The fault boundary around a node sets messages aside whose handling raises.
 
-Every shell, a team in memory and a rerun hand messages to their nodes through it, so what a node
-makes of a log does not depend on who runs it. A message that raised is recorded as `Fault`,
-counted, and not handled again when it is delivered once more; the node goes on with what its
-`set_aside` returns. What is not an `Exception` (an interrupt, an exit) ends the process.
+Shells, teams in memory and reruns pass messages to their nodes through it, so all of them have the
+same results. A message that raised is published as `Fault`, counted, and ignored when it is
+delivered again; the node continues with the messages of its `set_aside`. An interrupt or an exit
+ends the process.
 """
 
 import hashlib
@@ -24,52 +23,51 @@ from team.wire.text import cut, one_line
 
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000
-"""Most attempts of a node to continue behind one message, where it raises again and again."""
+"""Most attempts of a node to continue after one message."""
 LONGEST_TEXT = 1000
-"""Characters of an exception's text, or of a key, that are kept."""
+"""Longest text of an exception or a key in a fault [characters]."""
 _OURS = ("team.", "central.", "sim.")
 
 
 @runtime_checkable
 class Handler(Protocol):
-    """Anything that handles messages."""
+    """A handler of messages."""
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take one message."""
+        """Handle one message; returns the answers."""
 
 
 @runtime_checkable
 class TakesSamples(Protocol):
-    """A handler that also needs the encoded bytes of a message, as it may forward them."""
+    """A handler that needs the encoded bytes, too, to forward them."""
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        """Take one message, as `handle`."""
+        """Handle one message, as `handle` does."""
 
 
 @runtime_checkable
 class Guarded(Protocol):
-    """A handler that knows which messages can not be true of its team."""
+    """A handler that refuses messages that contradict its team."""
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why it does not take a message, in words; None where it does."""
+        """The reason to refuse a message; None: accepted."""
 
 
 @runtime_checkable
 class Recovers(Protocol):
-    """A handler that can continue behind a message whose handling raised."""
+    """A handler that can recover after an exception in `handle`."""
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """The messages in place of its answer: those that others wait for, and those prepared
-        before.
-        """
+        """Return the messages that replace the answer, such as the sender's credit."""
 
 
 @dataclass
 class Boundary:
-    """Hands messages to one node; counts the messages refused on arrival and those that raised.
+    """Pass messages to one node, and count refused messages and exceptions.
 
-    name: the node. faults: handlings that raised. refused: invalid messages. last, last_refused:
-    the newest of each, in words. aside: messages that are not handled again, by key and payload.
+    name: name of the node. faults: number of exceptions. refused: number of refused messages. last,
+    last_refused: description of the newest of each. aside: messages that are not handled again, by
+    key and digest.
     """
 
     name: str
@@ -80,24 +78,24 @@ class Boundary:
     aside: set[tuple[str, bytes]] = field(default_factory=set)
 
     def take(self, node: Handler, sample: Sample) -> list[Outgoing]:
-        """Decode a sample, hand the message to the node and return its answer."""
+        """Decode a sample and let the node handle it; returns the answers."""
         message = self.let_in(sample, lambda: opened(sample)[2])
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
     def take_reply(
         self, node: Handler, key: str, payload: bytes, expected: type[m.Message]
     ) -> list[Outgoing]:
-        """As `take`, of a reply to a question on `key`, which must be of the expected kind."""
+        """Handle a reply to a query on `key`, which must be of the expected type."""
         sample = reply_sample(key, payload)
         message = self.let_in(sample, lambda: reply_of(payload, expected))
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
     def give(self, node: Handler, message: m.Message) -> list[Outgoing]:
-        """As `take`, of a message that came in before: a log's."""
+        """Let the node handle a decoded message, such as a log's."""
         return self.hand(node, message)
 
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
-        """The valid message of a sample; otherwise what to publish: nothing, or a fault."""
+        """Decode a sample; returns its message, or the messages to publish if it is invalid."""
         try:
             return open_()
         except WireError as error:
@@ -109,10 +107,9 @@ class Boundary:
     def hand(
         self, node: Handler, message: m.Message, sample: Sample | None = None
     ) -> list[Outgoing]:
-        """Hand a message to the node; returns its answer, or the fault and what the node
-        continues with.
+        """Let the node handle a message; returns the answers, or the fault and the replacement.
 
-        sample: as which it arrived; without one it is encoded only where somebody looks at it.
+        sample: the message as it arrived; None: it is encoded only if its bytes are needed.
         """
         if self.aside and _name(sample or _sample_of(message)) in self.aside:
             return []
@@ -130,7 +127,7 @@ class Boundary:
     def _set_aside(
         self, node: Handler, message: m.Message, sample: Sample, error: Exception
     ) -> list[Outgoing]:
-        """The fault of a message whose handling raised, and what the node continues with."""
+        """The fault of an exception, and the node's messages in place of its answer."""
         tag = m.tag_of(type(message))
         out = [self.note(error, sample, tag)]
         self.aside.add(_name(sample))
@@ -142,13 +139,13 @@ class Boundary:
         return out
 
     def refuse(self, sample: Sample, why: str) -> None:
-        """Count and log a message that is refused."""
+        """Count and log a refused message."""
         self.refused += 1
         self.last_refused = one_line(f"{cut(sample.key, 80)}: {cut(why, 200)}")
         LOG.warning("%s: dropped %s (%d so far)", self.name, self.last_refused, self.refused)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
-        """Count and log a fault; returns its message. Raises KeyboardInterrupt again."""
+        """Count and log a fault; returns its message. Re-raises KeyboardInterrupt."""
         if _is_interrupt(error):
             raise KeyboardInterrupt from error
         self.faults += 1
@@ -178,7 +175,7 @@ class Boundary:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was refused and set aside, in words, for a status."""
+        """Numbers of refused messages and faults, in words, for the status."""
         dropped = f"{self.refused} dropped at the door, the last: {self.last_refused}"
         raised = f"{self.faults} set aside after a fault, the last: {self.last}"
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
@@ -195,7 +192,7 @@ def _guarded(kind: type) -> bool:
 
 
 def reply_sample(key: str, payload: bytes) -> Sample:
-    """A reply as a sample: it has neither stamp nor counter."""
+    """Convert a reply to a sample without stamp and counter."""
     return Sample(key, payload, 0, 0, -1)
 
 
@@ -204,7 +201,7 @@ def _sample_of(message: m.Message) -> Sample:
 
 
 def reply_of(payload: bytes, expected: type[M]) -> M:
-    """The message of a reply; raises WireError if it is invalid or of another kind."""
+    """Decode a reply; raises WireError if it is invalid or of another type."""
     message: m.Message = decoded(payload)
     if not isinstance(message, expected):
         expected_tag = expected.__name__
@@ -213,7 +210,7 @@ def reply_of(payload: bytes, expected: type[M]) -> M:
 
 
 def place_of(trace: TracebackType | None) -> str:
-    """module:function:line of the innermost frame of this program; of all frames if none is."""
+    """Return module:function:line of the innermost frame of our packages, else of all frames."""
     frames = [(f.f_globals.get("__name__", "?"), f.f_code.co_qualname, line)
               for f, line in traceback.walk_tb(trace)]  # fmt: skip
     ours = [frame for frame in frames if f"{frame[0]}.".startswith(_OURS)]
@@ -222,7 +219,7 @@ def place_of(trace: TracebackType | None) -> str:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether an interrupt is behind an exception: within a compiled kernel it is a SystemError."""
+    """Whether an interrupt caused an exception; a compiled kernel raises SystemError for it."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

@@ -1,9 +1,9 @@
-"""Refuses messages that are valid in themselves and can not be true of this team.
+"""Refuse messages that are valid but contradict the team.
 
-A stranger, or a broken robot, may name unknown robots, incarnations and counters that can not be
-reached, stamps that are years away. A node gives the reason by `refusal`; the boundary
-(`team.containment`) counts it and names it in the node's status; the recorder keeps everything.
-Every bound is far beyond what a team does, so that no order of arrival makes a true message fail.
+A stranger or a broken robot may send unknown robots, unreachable incarnations and counters, or
+stamps that are years off. The boundary (`team.containment`) counts the reason and shows it in the
+node's status; the recorder keeps every message. The bounds are so wide that no order of arrival
+makes a true message fail.
 """
 
 from collections.abc import Iterable, Iterator
@@ -11,32 +11,32 @@ from collections.abc import Iterable, Iterator
 from team.wire import messages as m
 
 MOST_LIVES = 1_000
-"""Most incarnations of a stream; each begins because the source has lost requested measurements."""
+"""Most incarnations of a stream."""
 MOST_COUNT = 2**40
-"""Largest value of any counter; at 100 Hz it is reached after 348 years."""
+"""Largest counter: 348 years at 100 Hz."""
 EARLY_NS = 86_400 * 10**9
 LATE_NS = 400 * EARLY_NS
-"""A stream's messages lie within a day before and 400 days after its initial pose's stamp."""
+"""Stamps of a stream lie from EARLY_NS before to LATE_NS after that of its initial pose."""
 OF_ROBOTS = (
     m.Measurement, m.Submap, m.SightingFactor, m.MapEstimate, m.Progress, m.Done, m.Rendezvous,
     m.Innovation, m.Association, m.StreamHead,
 )  # fmt: skip
-"""Messages about a stream: they have its robot and its incarnation."""
+"""Messages of a stream, with robot and incarnation."""
 
 
 class Door:
-    """Knows the team's robots, and when each stream began according to its source."""
+    """The team's robots, and the start time of each stream."""
 
     def __init__(self, robots: Iterable[str]) -> None:
         self._robots = frozenset(robots)
         self._began: dict[tuple[str, int], int | None] = {}
 
     def admit(self, robot: str) -> None:
-        """From now on the robot is in the team."""
+        """Add a robot to the team."""
         self._robots |= {robot}
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why the message can not be true of this team, in words; None if it can."""
+        """The reason to refuse a message; None: accepted."""
         strangers = sorted(set(_robots(message)) - self._robots)
         if strangers:
             return f"of {', '.join(strangers)}, not in this team"
@@ -46,9 +46,9 @@ class Door:
         return refused or self._another_time(message)
 
     def _note_beginning(self, start: m.InitialPose) -> None:
-        """Note when a stream begins; one that two messages begin at two times has no bounds.
+        """Store a stream's start time; two contradicting ones remove the stream's bounds.
 
-        One of the two is a stranger's, and its source's own messages must pass.
+        One of the two is forged, and the messages of the true source must be accepted.
         """
         stream = (start.robot, start.incarnation)
         known = self._began.setdefault(stream, start.stamp_ns)
@@ -63,7 +63,7 @@ class Door:
 
 
 def another_time(stamp_ns: int, began_ns: int) -> str | None:
-    """Why a stamp can not be of a stream that began at this time, in words."""
+    """The reason to refuse a stamp of a stream that began at this time; None: accepted."""
     after_ns = stamp_ns - began_ns
     if -EARLY_NS <= after_ns <= LATE_NS:
         return None
@@ -71,18 +71,18 @@ def another_time(stamp_ns: int, began_ns: int) -> str | None:
 
 
 def absurd(message: m.Message) -> str | None:
-    """Why a count is absurd, in words."""
+    """The reason to refuse a message with an unreachable count; None: accepted."""
     for incarnation in _lives(message):
         if incarnation > MOST_LIVES:
             return f"of incarnation {incarnation}; no stream has more than {MOST_LIVES}"
     for count in _counts(message):
         if count > MOST_COUNT:
-            return f"counts to {count}; nobody has come further than {MOST_COUNT}"
+            return f"counts to {count}; {MOST_COUNT} at most"
     return None
 
 
 def _robots(message: m.Message) -> Iterator[str]:
-    """The robots that a message names as the team's."""
+    """The robots that a message claims for the team."""
     match message:
         case m.SightingFactor():
             yield from (message.robot, message.teammate)

@@ -1,4 +1,4 @@
-"""Requests the measurements that a node lacks from their source."""
+"""Request missing measurements from their source."""
 
 import logging
 import time
@@ -13,15 +13,16 @@ from team.wire.bus import BusError
 from team.wire.codec import WireError
 
 PATIENCE_S = 0.5
-"""A gap has this long [s] to close before it is asked for."""
+"""Time [s] for which a gap may stay open before it is requested."""
 ASK_TIMEOUT_S = 10.0
-"""A source that does not answer within this time is asked again later."""
+"""Longest time [s] for an answer; the request is repeated later."""
 _LOG = logging.getLogger("teamslam")
 
 
 class MissingMeasurements:
-    """Requests missing measurements for one node, whose shell takes the answers; call `look`
-    often. confirm: is given each measurement of an answer before the node.
+    """Request missing measurements for one node; call `look` periodically.
+
+    confirm: called with each measurement of an answer before the node handles it.
     """
 
     def __init__(
@@ -32,7 +33,7 @@ class MissingMeasurements:
         self._since_s: float | None = None
 
     def look(self, requested: Sequence[m.MeasurementsRequest]) -> None:
-        """Send the requests, once any has been open for PATIENCE_S."""
+        """Send the requests once one has been open for PATIENCE_S."""
         now_s = time.monotonic()
         if not requested:
             self._since_s = None
@@ -51,9 +52,7 @@ class MissingMeasurements:
                 self.ask(each)
 
     def ask(self, requested: m.MeasurementsRequest) -> int:
-        """Send one request now; returns the number of measurements that came, which the node has
-        taken.
-        """
+        """Send one request; returns the number of measurements that the node has received."""
         try:
             replies = self._shell.bus.ask(
                 ch.MEASUREMENTS, requested.robot, requested, ASK_TIMEOUT_S

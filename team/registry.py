@@ -1,6 +1,4 @@
-"""Finds classes by the name that a table gives them, so that modules can be left out of an
-installation.
-"""
+"""Load classes by the names in a table, so that their modules are optional."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -8,11 +6,11 @@ from typing import Any
 
 
 class NotInstalledError(Exception):
-    """A method's module is missing: this installation goes without the methods for comparison."""
+    """The module of a comparison method is not installed."""
 
 
 def is_installed(place: str) -> bool:
-    """Whether the module of `package.module:name` is installed; nothing is imported."""
+    """Whether the module of `package.module:name` is installed, without importing it."""
     module = place.partition(":")[0]
     package, _, _ = module.rpartition(".")
     try:
@@ -22,16 +20,14 @@ def is_installed(place: str) -> bool:
 
 
 def absence(place: str, what: str) -> str | None:
-    """Why `what` is not available, in words; None if it is installed."""
+    """The reason why `what` is not available; None: it is installed."""
     if is_installed(place):
         return None
     return f"{what} is not installed: {place.partition(':')[0]} is not here"
 
 
 def loaded(place: str, what: str) -> Any:
-    """The `name` of `package.module:name`. Raises NotInstalledError, which says that `what` is
-    missing.
-    """
+    """Import `package.module:name`; raises NotInstalledError, which names `what`."""
     module, _, name = place.partition(":")
     absent = absence(place, what)
     if absent is not None:

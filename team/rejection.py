@@ -1,22 +1,21 @@
-"""All reasons for which a measurement is in no submap and in no inter-robot factor."""
+"""All reasons to reject a measurement."""
 
 from enum import StrEnum
 
 
 class Rejection(StrEnum):
-    """A reason for rejection, as the robot's ledger, its `Done` and `teamslam verify-ledger` spell
-    it.
+    """A reason for rejection, as spelt by the ledger, `Done` and `teamslam verify-ledger`.
 
-    The ledger counts by `disposition`; all other measurements were used.
+    The ledger counts by `disposition`. A measurement without a rejection was used.
     """
 
     OLDER = "older than the odometry"
     NOT_COVERED = "no odometry covers it"
     NO_TIME = "odometry over no time"
     SPEED = "odometry beyond the bounds"
-    """Of odometry: its time is used, its motion is not."""
+    """The interval's time is used, its motion is not."""
     STEERING = "steering without a car's motion model"
-    """Of odometry: as SPEED; steering needs motion.kind = "ackermann"."""
+    """As SPEED; steering needs motion.kind = "ackermann"."""
     TIME = "a time beyond the bounds"
     RANGE = "a range beyond the bounds"
     SENSOR_LIMITS = "outside the sensor's limits"
@@ -29,10 +28,10 @@ class Rejection(StrEnum):
     NO_TEAMMATES = "sightings are not used by this estimator"
     NO_NODES = "sightings need pose nodes, and front_end.node_s is 0"
     NO_NODE = "no pose node near it"
-    """Of an inter-robot measurement: no pose node is near its time."""
+    """No pose node is near the time of the inter-robot measurement."""
     LATE = "counted in a window that ends before its stamp"
     UNSOLVED = "its window has no solution"
-    """Of a window without a solution: its submap has the odometry's motion alone."""
+    """The window has no solution; its submap has the odometry's motion alone."""
     SET_ASIDE = "its handling raised"
 
     @property
@@ -42,4 +41,4 @@ class Rejection(StrEnum):
 
 
 UNMEASURED = frozenset({None, Rejection.SPEED, Rejection.STEERING})
-"""Of odometry whose time is used, whether or not its motion is."""
+"""Outcomes of an odometry interval whose time is used."""

@@ -1,6 +1,4 @@
-"""The shell of a node: it owns the bus, the clock and the signals; the node computes the
-answers.
-"""
+"""The shell of a node owns its bus, clock and signals; the node computes the answers."""
 
 import ctypes
 import logging
@@ -31,16 +29,15 @@ REMIND_S = 10.0
 WAIT_S = 0.05
 """Time [s] that a shell waits for input before it turns to its other duties."""
 RECORDER_S = 30.0
-"""Time [s] for which a process that has ended stays for a recorder that is away, or one that has
-reported what it lacks and gets no further."""
+"""Time [s] for which a finished process stays for an absent recorder, or for one that makes no
+progress."""
 BACK_S = 1.5
-"""Time [s] that a recorder which has come back needs to fetch missed messages from the
-publishers' caches, where nothing else reports what it has."""
+"""Time [s] in which a returned recorder fetches missed messages from the publishers' caches."""
 RECORDER = "recorder"
 PARENT = "TEAMSLAM_PARENT"
 """Environment variable: the process whose end ends this one."""
 LAST_S = 20
-"""A process that was told to stop is ended by SIGALRM after this many seconds."""
+"""SIGALRM ends a process this many seconds after its stop signal."""
 T = TypeVar("T")
 Take = Callable[[Sequence[Sample]], None]
 _LOG = logging.getLogger("teamslam")
@@ -54,17 +51,17 @@ class Node(Protocol):
     finished: bool
 
     def begin(self) -> list[Outgoing]:
-        """The first messages of the node."""
+        """Return the node's first messages."""
 
     def handle(self, message: Message, now_ns: int) -> list[Outgoing]:
-        """Take one message."""
+        """Handle one message; returns the answers."""
 
     def status(self) -> Status:
-        """The node's status, for people."""
+        """Return the node's status."""
 
 
 class FaultyRunError(RuntimeError):
-    """A process did its work, but messages were set aside, or the final map lacks a robot."""
+    """Messages were set aside in this run, or its final map lacks a robot."""
 
 
 def judge(boundary: Boundary, final: FusedMap | None) -> None:
@@ -77,7 +74,7 @@ def judge(boundary: Boundary, final: FusedMap | None) -> None:
 
 
 def lacking(final: FusedMap) -> str:
-    """The robots that were withdrawn from the final map, or lost, in words; empty: none."""
+    """Describe the robots that the final map lacks; empty: none."""
     found = []
     if final.withdrawn:
         found.append(f"the final map is without {', '.join(final.withdrawn)}: withdrawn")
@@ -88,12 +85,10 @@ def lacking(final: FusedMap) -> str:
 
 
 class Shell:
-    """Runs one node on one bus.
+    """Run one node on one bus; ends: channels on which the node's team ends.
 
-    ends: the channels on which the node's team ends.
-
-    A message that is refused is counted, logged with its reason, and dropped; one whose handling
-    raises is set aside (`team.containment`), and the node goes on.
+    A refused message is counted, logged with the reason and dropped. A message whose handling
+    raises is set aside (`team.containment`), and the node continues.
     """
 
     def __init__(
@@ -114,10 +109,10 @@ class Shell:
         self.boundary = Boundary(name)
         self.notes: Callable[[], tuple[str, ...]] = tuple
         self.believed: Callable[[Sequence[Sample]], Sequence[Sample]] = lambda samples: samples
-        """Selects the samples of a turn that reach the node."""
+        """Filter for the samples that reach the node."""
         self.the_end = TheEnd(bus, name, ends)
         self.take_end: Take = self.take
-        """Takes the samples that end the team, which this node has missed."""
+        """Handler of the samples that end the team and that this node has missed."""
         self._recorder_is_there: bool | None = None
         self._recorder_since = 0.0
         self._totals: Tally | None = None
@@ -131,17 +126,14 @@ class Shell:
         self._stale = False
 
     def refresh_by(self, refresh: Callable[[], list[Outgoing]], share: float) -> None:
-        """Sets what to publish when input has arrived and no more waits, for at most `share` of the
-        time.
+        """Publish `refresh()` after input, while no more waits, for at most `share` of the time.
 
-        So a result that is worth most while it is fresh does not wait until it would be due.
+        A fresh result is worth most, so it is not delayed until the next regular one.
         """
         self._refresh, self._spare_time = refresh, SpareTime(share)
 
     def receive(self) -> list[Sample]:
-        """The samples that arrive within WAIT_S; once no more wait, publishes what there is to
-        refresh.
-        """
+        """Receive samples for WAIT_S; publish the refreshed result if none waits."""
         refreshes = self._stale and self._refresh is not None
         wait_s = min(WAIT_S, self._spare_time.wait_s) if refreshes else WAIT_S
         samples = self.bus.receive(wait_s)
@@ -159,9 +151,7 @@ class Shell:
         return samples
 
     def begin(self) -> None:
-        """Publish the node's first messages and declare it alive; its subscriptions exist
-        before.
-        """
+        """Publish the node's first messages and declare it alive; call it after subscribing."""
         self.publish(self.node.begin())
         self.bus.declare_alive(self._name)
         self._is_running = True
@@ -169,12 +159,11 @@ class Shell:
 
     @property
     def going(self) -> bool:
-        """True until the node has finished or the process was told to stop."""
+        """Whether the node has not finished and no stop was requested."""
         return not (self.node.finished or self._stop.is_set())
 
     def publish(self, out: Iterable[Outgoing]) -> None:
-        """Publish what a node returned, in its order; a message that can not be published is a
-        fault.
+        """Publish a node's messages in order; a failed publication is a fault.
 
         Requests are sent as queries; their replies arrive like other samples.
         """
@@ -192,9 +181,7 @@ class Shell:
                     self.publish([fault])
 
     def take(self, samples: Iterable[Sample]) -> None:
-        """Decode samples, hand them to the node and publish its answers; status goes on during a
-        long queue.
-        """
+        """Decode samples, let the node handle them and publish its answers and status."""
         for sample in samples:
             self._note_recorder(sample)
             self.publish(self.boundary.take(self.node, sample))
@@ -204,13 +191,13 @@ class Shell:
     def take_replies(
         self, channel: Channel, name: str, replies: Iterable[bytes], expected: type[Message]
     ) -> None:
-        """As `take`, for the replies to a query, each of which must be of the expected kind."""
+        """Handle the replies to a query as `take` does; each must be of the expected type."""
         for reply in replies:
             key = channel.key(name)
             self.publish(self.boundary.take_reply(self.node, key, reply, expected))
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer queries; an answer that raises is a fault, of which the asker is informed."""
+        """Answer queries; an exception is a fault and is reported to the sender of the query."""
 
         def contained(request: bytes) -> list[bytes]:
             try:
@@ -225,10 +212,7 @@ class Shell:
         self.bus.answer(channel, name, contained)
 
     def contained(self, what: str, duty: Callable[[], T]) -> T | None:
-        """Do work that no message asked for; None, and a fault, if it raises.
-
-        BusError passes: without a bus the process can not go on.
-        """
+        """Run `duty`; an exception other than BusError is a fault, and the result None."""
         try:
             return duty()
         except BusError:
@@ -238,12 +222,12 @@ class Shell:
         return None
 
     def look_for_the_end(self) -> None:
-        """Ask the router now and then for an end of the team that this node has missed."""
+        """Query the router periodically for a missed end of the team."""
         if missed := self.the_end.missed():
             self.take_end(missed)
 
     def note(self, samples: Iterable[Sample]) -> None:
-        """Note which recorder is present, at a time when nothing else that arrives matters."""
+        """Read the recorder's messages among these samples and ignore the others."""
         for sample in samples:
             self._note_recorder(sample)
 
@@ -261,7 +245,7 @@ class Shell:
                 self._note_recorded(decoded(sample.payload, Tally), self._totals)
 
     def _note_recorded(self, has: Tally, totals: Tally) -> None:
-        """Note the recorder's report of what it lacks; `_recorder_since` is its last step."""
+        """Update the number of messages that the recorder lacks, and the time of its progress."""
         if has.since_ns != totals.since_ns:
             return
         published = dict(zip(totals.keys, totals.counts, strict=True))
@@ -273,13 +257,11 @@ class Shell:
         self._lacking = lacking
 
     def wait_for_recorder(self, lacks: Callable[[], bool], take: Take | None = None) -> None:
-        """Stay until a recorder of the run has reported that it has what this process published.
+        """Wait until a recorder has reported all messages that this process published.
 
-        Only the publisher can repeat its messages. Without a report a process stays as long as a
-        recorder is there; it leaves where none has been there for RECORDER_S, or where one has got
-        no further for RECORDER_S since its report. lacks: whether the recorder lacks something
-        else. take: handles what arrives meanwhile; without it only the recorder's messages are
-        read.
+        Only the publisher can repeat its messages. The wait ends if no recorder is present for
+        RECORDER_S, or if a present one makes no progress for RECORDER_S after a report. lacks:
+        whether the recorder lacks anything else. take: handles other samples meanwhile.
         """
         if self._recorder_is_there is None:
             return
@@ -306,7 +288,7 @@ class Shell:
                 take([sample for sample in samples if sample.key != RECORDED.key(self._name)])
 
     def _is_recorded(self, lacks: Callable[[], bool]) -> bool:
-        """Whether the recorder has what this process has published."""
+        """Whether the recorder has all messages of this process."""
         if not self._recorder_is_there or lacks():
             return False
         if self._totals is not None:
@@ -314,7 +296,7 @@ class Shell:
         return time.monotonic() - self._recorder_since >= BACK_S
 
     def _lacks(self) -> str:
-        """The messages missing in the log, in words."""
+        """Describe the messages that are missing in the log."""
         if not self._recorder_is_there:
             return "it is away"
         if not self._lacking:
@@ -323,7 +305,7 @@ class Shell:
         return f"it lacks {missing} messages on {len(keys)} keys, as {keys[0]}"
 
     def sample_of(self, out: Outgoing) -> Sample:
-        """A message to this node itself, as a sample from the bus."""
+        """Convert a message of this node to a sample as received from the bus."""
         return Sample(out.key, encoded(out.message), out.message.stamp_ns, time.time_ns(), 0)
 
     def end(self, final: FusedMap | None) -> None:
@@ -345,7 +327,7 @@ class Shell:
                 node=self._name,
                 state="unknown",
                 figures={},
-                warnings=("it can not say how it is",),
+                warnings=("its status failed: see its faults",),
             )
         now = time.monotonic()
         elapsed = max(now - self._since, 1e-3)
@@ -369,7 +351,7 @@ class Shell:
         self.bus.publish(Outgoing(STATUS, self._name, status))
 
     def run(self, duty: Callable[[], None] = lambda: None) -> None:
-        """Run turn after turn until the end: input, the node's answers, `duty`, status."""
+        """Run until the end: receive, handle, publish, run `duty`, publish the status."""
         self.begin()
         while self.going:
             self.take(self.believed(self.receive()))
@@ -383,12 +365,11 @@ class Shell:
 def process(
     name: str, *, endless: bool = False, patient: bool = False
 ) -> Iterator[threading.Event]:
-    """Run a process of a team: it stops at SIGTERM and SIGINT and ends when its parent dies.
+    """Run a process of a team until SIGTERM, SIGINT or its parent's death.
 
-    A process that was told to stop before its work was done ends with status 128 + the signal's
-    number; an `endless` one works until it is told to stop, and ends with 0. The kernel ends it
-    LAST_S after that; a `patient` one only at the second signal, since it has to deliver what it
-    has, however long that takes.
+    A process stopped before its work is done exits with 128 + the signal's number; an `endless`
+    one exits with 0. The kernel ends it LAST_S after the first signal; a `patient` process, which
+    has to deliver its data, after the second one.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()
@@ -416,10 +397,7 @@ def process(
 
 
 def _tie_to(parent: int, stop: threading.Event) -> None:
-    """Stop when the parent is gone: at once where the kernel reports it (Linux), else by polling.
-
-    A process that has not stopped by itself two seconds later is ended.
-    """
+    """Request a stop at the parent's death (Linux: a signal; else polling); exit 2 s later."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 

@@ -1,4 +1,4 @@
-"""Which of our sources a module depends on: what its results, or its compiled code, hang on."""
+"""The sources of ours that a module depends on, and hence its results and compiled code."""
 
 import ast
 import re
@@ -8,14 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
-"""How a table names what is found by name (`team.registry`)."""
+"""A name in a table of `team.registry`."""
 
 
 def sources_of(module: str, packages: tuple[str, ...], *, places: bool = True) -> dict[str, bytes]:
-    """The text of a module and of every module of these packages that it imports, near or far.
+    """The text of a module and of every module of these packages that it imports, transitively.
 
-    They are found by their import statements, those inside functions too, and by the places that
-    tables name; not by these for what calls nothing by name.
+    places: names in tables (`team.registry`) count as imports.
     """
     found: dict[str, bytes] = {}
     waiting = [module]

@@ -1,17 +1,15 @@
-"""Schedules a node's deferrable work: when nothing else waits, and for a limited share of the
-time.
-"""
+"""Schedule a node's deferrable work for a limited share of the time."""
 
 import time
 
 FAILED_S = 10.0
-"""Work that raised an exception is tried again after this time [s]."""
+"""Time [s] before work that raised an exception is tried again."""
 
 
 class SpareTime:
-    """Decides by the wall clock when the next piece of deferrable work may begin.
+    """The wall-clock time at which the next piece of deferrable work may begin.
 
-    share: of the time, at most. took_s: duration of the last useful piece; None before the first.
+    share: largest share of the time. took_s: duration of the last useful piece; None: none yet.
     """
 
     def __init__(self, share: float) -> None:
@@ -25,14 +23,12 @@ class SpareTime:
         return max(0.0, self._next - time.monotonic())
 
     def note(self, began: float, *, useful: bool) -> None:
-        """Note that a piece that began at this `time.monotonic` is done; a useless one costs
-        nothing.
-        """
+        """Record a finished piece that began at this `time.monotonic`; useless ones are free."""
         now = time.monotonic()
         if useful:
             self.took_s = now - began
             self._next = now + self._rest * self.took_s
 
     def failed(self) -> None:
-        """Note that a piece raised an exception."""
+        """Record a piece that raised an exception."""
         self._next = time.monotonic() + FAILED_S

@@ -1,4 +1,4 @@
-"""The end of a team: the router stores it for processes that were absent."""
+"""The end of a team, which the router stores for absent processes."""
 
 import logging
 import os
@@ -14,8 +14,7 @@ FINAL_S = 3.0
 """Time [s] between two queries to the router for a missed end."""
 FINAL_ASK_S = 2.0
 SINCE = "TEAMSLAM_SINCE"
-"""Environment variable: start of this process' run [ns, wall clock], where that is earlier than
-the process."""
+"""Environment variable: start of the run [ns, wall clock], if earlier than that of the process."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -32,16 +31,14 @@ os.register_at_fork(after_in_child=_forked)
 
 
 class TheEnd:
-    """Requests from the router the samples that end the team of this process.
+    """Query the router for the samples that end the team of this process.
 
-    A process that starts again, or that was stopped or cut off while the centre left, learns of the
-    end in this way. An end that is older than the process is another run's, unless whoever started
-    it says that the run began earlier (SINCE), or an earlier process of this node was in that run
-    and ended without a `Tally`.
+    A restarted, stopped or disconnected process receives the end in this way. An end that is older
+    than the process belongs to another run, unless SINCE states an earlier start of the run, or an
+    earlier process of this node took part in that run and ended without a `Tally`.
 
-    ends: the channels on which this team ends. With a centre that is the centre's final map alone;
-    without one each robot publishes its own end, and nobody else's. robot: of the robots' channels,
-    the only robot of interest; "*": all.
+    ends: channels on which the team ends: the centre's final map, or, without a centre, each
+    robot's own. robot: the robot of interest on the robots' channels; "*": all.
     """
 
     def __init__(
@@ -61,9 +58,7 @@ class TheEnd:
         self._began = _STARTED
 
     def missed(self) -> list[Sample]:
-        """The samples that end the team, as their authors published them; the router is asked at
-        most every FINAL_S.
-        """
+        """The samples that end the team, as their authors published them; queries every FINAL_S."""
         now = time.monotonic()
         if now < self._due:
             return []
@@ -81,7 +76,7 @@ class TheEnd:
         return [sample for reply in replies for sample in self._ending(reply)]
 
     def _ending(self, reply: bytes) -> list[Sample]:
-        """The sample in a reply, if it is one that was requested."""
+        """The sample in a reply, if it was requested."""
         try:
             sample = replied(KEPT, "", reply, 0)
         except WireError as error:

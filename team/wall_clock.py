@@ -1,7 +1,7 @@
-"""Detects that the wall clock was set, as on a computer without a battery for its clock.
+"""Detect a step of the wall clock, as on a computer whose clock has no battery.
 
-Such a computer starts with a time of long ago, until the network has told it the true one. The age
-of a file that was written before is then wrong by the step.
+Such a computer starts in the past until it reaches a time server. The ages of files that were
+written before the step are wrong by it.
 """
 
 import time
@@ -11,13 +11,11 @@ from pathlib import Path
 
 BOOT, OFFSET = "clock.boot", "clock.offset_s"
 STEP_S = 60.0
-"""A wall clock that has moved by more than this [s] against the time since boot was set."""
+"""Least change [s] of the wall clock against the time since boot that counts as a step."""
 
 
 def wall_clock() -> dict[str, str]:
-    """Name this boot, and the wall clock minus the time since it [s]; empty where neither is
-    reported.
-    """
+    """The boot's id, and the wall clock minus the time since boot [s]; empty: not available."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         offset_s = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
