@@ -75,20 +75,20 @@ class View:
 
 
 MAP = View("view/map", "foxglove.SceneUpdate", "1 Hz, when it has changed",
-           "the team's landmarks with 95 % ellipses; the true ones")  # fmt: skip
+           "landmarks with 95 % ellipses, and the true ones")  # fmt: skip
 ROBOTS = View("view/robots", "foxglove.SceneUpdate", "1 Hz",
-              "the robots with 95 % ellipses and the last stretch of their paths")  # fmt: skip
+              "robots with 95 % ellipses and recent paths")  # fmt: skip
 PATHS = View("view/paths", "foxglove.SceneUpdate", "0.1 Hz",
-             "whole paths, thinned: running, true, at the end smoothed")  # fmt: skip
+             "thinned paths: running, true, finally smoothed")  # fmt: skip
 TRANSFORMS = View("view/transforms", "foxglove.FrameTransforms", "1 Hz",
-                  "the robots' frames in that of the map")  # fmt: skip
+                  "robots' frames in the map's")  # fmt: skip
 POSE = View("view/pose/{robot}", "foxglove.PoseInFrame", "1 Hz", "a robot's running pose")
 LANDMARKS = View("view/landmarks", "foxglove.PointCloud", "as view/map",
-                 "the team's landmarks as points, with their numbers")  # fmt: skip
+                 "landmarks as points, with numbers")  # fmt: skip
 PARTICLES = View("view/particles/{robot}", "foxglove.PointCloud", "1 Hz, when it has changed",
-                 "a robot's thinned particles with their weights")  # fmt: skip
+                 "a robot's particles with weights")  # fmt: skip
 LOG = View("view/log", "foxglove.Log", "on change",
-           "who joined, was lost, was refused; what the nodes warn of")  # fmt: skip
+           "robots that joined, were lost or refused; warnings")  # fmt: skip
 TEAM = View("view/team", TeamFigures, "1 Hz", "figures of the team")
 ROBOT = View("view/robot/{robot}", RobotFigures, "1 Hz", "figures of a robot")
 
