@@ -43,6 +43,8 @@ STRUCTS: tuple[type[msgspec.Struct], ...] = (
 )  # fmt: skip
 AT_THE_TOP = {"estimator", "fusion", "seed"}
 """Fields of a robot and the centre that a scenario sets once, for the whole team."""
+FILLED_IN = {"name", "team", "id"}
+"""Required fields for which the reader of a file has a default."""
 
 
 def described(cls: type[msgspec.Struct]) -> dict[str, str]:
@@ -56,14 +58,14 @@ def cell_of(field: msgspec.structs.FieldInfo) -> str:
     """The second cell of a field's row: its default and the values that it may have."""
     values, default = values_of(field.type), field.default
     if field.required:
-        return f"required: {values}"
+        return values if field.name in FILLED_IN else f"required: {values}"
     if default is None:
         return f"absent: {values}"
     if isinstance(default, msgspec.Struct):
         return "table"
     code = f"`{msgspec.json.encode(default).decode()}`" if default != () else "`[]`"
     if isinstance(default, tuple):
-        return f"{code}: {values}"
+        return code
     if get_origin(field.type) is Literal:
         others = [each for each in get_args(field.type) if each != default]
         return ", ".join([code, *(f'`"{each}"`' for each in others)]) if len(others) < 5 else code
@@ -84,15 +86,20 @@ def values_of(declared: Any, bounds: Meta | None = None) -> str:
         return "point"
     if get_origin(declared) is tuple:
         return re.sub(r"^(array|\w+)", r"array of \1s", values_of(get_args(declared)[0]))
-    named = {float: "number", int: "integer", str: "text", bool: "boolean"}.get(declared, "table")
-    return named + ("" if bounds is None else bounded(bounds))
+    if declared in {float, int}:
+        return ("number" if declared is float else "integer") + bounded(bounds)
+    return {str: "text", bool: "boolean"}.get(declared, "table")
 
 
-def bounded(bounds: Meta) -> str:
-    """The bounds of a number."""
-    limits = {">": bounds.gt, "≥": bounds.ge, "<": bounds.lt, "≤": bounds.le}
-    texts = [f" {sign} {limit:g}" for sign, limit in limits.items() if limit is not None]
-    return ",".join(texts).replace("9.22337e+18", "2⁶³ − 1")
+def bounded(bounds: Meta | None) -> str:
+    """The bounds of a number; of one that is not negative, none."""
+    if bounds is None:
+        return " any"
+    low, high = bounds.ge, bounds.le
+    if low is not None and high is not None:
+        return f" {low:g} to {high:g}".replace("9.22337e+18", "2⁶³ − 1")
+    limits = {">": bounds.gt, "≥": low or None, "<": bounds.lt, "≤": high}
+    return ",".join(f" {sign} {limit:g}" for sign, limit in limits.items() if limit is not None)
 
 
 def rows_of(page: str, cls: type[msgspec.Struct]) -> dict[str, list[str]]:
