@@ -1,4 +1,4 @@
-"""Drive a robot from its tables: python robot.py r1 data/r1 lab tcp/127.0.0.1:7447 [SECONDS A STEP]."""
+"""Drive a robot: python robot.py r1 data/r1 lab tcp/127.0.0.1:7447 [SECONDS A STEP]."""
 
 import csv
 import sys
