@@ -1,4 +1,4 @@
-"""The table of channels: the only place where a key is written.
+"""The table of channels, the only place of keys.
 
 Keys are relative to the team; a bus puts `team/<team name>/` before them. The sender of a message
 owns the prefix of its key: a robot's process `robot/{robot}/…`, its driver `source/{robot}/…`, an
@@ -34,9 +34,9 @@ _PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": f"{_NAME}(
 
 @dataclass(frozen=True)
 class Channel:
-    """One row: the message on a key, its rate, its delivery, and how a log treats it.
+    """One row: the message on a key, its rate, its delivery, and its place in a log.
 
-    alternatives: messages that may be sent on the key in the place of `message`, or mixed with it.
+    alternatives: further messages on the key.
     """
 
     name: str
@@ -51,43 +51,41 @@ class Channel:
 
     @property
     def kinds(self) -> tuple[type[m.Message], ...]:
-        """The types of messages that may be sent on the key."""
+        """The types of messages on the key."""
         return (self.message, *self.alternatives)
 
     def kind_of(self, tag: str) -> type[m.Message]:
-        """The type of message with this tag; the first one where none has it."""
+        """Return the type of message with this tag, or the first type."""
         return next((kind for kind in self.kinds if m.tag_of(kind) == tag), self.message)
 
     def key(self, name: str = "") -> str:
-        """The key for one robot or node."""
+        """Return the key for one robot or node."""
         before, after = self._around
         return before + name + after if after is not None else before
 
     def selectors(self, name: str = "*") -> tuple[str, ...]:
-        """The key expressions of one name; `*`: of all, where nodes and views have up to two parts.
+        """Return the key expressions of one name, or of all (`*`), each of a fixed depth.
 
-        They match keys of a fixed depth only.
+        Names of nodes and views have up to two parts.
         """
         two = name == "*" and self._around[1] is not None and "{robot}" not in self.template
         return (self.key(name), self.key("*/*")) if two else (self.key(name),)
 
     def publisher(self, name: str) -> str:
-        """The node that publishes the key for one robot or node."""
+        """Return the node that publishes the key for one robot or node."""
         first, _, rest = self.template.partition("/")
         if first == "{node}":
             return name
         return f"{first}/{name}" if first == "robot" and rest.startswith("{robot}") else first
 
     def owner(self, key: str) -> str | None:
-        """The robot or node that `key` belongs to on this channel; None where the key is of another
-        channel.
-        """
+        """Return the robot or node of `key`; None if the key is of another channel."""
         match = self._pattern.fullmatch(key)
         return None if match is None else match.groupdict().get("name", "")
 
     @cached_property
     def _around(self) -> tuple[str, str | None]:
-        """The key before and behind the name; None behind it where the key has no name."""
+        """The key before and behind the name; None behind it if the key has no name."""
         parts = _PLACE.split(self.template)
         return parts[0], parts[2] if len(parts) > 1 else None
 
@@ -263,23 +261,23 @@ REPLIES = {
     MEMBERS: (CARRIED,),
     FOLD: (TEAM_MAP,),
 }
-"""The channels whose messages answer a query."""
+"""The channels of the replies to each query."""
 UNOPENED = (*QUERIES, VIEW)
-"""Rows whose traffic is not decoded: queries have no samples, and a view is no message of ours."""
+"""Rows whose traffic is not decoded: queries have no samples, views no messages of the team."""
 
 
 def robot_node(robot: str) -> str:
-    """The node name of a robot, as liveliness tokens and status carry it."""
+    """Return the node name of a robot, as in liveliness tokens and status."""
     return f"robot/{robot}"
 
 
 def source_node(robot: str) -> str:
-    """The node name of a robot's driver, as liveliness tokens and status carry it."""
+    """Return the node name of a robot's driver, as in liveliness tokens and status."""
     return f"source/{robot}"
 
 
 def robot_of(node: str) -> str | None:
-    """The robot of a node's name; None if the node is not a robot."""
+    """Return the robot of a node's name; None if the node is not a robot."""
     kind, _, robot = node.partition("/")
     return robot if kind == "robot" else None
 
@@ -289,7 +287,7 @@ _OPENED = tuple(each for each in CHANNELS if each not in UNOPENED)
 
 @lru_cache(maxsize=16_384)
 def channel_of(key: str) -> tuple[Channel, str] | None:
-    """The channel that a relative key belongs to, and the robot or node in it."""
+    """Return the channel of a relative key, and the robot or node in it."""
     for channel in _OPENED:
         if (name := channel.owner(key)) is not None:
             return channel, name
@@ -297,7 +295,7 @@ def channel_of(key: str) -> tuple[Channel, str] | None:
 
 
 def row_of(key: str) -> Channel | None:
-    """The row of a relative key, also of a view's."""
+    """Return the row of a relative key, also of a view."""
     found = channel_of(key)
     if found is not None:
         return found[0]

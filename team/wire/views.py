@@ -1,9 +1,8 @@
-"""The table of views: what a viewer node publishes below `view/`, in the schemas of other tools.
+"""The table of views, which a viewer node publishes in the schemas of other tools.
 
-A view is no message of the team: no node decodes it, nothing is computed from it, and verification
-skips it. Foxglove, Lichtblick and Rerun know its schema, so that a log opens there without any
-configuration. Frames: `map` is the frame of the team's map, `robot/<name>` that of a robot; metres,
-radians, counter-clockwise; z = 0.
+No node decodes a view, no estimate depends on it, and verification skips it. Foxglove, Lichtblick
+and Rerun support its schema, so they open a log without configuration. Frames: `map` is the frame
+of the team's map, `robot/<name>` that of a robot; metres, radians, counter-clockwise; z = 0.
 """
 
 import re
@@ -21,9 +20,9 @@ MAP_FRAME = "map"
 class TeamFigures(msgspec.Struct, frozen=True):
     """Figures of the team for plots; unknown ones are left out.
 
-    Errors are those of the map without alignment to the truth; landmark_nees_per_dof takes each
-    landmark by itself (2 degrees of freedom; its expectation is 1). status: the centre's own
-    figures, the consistency monitor's among them.
+    Errors are those of the map without alignment to the truth; landmark_nees_per_dof is of each
+    landmark by itself (2 degrees of freedom; its expectation is 1). status: the centre's figures,
+    those of the consistency monitor included.
     """
 
     team_time_s: float
@@ -37,7 +36,7 @@ class TeamFigures(msgspec.Struct, frozen=True):
 class RobotFigures(msgspec.Struct, frozen=True):
     """Figures of one robot for plots: its running pose, and its errors with their 3σ bounds.
 
-    Figures that need an absent truth are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is
+    Figures without truth are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is
     1. status: the robot's own figures.
     """
 
@@ -65,11 +64,11 @@ class View:
     meaning: str
 
     def key(self, robot: str = "") -> str:
-        """The relative key, for one robot where the view is of one."""
+        """Return the relative key; of a view of a robot, for that robot."""
         return self.template.replace("{robot}", robot)
 
     def is_of(self, key: str) -> bool:
-        """Whether a relative key belongs to this view."""
+        """Return whether a relative key belongs to this view."""
         pattern = re.escape(self.template).replace(r"\{robot\}", "[^/]+")
         return re.fullmatch(pattern, key) is not None
 
@@ -96,16 +95,14 @@ VIEWS: tuple[View, ...] = tuple(v for v in list(globals().values()) if isinstanc
 
 
 def view_of(key: str) -> View | None:
-    """The view that a relative key belongs to; None for a key of a channel, and for an unknown
-    one.
-    """
+    """Return the view of a relative key; None for keys of channels and unknown keys."""
     if VIEW.owner(key) is None:
         return None
     return next((view for view in VIEWS if view.is_of(key)), None)
 
 
 def json_schema(of: type[msgspec.Struct]) -> dict[str, Any]:
-    """The JSON Schema of figures, without references: not every tool resolves them."""
+    """Return the JSON Schema of figures, without references, which some tools do not resolve."""
     (_,), components = msgspec.json.schema_components((of,), ref_template="#/$defs/{name}")
     schema = components[of.__name__]
     return {"title": of.__name__, **schema}
