@@ -171,7 +171,7 @@ GIVEN_UP = Channel(name="given_up", template="operator/given_up/{node}", message
 END_ORDER = Channel(name="end_order", template="operator/end", message=m.TeamEnd, rate="once", delivery="all", recorded=True, recomputable=False,
                     meaning="an operator's order to end a live team")  # fmt: skip
 TEAM_END = Channel(name="team_end", template="central/end", message=m.TeamEnd, rate="once", delivery="latest", recorded=True, recomputable=False,
-                   meaning="the same, repeated for late joiners")  # fmt: skip
+                   meaning="the order to end, repeated for late joiners")  # fmt: skip
 FINAL_MAP = Channel(name="final_map", template="central/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True, recomputable=True,
                     meaning="the final map with its joint covariance")  # fmt: skip
 TRAJECTORY = Channel(name="trajectory", template="central/trajectory/{robot}", message=m.Trajectory, rate="once per incarnation",
