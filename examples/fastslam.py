@@ -1,4 +1,4 @@
-"""FastSLAM on arrays: a robot drives a circle among eight landmarks.
+"""Run FastSLAM on arrays: a robot drives a circle among eight landmarks.
 
 python examples/fastslam.py [PICTURE]
 """

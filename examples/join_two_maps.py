@@ -1,6 +1,6 @@
-"""Two robots map one hall by Hybrid-SLAM, and their submaps are joined.
+"""Join the submaps of two robots that map one hall by Hybrid-SLAM.
 
-Only the first robot knows where it begins; the landmarks that both have seen place the second one.
+Only the initial pose of the first robot is known; common landmarks place the second one.
 
     python examples/join_two_maps.py [PICTURE]
 """
@@ -32,7 +32,7 @@ landmarks = rng.uniform(0.0, 24.0, (24, 2))
 
 
 def drive(pose: np.ndarray, yaw_rate: float, keyframes: int) -> tuple[np.ndarray, list[Keyframe]]:
-    """The true path (keyframes, 3) from `pose`, and what the robot measures on it."""
+    """Return the true path (keyframes, 3) from `pose`, and the keyframes measured on it."""
     path, measured = [], []
     for _ in range(keyframes):
         increment = increment_of(MOTION, duration_s=1.0, forward=0.8, yaw_rate=yaw_rate)
@@ -54,7 +54,7 @@ def drive(pose: np.ndarray, yaw_rate: float, keyframes: int) -> tuple[np.ndarray
 
 
 def submaps(keyframes: list[Keyframe]) -> list[LocalMap]:
-    """One submap of every ten keyframes; nothing flows from one into the next."""
+    """Make an independent submap of every ten keyframes."""
     windows = [keyframes[k : k + WINDOW] for k in range(0, len(keyframes), WINDOW)]
     return [submap_of(window, SENSOR, rng) for window in windows]
 
@@ -71,7 +71,7 @@ team = join(
 reference = batch_map(
     {robot: keyframes for robot, (_, keyframes) in driven.items()},
     dict.fromkeys(driven, SENSOR),
-    {  # the batch begins somewhere: near the true start, and free to leave it
+    {  # initial value of the batch, near the true start, with a wide prior
         "r1": InitialPose(pose=starts["r1"]),
         "r2": InitialPose(pose=starts["r2"], covariance=np.diag((100.0, 100.0, 10.0))),
     },
@@ -79,7 +79,7 @@ reference = batch_map(
 
 
 def rmse(ids: np.ndarray, means: np.ndarray) -> float:
-    """Of landmarks against the truth [m]."""
+    """Return the root mean square error of landmarks [m]."""
     return float(np.sqrt(np.mean(np.sum((means - landmarks[ids]) ** 2, axis=1))))
 
 

@@ -1,4 +1,4 @@
-"""Two robots that drive bends, as a data set of CSV tables: python own_data.py my_set."""
+"""Write the CSV tables of two robots that drive bends: python own_data.py my_set."""
 
 import csv
 import sys
@@ -11,7 +11,7 @@ STEP_S, STEPS = 0.1, 2400
 
 
 def write(file, columns, rows):
-    """One table."""
+    """Write one table."""
     with file.open("w", newline="") as out:
         csv.writer(out).writerows([columns, *rows])
 

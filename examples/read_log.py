@@ -1,4 +1,4 @@
-"""What is in the log of a run, and the team's map joined again from its submaps.
+"""List the log of a run, and join the team's map again from its submaps.
 
 python examples/read_log.py runs/FOLDER/log.mcap
 """

@@ -1,4 +1,4 @@
-"""The next submap that any robot of a running team publishes, read off Zenoh.
+"""Read the next submap of a running team from Zenoh.
 
 python examples/read_submap.py tcp/127.0.0.1:7447 waypoints
 """
@@ -14,7 +14,7 @@ endpoint, team = sys.argv[1:3]
 links = f'mode: "client", connect: {{endpoints: ["{endpoint}"]}}'
 config = zenoh.Config.from_json5(f"{{{links}, scouting: {{multicast: {{enabled: false}}}}}}")
 key = f"team/{team}/robot/*/submap"
-history = zenoh.ext.HistoryConfig(detect_late_publishers=True)  # those that were sent before, too
+history = zenoh.ext.HistoryConfig(detect_late_publishers=True)  # with submaps published earlier
 with zenoh.open(config) as session:
     subscriber = zenoh.ext.declare_advanced_subscriber(session, key, history=history)
     robot, sequence, submap = submap_in(subscriber.recv().payload.to_bytes())

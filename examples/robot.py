@@ -1,4 +1,4 @@
-"""A robot from CSV tables: python robot.py r1 data/r1 lab tcp/127.0.0.1:7447 [SECONDS A STEP]."""
+"""Drive a robot: python robot.py r1 data/r1 lab tcp/127.0.0.1:7447 [SECONDS A STEP]."""
 
 import csv
 import sys
@@ -21,7 +21,7 @@ given = Path(folder) / "start.csv"  # without this file the landmarks place the 
 start = [float(x) for x in given.read_text().split()[1].split(",")] if given.exists() else None
 
 with Driver(name, team=team, connect=endpoint, start=start) as robot:
-    for t, kind, numbers in sorted(events):  # what is seen at a time, then how it has moved
+    for t, kind, numbers in sorted(events):  # landmarks at t precede the odometry until t
         if kind == "odometry":
             robot.odometry(t, *speed)  # until t, since the last call
             speed = numbers

@@ -1,4 +1,4 @@
-"""A small ROS 2 bag, as a robot with a camera would record it: python ros2_bag.py my_bag."""
+"""Write a small ROS 2 bag of a robot with a camera: python ros2_bag.py my_bag."""
 
 import sys
 from math import cos, sin
@@ -13,13 +13,13 @@ T = STORE.types
 
 
 def header(t_ns, frame):
-    """When, and in which frame."""
+    """Return the header with time and frame."""
     time = T["builtin_interfaces/msg/Time"](sec=t_ns // 10**9, nanosec=t_ns % 10**9)
     return T["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
 def transform(t_ns, parent, child, x, y, z, q=(0.0, 0.0, 0.0, 1.0)):
-    """The pose of `child` in `parent`."""
+    """Return the pose of `child` in `parent`."""
     return T["geometry_msgs/msg/TransformStamped"](
         header=header(t_ns, parent),
         child_frame_id=child,
@@ -31,7 +31,7 @@ def transform(t_ns, parent, child, x, y, z, q=(0.0, 0.0, 0.0, 1.0)):
 
 
 def odometry(t_ns, x, y, theta):
-    """What wheel odometry has added up."""
+    """Return accumulated wheel odometry."""
     vector, zeros = T["geometry_msgs/msg/Vector3"], np.zeros(36)
     twist = T["geometry_msgs/msg/Twist"](
         linear=vector(x=0.5, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0)
@@ -56,7 +56,7 @@ with Writer(sys.argv[1], version=9, storage_plugin=StoragePlugin.MCAP) as bag:
     static = bag.add_connection("/tf_static", "tf2_msgs/msg/TFMessage", typestore=STORE)
 
     def send(connection, t_ns, message):
-        """Into the bag."""
+        """Write a message to the bag."""
         bag.write(connection, t_ns, STORE.serialize_cdr(message, connection.msgtype))
 
     optical = transform(0, "base_link", "camera_optical", 0.2, 0.0, 0.4, (-0.5, 0.5, -0.5, 0.5))

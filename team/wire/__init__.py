@@ -1,1 +1,1 @@
-"""The wire: channels, messages, codec and buses. It does not know what a map is."""
+"""The wire: channels, messages, codec and buses, independent of the estimation."""

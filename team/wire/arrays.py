@@ -52,42 +52,42 @@ def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
 
 
 def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
-    """A read-only float64 view."""
+    """Return a read-only float64 view."""
     return _array(data, "<f8", what)
 
 
 def ids(data: Ids, what: str) -> "np.typing.NDArray[np.uint32]":
-    """A read-only uint32 view."""
+    """Return a read-only uint32 view."""
     return _array(data, "<u4", what)
 
 
 def stamps(data: Stamps, what: str) -> "np.typing.NDArray[np.int64]":
-    """A read-only int64 view."""
+    """Return a read-only int64 view."""
     return _array(data, "<i8", what)
 
 
 def octets(data: bytes, what: str) -> "np.typing.NDArray[np.uint8]":
-    """A read-only uint8 view."""
+    """Return a read-only uint8 view."""
     return _array(data, "u1", what)
 
 
 def from_floats(values: Any) -> Floats:
-    """Little-endian float64 bytes, C order."""
+    """Encode as little-endian float64 bytes, C order."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
 
 
 def from_numbers(values: Sequence[float]) -> Floats:
-    """The same of at most FEW plain floats, without an array."""
+    """Encode at most FEW plain floats as `from_floats` does, without an array."""
     return _NUMBERS[len(values)].pack(*values)
 
 
 def from_ids(values: Any) -> Ids:
-    """Little-endian uint32 bytes."""
+    """Encode as little-endian uint32 bytes."""
     return np.ascontiguousarray(values, dtype="<u4").tobytes()
 
 
 def from_stamps(values: Any) -> Stamps:
-    """Little-endian int64 bytes."""
+    """Encode as little-endian int64 bytes."""
     return np.ascontiguousarray(values, dtype="<i8").tobytes()
 
 

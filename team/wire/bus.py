@@ -1,8 +1,8 @@
-"""A bus carries payloads by key. Two implementations: here in memory, and `team.wire.zenoh`.
+"""The interface of a bus, which carries payloads by key, and a bus in memory.
 
-A received `Sample` contains the relative key, the payload as it was published, the team time, the
-publisher's wall clock and the publisher's counter of this key. A node never uses a bus itself: its
-shell receives the samples, decodes them, and publishes the messages that the node returns.
+`team.wire.zenoh` has the bus over a network. A received `Sample` contains the relative key, the
+payload as published, the team time, and the publisher's wall clock and counter of this key. A node
+uses no bus: its shell receives and decodes the samples, and publishes the messages of the node.
 """
 
 import re
@@ -46,7 +46,7 @@ _IN_WORDS = (Status, Fault, FusedMap, GivenUp, TeamEnd, Verdict, Withdrawal, Wit
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
-    """One publication as it was received; a log has hundreds of thousands."""
+    """A received publication."""
 
     key: str
     payload: bytes
@@ -56,9 +56,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
 
 
 class Outgoing(NamedTuple):
-    """A message on its channel, for one robot or node (empty where the channel's key has no
-    name).
-    """
+    """A message on its channel, for a robot or node (empty if the channel's key has no name)."""
 
     channel: Channel
     name: str
@@ -71,26 +69,25 @@ class Outgoing(NamedTuple):
 
 
 class BusError(RuntimeError):
-    """The bus can not do what was requested: no router answers, the port is in use, the link is
-    cut.
-    """
+    """A failed request to the bus: no router answers, the port is in use, the link is cut."""
 
 
 _PLACES = re.compile(r"\{(robot|node)\}")
 Answer = Callable[[bytes], Iterable[bytes]]
-"""Answers a query: takes the request's payload, returns the payloads of the replies."""
+"""A function from the payload of a query to the payloads of its replies."""
 
 
 @runtime_checkable
 class Tap(Protocol):
-    """Stores all samples that a bus sends and receives, replies included: a process' own log."""
+    """A store of all samples that a bus sends and receives, replies included: an own log."""
 
     def __call__(self, samples: list[Sample]) -> None:
-        """Stores these samples."""
+        """Store samples."""
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Intervals of a robot's measurements that are known to exist and are not stored, as after
-        a crash: incarnation, first number, last number.
+        """Return the intervals of a robot's measurements that are missing in the store.
+
+        Each is (incarnation, first number, last number). A crash leaves them.
         """
 
 
@@ -98,87 +95,81 @@ class Tap(Protocol):
 class Bus(Protocol):
     """The bus as a shell uses it.
 
-    dropped: number of received samples that were dropped, since they came without a sound
-        attachment, or under another key than the one on which they were published.
+    dropped: number of received samples without a valid attachment, or under another key than
+        that on which they were published.
     """
 
     dropped: int
 
     def publish(self, out: Outgoing) -> int:
-        """Publishes; returns the payload's number of bytes. Blocks, with a bound, while receivers
-        are slower.
+        """Publish a message and return the size of its payload [bytes].
+
+        It blocks for a limited time while receivers are slower.
         """
 
     def publish_raw(self, sample: Sample) -> None:
-        """Publishes a logged sample again, with its bytes, its stamps and its counter."""
+        """Publish a logged sample again, with its bytes, its stamps and its counter."""
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribes: from now on `receive` returns what others publish on the channel, each sample
-        once.
+        """Subscribe to a channel: `receive` returns each sample of other publishers once.
 
-        whole: for a `latest` channel all samples that its publishers still have, not only the
-            newest one.
+        whole: deliver all stored samples of a `latest` channel, not only the newest one.
         """
 
     def receive(self, timeout_s: float) -> list[Sample]:
-        """All samples received since the last call, in order; waits at most `timeout_s` for the
-        first one.
-        """
+        """Return the samples since the last call, in order; wait at most `timeout_s` for one."""
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answers the queries of `channel` for one name, or `*`; a ValueError's text is sent to the
-        asker.
+        """Answer the queries of `channel` for one name, or `*`.
+
+        The text of a ValueError is sent as the reply.
         """
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads, in order; empty when nobody answers. Raises `BusError` on an
-        error.
+        """Query, and return the payloads of the replies in order; raise `BusError` on an error.
+
+        Without an answer there is no reply.
         """
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Sends a query without waiting: `receive` returns the replies, as samples of their
-        channels.
+        """Send a query without waiting; `receive` returns the replies as samples of their channels.
 
-        Does nothing while the same query is open. A reply has no counter of its own (`NO_COUNTER`),
-        and the wall clock of its arrival.
+        Nothing is sent while the same query is open. A reply has no counter (`NO_COUNTER`), and the
+        wall clock of its arrival.
         """
 
     def again(self) -> None:
-        """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
+        """Request and deliver all samples of `all` channels and whole subscriptions again."""
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples that are known to exist and were not received: by key, intervals of a publisher's
-        counters.
-        """
+        """Return the missing samples: by key, intervals of a publisher's counters."""
 
     def awaited(self) -> set[str]:
-        """Keys with missing samples that their publisher may still have."""
+        """Return the keys with missing samples that their publisher may still have."""
 
     def publish_totals(self) -> Tally | None:
-        """Publishes how many samples of each key this process has published; None where nothing can
-        get lost.
+        """Publish and return the number of samples of each key that this process has published.
+
+        None if no sample can be lost.
         """
 
     def declare_alive(self, node: str) -> None:
-        """Holds a liveliness token until the bus is closed."""
+        """Hold a liveliness token until the bus is closed."""
 
     def watch_alive(self, node: str = "*") -> None:
-        """Receives `Liveliness` of others' tokens as they appear and disappear, the present ones
-        first.
-        """
+        """Receive `Liveliness` of tokens that appear and disappear, the present ones first."""
 
     def is_alive(self, node: str) -> bool:
-        """Whether anyone holds the node's liveliness token."""
+        """Return whether a process holds the node's liveliness token."""
 
     def close(self) -> None:
-        """Leaves the network; the tokens are withdrawn."""
+        """Leave the network and withdraw the tokens."""
 
 
 def opened(sample: Sample) -> tuple[Channel, str, Message]:
-    """The channel, the name and the message of a sample, checked against its key; raises
-    `WireError`.
+    """Decode a sample and check it against its key; return channel, name and message.
 
-    A robot's message on another robot's key is refused, and a node's on another node's.
+    Raises `WireError`, also for a message of a robot or node on the key of another one.
     """
     found = channel_of(sample.key)
     if found is None:
@@ -197,16 +188,15 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
 
 
 def shown(sample: Sample) -> tuple[Channel, str, Message]:
-    """As `opened`, for a reader that shows the message to people: its texts are printable."""
+    """Decode a sample as `opened` does, with printable texts, for readers that show it."""
     channel, name, message = opened(sample)
     return channel, name, readable(message) if isinstance(message, _IN_WORDS) else message
 
 
 def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
-    """The sound ones of some samples, each as `opened` returns it; the others are left out.
+    """Decode the valid samples as `shown` does, and leave out the others.
 
-    For a reader that only observes: an unsound sample is no message of the team, whoever has sent
-    it. Texts are as `shown` returns them.
+    It is for readers that only observe: an invalid sample is no message of the team.
     """
     for sample in samples:
         try:
@@ -216,7 +206,7 @@ def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
 
 
 def _sender_of(channel: Channel, message: Message) -> str | None:
-    """The node that a message gives as its sender; None where it gives none."""
+    """Return the node that a message names as its sender; None if it names none."""
     match message:
         case Configuration() | Progress() | Status() | Liveliness() | Fault():
             return message.node
@@ -231,10 +221,10 @@ def _sender_of(channel: Channel, message: Message) -> str | None:
 
 
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
-    """A reply to a query as a sample of the channel that its message belongs to; a stored sample
-    as its author published it.
+    """Return a reply to a query as a sample of the channel of its message.
 
-    Raises `WireError` where it is no message that answers this query, or belongs to another robot.
+    A stored sample is returned as its author published it. Raises `WireError` if the message does
+    not answer this query, or belongs to another robot.
     """
     if channel is KEPT:
         return _kept(payload)
@@ -249,7 +239,7 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
 
 
 def _kept(payload: bytes) -> Sample:
-    """The sample in a reply of the router; raises `WireError`."""
+    """Return the sample in a reply of the router; raises `WireError`."""
     kept = decoded(payload, Kept)
     sample = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
     if opened(sample)[0] not in REPLIES[KEPT]:
@@ -258,9 +248,7 @@ def _kept(payload: bytes) -> Sample:
 
 
 NO_COUNTER = 2**32 - 1
-"""Stands for the counter of a sample that was a reply: it was published at another time, or
-never.
-"""
+"""The counter of a sample that was a reply, which has none of its own."""
 
 
 LATEST_CACHE = 8_192
@@ -277,9 +265,7 @@ WHOLE_CACHE = 1_000_000
 
 
 def cache_size(channel: Channel) -> int:
-    """Number of publications of a key that its publisher stores for late joiners and after a
-    cut.
-    """
+    """Return the number of publications of a key that its publisher stores."""
     if channel.delivery == "all":
         return WHOLE_CACHE
     if channel.message in (FusedMap, MapEstimate, Prior):
@@ -293,7 +279,7 @@ def cache_size(channel: Channel) -> int:
 class MemoryNetwork:
     """The keys of one process: publications are delivered at once, in order, to every other bus.
 
-    It stores the publications that `latest` and `all` channels promise to late joiners.
+    It stores the publications of `latest` and `all` channels for late joiners.
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
@@ -305,12 +291,12 @@ class MemoryNetwork:
     _receivers: dict[str, list["MemoryBus"]] = field(default_factory=dict)
 
     def enter(self, bus: "MemoryBus") -> None:
-        """Adds a bus, the last one to which a sample is delivered."""
+        """Add a bus; samples are delivered to it last."""
         self.buses.append(bus)
         bus.number = next(self._numbers)
 
     def leave(self, bus: "MemoryBus") -> None:
-        """Removes a bus."""
+        """Remove a bus."""
         self.buses.remove(bus)
         for _, buses in self._requests.values():
             for wanting in buses.values():
@@ -318,13 +304,13 @@ class MemoryNetwork:
         self._receivers.clear()
 
     def want(self, bus: "MemoryBus", channel: Channel, name: str) -> None:
-        """Adds the subscription of a bus."""
+        """Add the subscription of a bus."""
         _, buses = self._requests.setdefault(channel.name, (channel, {}))
         buses.setdefault(name, set()).add(bus)
         self._receivers.clear()
 
     def receivers(self, key: str) -> list["MemoryBus"]:
-        """The buses that subscribed to a key, in the order in which they were added."""
+        """Return the buses that subscribed to a key, in the order in which they were added."""
         found = self._receivers.get(key)
         if found is None:
             wanting: set[MemoryBus] = set()
@@ -337,7 +323,7 @@ class MemoryNetwork:
         return found
 
     def deliver(self, source: "MemoryBus", sample: Sample) -> None:
-        """Delivers a sample to every other bus that subscribed, and stores it for late joiners."""
+        """Deliver a sample to every other subscribed bus, and store it for late joiners."""
         found = channel_of(sample.key)
         if found is not None and found[0].delivery != "stream":
             stored = self.stored.setdefault(sample.key, deque(maxlen=cache_size(found[0])))
@@ -350,7 +336,7 @@ class MemoryNetwork:
 class MemoryBus:
     """A bus within one process: synchronous and deterministic.
 
-    number: its place among those of the network.
+    number: its position among the buses of the network.
     """
 
     def __init__(self, network: MemoryNetwork) -> None:
@@ -363,7 +349,7 @@ class MemoryBus:
         network.enter(self)
 
     def publish(self, out: Outgoing) -> int:
-        """Encodes and delivers at once; the wall clock of a memory bus is always zero."""
+        """Encode and deliver at once; the wall clock of a memory bus is always zero."""
         counter = self._counters[out.key]
         self._counters[out.key] = counter + 1
         payload = encoded(out.message)
@@ -371,11 +357,11 @@ class MemoryBus:
         return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
-        """Delivers the sample at once, unchanged."""
+        """Deliver the sample at once, unchanged."""
         self._network.deliver(self, sample)
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribes to this channel; the samples stored for late joiners come first."""
+        """Subscribe to a channel; the samples stored for late joiners come first."""
         for key, stored in self._network.stored.items():
             if _is_of(channel, name, key) and not self._subscribed(key):
                 requested = list(stored) if whole or channel.delivery == "all" else [stored[-1]]
@@ -388,20 +374,20 @@ class MemoryBus:
         return self in self._network.receivers(key)
 
     def queue(self, sample: Sample) -> None:
-        """Queues a sample, which `receive` returns."""
+        """Queue a sample for `receive`."""
         self._arrived.append(sample)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """All samples received since the last call; a memory bus never waits."""
+        """Return the samples since the last call; a memory bus never waits."""
         arrived = self._arrived  # one by one: another thread may be publishing
         return [arrived.popleft() for _ in range(len(arrived))]
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answers queries, within `ask`."""
+        """Answer queries, within `ask`."""
         self._network.answers.append((channel, name, answer))
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads, computed at once."""
+        """Compute and return the payloads of the replies at once."""
         for answered, names, answer in self._network.answers:
             if answered is channel and _is_of(channel, names, channel.key(name)):
                 try:
@@ -411,13 +397,13 @@ class MemoryBus:
         return []
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Sends a query; `receive` returns the replies with its next samples."""
+        """Send a query; `receive` returns the replies with its next samples."""
         for payload in self.ask(channel, name, request, 0.0):
-            with suppress(WireError):  # what is no reply to this question is dropped
+            with suppress(WireError):  # invalid replies are dropped
                 self._arrived.append(replied(channel, name, payload, 0))
 
     def again(self) -> None:
-        """Delivers the stored samples of whole subscriptions and of `all` channels once more."""
+        """Deliver the stored samples of whole subscriptions and of `all` channels again."""
         for key, stored in self._network.stored.items():
             found = channel_of(key)
             if found is None or not self._subscribed(key):
@@ -426,30 +412,30 @@ class MemoryBus:
                 self._arrived.extend(sample for source, sample in stored if source is not self)
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Nothing is lost in memory: an empty table."""
+        """Return an empty table: no sample is lost in memory."""
         return {}
 
     def awaited(self) -> set[str]:
-        """Nothing is lost in memory: an empty set."""
+        """Return an empty set: no sample is lost in memory."""
         return set()
 
     def publish_totals(self) -> Tally | None:
-        """Nothing is lost in memory: nothing is published."""
+        """Publish nothing: no sample is lost in memory."""
         return None
 
     def declare_alive(self, node: str) -> None:
-        """Holds a token."""
+        """Hold a token."""
         self._token(node, alive=True)
 
     def watch_alive(self, node: str = "*") -> None:
-        """Receives changes of tokens, the present ones first."""
+        """Receive changes of tokens, the present ones first."""
         self._network.want(self, ALIVE, node)
         for source, sample in self._network.alive.values():
             if source is not self and self._subscribed(sample.key):
                 self.queue(sample)
 
     def is_alive(self, node: str) -> bool:
-        """Whether anyone holds the token."""
+        """Return whether a bus holds the token."""
         return node in self._network.alive
 
     def _token(self, node: str, *, alive: bool) -> None:
@@ -465,7 +451,7 @@ class MemoryBus:
                 bus.queue(sample)
 
     def close(self) -> None:
-        """Leaves the network; the tokens are withdrawn."""
+        """Leave the network and withdraw the tokens."""
         self._network.leave(self)
         own = [node for node, (source, _) in self._network.alive.items() if source is self]
         for node in own:

@@ -1,6 +1,4 @@
-"""A set of integers as sorted, disjoint, closed intervals: its memory does not depend on their
-length.
-"""
+"""Sets of integers as sorted, disjoint, closed intervals, whatever their lengths."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
@@ -23,7 +21,7 @@ class IntervalSet:
         """Add the integers first … last; nothing if last < first."""
         if last < first:
             return
-        low = bisect_left(self._ends, first - 1)  # the first that reaches or touches it
+        low = bisect_left(self._ends, first - 1)  # the first interval that overlaps or touches it
         high = bisect_right(self._begins, last + 1)
         if low < high:
             first = min(first, self._begins[low])
@@ -39,7 +37,7 @@ class IntervalSet:
         return len(self._begins)
 
     def __iter__(self) -> Iterator[Interval]:
-        """The intervals in ascending order."""
+        """Iterate over the intervals in ascending order."""
         return zip(self._begins, self._ends, strict=True)
 
     @property
@@ -48,27 +46,25 @@ class IntervalSet:
         return self._ends[-1] if self._ends else -1
 
     def join_first(self, count: int) -> None:
-        """Join the first intervals, with what lies between them, until at most `count` are left."""
+        """Join the first intervals and the gaps between them until at most `count` are left."""
         excess = len(self._begins) - count
         if excess > 0:
             del self._begins[1 : 1 + excess], self._ends[:excess]
 
     def next_absent(self, number: int) -> int:
-        """The smallest integer from `number` on that is not in the set."""
+        """Return the smallest integer from `number` on that is not in the set."""
         at = bisect_left(self._ends, number)
         inside = at < len(self._begins) and self._begins[at] <= number
         return self._ends[at] + 1 if inside else number
 
     def last_absent(self, number: int) -> int:
-        """The largest integer up to `number` that is not in the set."""
+        """Return the largest integer up to `number` that is not in the set."""
         at = bisect_left(self._ends, number)
         inside = at < len(self._begins) and self._begins[at] <= number
         return self._begins[at] - 1 if inside else number
 
     def gaps(self, first: int, last: int) -> list[Interval]:
-        """The intervals of the integers first … last that are not in the set, in ascending
-        order.
-        """
+        """Return the intervals of first … last that are not in the set, in ascending order."""
         found: list[Interval] = []
         at = bisect_left(self._ends, first)
         while first <= last:

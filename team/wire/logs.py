@@ -1,8 +1,8 @@
-"""The log of a process: what others send can neither fill it nor forge a line of it.
+"""The log of a process, whose lines others can neither flood nor forge.
 
 Every record of the logger `teamslam` passes one filter. Each place in the program may log AT_ONCE
-lines, and regains PER_S of a line each second; the next line after a gap counts those left out.
-Control characters are escaped, so that a record is one line, of at most LONGEST characters.
+lines, and regains PER_S lines a second; the next line counts the omitted ones. Control characters
+are escaped, so that a record is one line, of at most LONGEST characters.
 """
 
 import logging
@@ -14,18 +14,18 @@ AT_ONCE = 50
 PER_S = 0.5
 """Number of lines that it regains each second."""
 LONGEST = 4_000
-"""Characters of a line that are logged."""
+"""Largest number of logged characters of a line."""
 
 
 class Limits(logging.Filter):
-    """Limits the rate of records by the place that logs them, and escapes their texts."""
+    """A filter that limits the rate of records by their place, and escapes their texts."""
 
     def __init__(self) -> None:
         super().__init__()
         self._sites: dict[tuple[str, int], tuple[float, float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is logged; its message is then one printable line."""
+        """Decide whether the record is logged, and make its message one printable line."""
         now = record.created
         site = (record.pathname, record.lineno)
         allowance, since, left_out = self._sites.get(site, (float(AT_ONCE), now, 0))
@@ -43,7 +43,7 @@ class Limits(logging.Filter):
         return True
 
     def forget(self) -> None:
-        """Forget what was logged."""
+        """Reset the limits of all places."""
         self._sites.clear()
 
 

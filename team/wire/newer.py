@@ -1,9 +1,8 @@
-"""Decides which of two messages of a `latest` channel is newer: by their contents, not by arrival.
+"""The order of messages of `latest` channels, by content instead of arrival.
 
-Zenoh orders the samples of one publisher on one key. Even so, a restarted centre, a late joiner's
-cache and a repeated reply deliver older messages after newer ones, and a robot that used them would
-go back in time. Each order here is total, so that receivers of the same messages end with the same
-message, in whatever order they arrive.
+Zenoh orders the samples of one publisher on one key, but a restarted centre, a late joiner's cache
+and a repeated reply deliver older messages after newer ones. Each order here is total, so receivers
+of the same messages end with the same message, whatever the order of arrival.
 """
 
 from collections.abc import Sequence
@@ -14,19 +13,18 @@ SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
 
 
 def set_order(received: int, withdrawn: int, members: Sequence[m.VersionEntry]) -> SetOrder:
-    """Sort key of a set: first the number of submaps that the centre had received, then the number
-    of withdrawn robots, then the set's size.
+    """Return the sort key of a set: number of received submaps, of withdrawn robots, and size.
 
-    The number of received submaps only grows, whichever robots are withdrawn or reinstated. With
-    the same submaps the fold may still withdraw a robot, as further ticks close, but reinstates
-    none; of sets with equal numbers the larger one contains the other.
+
+    The number of received submaps only grows. With the same submaps the fold may withdraw a further
+    robot, but reinstates none; of sets with equal numbers the larger one contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
     return received, withdrawn, sum(each.sequence + 1 for each in members), vector
 
 
 def is_newer_prior(new: m.Prior, known: m.Prior | None) -> bool:
-    """Compares incarnation, then set, then the robot's own number of submaps in the set."""
+    """Compare priors by incarnation, then set, then the robot's number of submaps in the set."""
 
     def order(prior: m.Prior) -> tuple[int, SetOrder, int]:
         members = set_order(prior.heard, prior.withdrawn, prior.members)
@@ -36,9 +34,7 @@ def is_newer_prior(new: m.Prior, known: m.Prior | None) -> bool:
 
 
 def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
-    """Compares: a final map is the newest; then exchange, then set, and a complete map before a
-    provisional one.
-    """
+    """Compare maps: final, exchange, set, complete before provisional."""
 
     def order(fused: m.FusedMap) -> tuple[bool, int, SetOrder, bool]:
         members = set_order(fused.heard, len(fused.withdrawn), fused.members)
@@ -48,11 +44,11 @@ def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
 
 
 def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
-    """The robot's progress as the larger numbers of both messages; of a newer incarnation, that
-    message.
+    """Return the larger numbers of both messages, or the message of the newer incarnation.
 
-    A restarted process first reports smaller numbers than in its earlier life. The larger ones
-    remain true: the same measurements give the same submaps.
+
+    A restarted process first reports smaller numbers; the larger ones remain valid, since equal
+    measurements give equal submaps.
     """
     if known is None or new.incarnation > known.incarnation:
         return new
@@ -69,9 +65,7 @@ def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
 
 
 def later_end(new: m.End, known: m.End | None) -> m.End:
-    """The end of the streams by the larger counter of each stream in both messages; notes of
-    `new`.
-    """
+    """Return the end with the larger counter of each stream in both messages; notes of `new`."""
     if known is None:
         return new
     streams = {each.robot: each for each in known.streams}
@@ -87,9 +81,7 @@ def later_end(new: m.End, known: m.End | None) -> m.End:
 
 
 def later_head(new: m.StreamHead, known: m.StreamHead | None) -> m.StreamHead:
-    """The message with the larger counter; of equal ones the newer, unless only the other says
-    "ended".
-    """
+    """Return the message with the larger counter; of equal ones "ended", else the newer."""
 
     def order(head: m.StreamHead) -> tuple[int, int, bool]:
         return head.incarnation, head.measurements, head.state == "ended"

@@ -1,4 +1,4 @@
-"""When to request missing data: after a delay, at growing intervals, anew when the gap changes."""
+"""The times at which missing data are requested: after a delay, then at growing intervals."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ class Patience(Generic[K]):
     _gaps: dict[K, tuple[Hashable, float, float]] = field(default_factory=dict)
 
     def due(self, gaps: Mapping[K, Hashable], now_s: float) -> list[K]:
-        """The names of the gaps to be requested now; a gap that has changed begins anew."""
+        """Return the names of the gaps to request now; a changed gap begins anew."""
         self._gaps = {name: known for name, known in self._gaps.items() if name in gaps}
         found = []
         for name, gap in gaps.items():

@@ -1,4 +1,4 @@
-r"""Makes texts of others safe to print: they may hold terminal escapes or forge lines.
+r"""Printable forms of foreign texts, which may contain terminal escapes or forged lines.
 
 C0 and C1 control characters (line ends among them), bidirectional overrides and other invisible
 format characters are written as `\x1b` or `\u202e`. Stored texts keep their bytes.
@@ -14,22 +14,22 @@ T = TypeVar("T")
 
 
 def one_line(text: str) -> str:
-    """A text as one line without control characters, for a terminal, a log or a report."""
+    """Return a text as one line without control characters, for a terminal, log or report."""
     return text if text.isprintable() else "".join(map(_printable, text))
 
 
 def lines(text: str) -> str:
-    """As `one_line`, for each line of a text of this program."""
+    """Apply `one_line` to each line of a text of this program."""
     return "\n".join(one_line(line) for line in text.split("\n"))
 
 
 def cut(text: str, length: int) -> str:
-    """At most so many characters of a text, with an ellipsis in place of the rest."""
+    """Shorten a text to `length` characters, with an ellipsis in place of the rest."""
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def readable(value: T) -> T:
-    """A message, or part of one, with all its texts as `one_line`; itself where nothing changes."""
+    """Apply `one_line` to all texts of a message; an unchanged message is returned itself."""
     return cast("T", _readable(value))
 
 

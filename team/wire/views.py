@@ -1,9 +1,8 @@
-"""The table of views: what a viewer node publishes below `view/`, in the schemas of other tools.
+"""The table of views, which a viewer node publishes in the schemas of other tools.
 
-A view is no message of the team: no node decodes it, nothing is computed from it, and verification
-skips it. Foxglove, Lichtblick and Rerun know its schema, so that a log opens there without any
-configuration. Frames: `map` is the frame of the team's map, `robot/<name>` that of a robot; metres,
-radians, counter-clockwise; z = 0.
+No node decodes a view, no estimate depends on it, and verification skips it. Foxglove, Lichtblick
+and Rerun support its schema, so they open a log without configuration. Frames: `map` is the frame
+of the team's map, `robot/<name>` that of a robot; metres, radians, counter-clockwise; z = 0.
 """
 
 import re
@@ -21,9 +20,9 @@ MAP_FRAME = "map"
 class TeamFigures(msgspec.Struct, frozen=True):
     """Figures of the team for plots; unknown ones are left out.
 
-    Errors are those of the map without alignment to the truth; landmark_nees_per_dof takes each
-    landmark by itself (2 degrees of freedom; its expectation is 1). status: the centre's own
-    figures, the consistency monitor's among them.
+    Errors are those of the map without alignment to the truth; landmark_nees_per_dof is of each
+    landmark by itself (2 degrees of freedom; its expectation is 1). status: the centre's figures,
+    those of the consistency monitor included.
     """
 
     team_time_s: float
@@ -37,7 +36,7 @@ class TeamFigures(msgspec.Struct, frozen=True):
 class RobotFigures(msgspec.Struct, frozen=True):
     """Figures of one robot for plots: its running pose, and its errors with their 3σ bounds.
 
-    Figures that need an absent truth are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is
+    Figures without truth are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is
     1. status: the robot's own figures.
     """
 
@@ -65,30 +64,30 @@ class View:
     meaning: str
 
     def key(self, robot: str = "") -> str:
-        """The relative key, for one robot where the view is of one."""
+        """Return the relative key; of a view of a robot, for that robot."""
         return self.template.replace("{robot}", robot)
 
     def is_of(self, key: str) -> bool:
-        """Whether a relative key belongs to this view."""
+        """Return whether a relative key belongs to this view."""
         pattern = re.escape(self.template).replace(r"\{robot\}", "[^/]+")
         return re.fullmatch(pattern, key) is not None
 
 
 MAP = View("view/map", "foxglove.SceneUpdate", "1 Hz, when it has changed",
-           "the team's landmarks with 95 % ellipses; the true ones")  # fmt: skip
+           "landmarks with 95 % ellipses, and the true ones")  # fmt: skip
 ROBOTS = View("view/robots", "foxglove.SceneUpdate", "1 Hz",
-              "the robots with 95 % ellipses and the last stretch of their paths")  # fmt: skip
+              "robots with 95 % ellipses and recent paths")  # fmt: skip
 PATHS = View("view/paths", "foxglove.SceneUpdate", "0.1 Hz",
-             "whole paths, thinned: running, true, at the end smoothed")  # fmt: skip
+             "thinned paths: running, true, finally smoothed")  # fmt: skip
 TRANSFORMS = View("view/transforms", "foxglove.FrameTransforms", "1 Hz",
-                  "the robots' frames in that of the map")  # fmt: skip
+                  "robots' frames in the map's")  # fmt: skip
 POSE = View("view/pose/{robot}", "foxglove.PoseInFrame", "1 Hz", "a robot's running pose")
 LANDMARKS = View("view/landmarks", "foxglove.PointCloud", "as view/map",
-                 "the team's landmarks as points, with their numbers")  # fmt: skip
+                 "landmarks as points, with numbers")  # fmt: skip
 PARTICLES = View("view/particles/{robot}", "foxglove.PointCloud", "1 Hz, when it has changed",
-                 "a robot's thinned particles with their weights")  # fmt: skip
+                 "a robot's particles with weights")  # fmt: skip
 LOG = View("view/log", "foxglove.Log", "on change",
-           "who joined, was lost, was refused; what the nodes warn of")  # fmt: skip
+           "robots that joined, were lost or refused; warnings")  # fmt: skip
 TEAM = View("view/team", TeamFigures, "1 Hz", "figures of the team")
 ROBOT = View("view/robot/{robot}", RobotFigures, "1 Hz", "figures of a robot")
 
@@ -96,16 +95,14 @@ VIEWS: tuple[View, ...] = tuple(v for v in list(globals().values()) if isinstanc
 
 
 def view_of(key: str) -> View | None:
-    """The view that a relative key belongs to; None for a key of a channel, and for an unknown
-    one.
-    """
+    """Return the view of a relative key; None for keys of channels and unknown keys."""
     if VIEW.owner(key) is None:
         return None
     return next((view for view in VIEWS if view.is_of(key)), None)
 
 
 def json_schema(of: type[msgspec.Struct]) -> dict[str, Any]:
-    """The JSON Schema of figures, without references: not every tool resolves them."""
+    """Return the JSON Schema of figures, without references, which some tools do not resolve."""
     (_,), components = msgspec.json.schema_components((of,), ref_template="#/$defs/{name}")
     schema = components[of.__name__]
     return {"title": of.__name__, **schema}

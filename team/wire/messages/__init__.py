@@ -1,13 +1,13 @@
-"""The messages: frozen, versioned, positional. A module for each who says them.
+"""The messages: frozen, versioned, positional; one module for each kind of publisher.
 
 On the wire a message is a MessagePack array `[tag, field, field, …]` in the order of its class;
 `tag` is "name/version". A later version of the program may append fields (with defaults) without a
-new version; readers ignore what follows the fields that they know. A new meaning, unit or frame is
-a new version. Arrays travel as `bin`: little-endian, C order, of the type that the field's name in
-`Floats`, `Ids` or `Stamps` says. SI units, radians, bearings in (−π, π].
+new version; readers ignore further fields. A new meaning, unit or frame is a new version. Arrays
+travel as `bin`: little-endian, C order, of the type that `Floats`, `Ids` or `Stamps` names. SI
+units, radians, bearings in (−π, π].
 
-Every message has `stamp_ns`, its team time: the time of the measurement that it is about.
-`check` raises `ValueError` with the reason when the numbers can not be what the message says.
+Every message has `stamp_ns`, its team time: the time of the measurement that it is about. `check`
+raises `ValueError` with the reason where the numbers do not fit the message.
 """
 
 from team.wire.messages.base import Bias as Bias

@@ -1,4 +1,4 @@
-"""What every message has, and what its numbers are checked for."""
+"""The base of all messages: types of fields, and checks of arrays that several messages share."""
 
 from typing import Annotated, Literal
 
@@ -16,7 +16,7 @@ from team.wire.arrays import (
 Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 Text = Annotated[str, Meta(max_length=20_000)]
 Document = Annotated[str, Meta(max_length=1_000_000)]
-"""A configuration: the world's has 1,500 characters for each robot."""
+"""A configuration; the world's has 1,500 characters for each robot."""
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 StampNs = Annotated[int, Meta(ge=-(2**62), lt=2**62)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
@@ -26,12 +26,12 @@ Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """What every message has: the team time that it is about."""
+    """A message with its team time: the stamp of the measurement that it is about."""
 
     stamp_ns: StampNs
 
     def check(self) -> None:
-        """Raise ValueError where the arrays do not fit together; nothing to check here."""
+        """Raise ValueError if the arrays do not fit together; the base has none."""
 
 
 def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:
@@ -53,5 +53,5 @@ def check_counts(count_bytes: bytes, groups: int, total: int) -> None:
 
 
 def tag_of(message: type[Message]) -> str:
-    """A message's tag, "name/version"."""
+    """Return the tag of a message, "name/version"."""
     return str(message.__struct_config__.tag)

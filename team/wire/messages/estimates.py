@@ -1,4 +1,4 @@
-"""What a robot estimates by itself, for viewers and for rules on whole maps, and its last words."""
+"""A robot's own estimates, for viewers and rules on whole maps, and the end of its work."""
 
 from typing import Annotated
 
@@ -12,7 +12,7 @@ from team.wire.messages.base import Count, Digest, Message, Name, Text, check_la
 class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):
     """A robot's own running map in the team's frame: landmark means and covariances.
 
-    exchange: counts the maps that a rule with feedback exchanged (lockstep), 0 under `join`.
+    exchange: number of exchanges of maps under a rule with feedback (lockstep); 0 under `join`.
     means: L × 2 floats. covariance: packed upper triangle of the 2L × 2L joint if `joint`, else the
     L packed 2 × 2 blocks (3 floats each).
     """
@@ -31,13 +31,13 @@ class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):
 
 
 class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
-    """A robot's pose at stamp_ns, with its 3 × 3 covariance, in the frame that it names.
+    """A robot's pose at stamp_ns, with its 3 × 3 covariance, in the frame `frame`.
 
-    `map_digest` names the fused map that went into it (8 zero bytes: none), `sequence` the submap
-    in progress. frame: in the notation of `FusedMap.frame`; empty in logs of earlier versions.
-    in_team_frame: this is the team's frame. On team/pose it is that of the named map, on own/pose
-    the initial pose is known. A pose on team/pose that is not in the team's frame is the own pose:
-    it withdraws the poses before it.
+    map_digest: the fused map that it uses (8 zero bytes: none). sequence: the submap in progress.
+    frame: in the notation of `FusedMap.frame`; empty in logs of earlier versions. in_team_frame:
+    frame is the team's; on team/pose that of the named map, on own/pose if the initial pose is
+    known. A pose on team/pose that is not in the team's frame is the own pose and withdraws the
+    poses before it.
     """
 
     robot: Name
@@ -57,7 +57,7 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
 class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):
     """A thinned particle cloud, for viewers: P × 3 poses and P weights.
 
-    In the frame of the robot's own poses (`robot/{robot}/pose`), not in that of the team's map.
+    They are in the frame of the robot's own poses (`robot/{robot}/own/pose`).
     """
 
     robot: Name
@@ -70,13 +70,11 @@ class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):
 
 
 class Innovation(Message, frozen=True, kw_only=True, tag="innovation/1"):
-    """Σ νᵀ S⁻¹ ν of a window's measurements against their prediction; χ² where the models are
-    right.
+    """NIS of a window's measurements, Σ νᵀ S⁻¹ ν; χ²(dof) if the models are right.
 
-    dof: its degrees of freedom, two for each measurement of a landmark that the window knew
-    already. (robot, incarnation, sequence) and stamp_ns are those of the window's submap; an
-    estimator over the whole stream says it of the measurements since the last of these, named by
-    its incarnations so far.
+    dof: degrees of freedom, two for each measurement of an already mapped landmark. (robot,
+    incarnation, sequence) and stamp_ns are those of the window's submap; an estimator over the
+    whole stream publishes the NIS of the measurements since its last one.
     """
 
     robot: Name
@@ -87,10 +85,10 @@ class Innovation(Message, frozen=True, kw_only=True, tag="innovation/1"):
 
 
 class Rendezvous(Message, frozen=True, kw_only=True, tag="rendezvous/1"):
-    """Announces that `submaps` buffered submaps are released; the oldest waited `waited_s` seconds.
+    """Release of `submaps` buffered submaps; the oldest was buffered for `waited_s` seconds.
 
-    teammates: the robots that it sees, which release theirs on this message; empty where the robot
-    itself was seen, or its stream has ended.
+    teammates: the observed robots, which release theirs on this message; empty if the robot was
+    observed itself, or its stream has ended.
     """
 
     robot: Name
@@ -101,18 +99,16 @@ class Rendezvous(Message, frozen=True, kw_only=True, tag="rendezvous/1"):
 
 
 class Disposition(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """How many measurements of a robot ended in one way: in a submap, rejected for a reason,
-    lost…
-    """
+    """Number of a robot's measurements with one disposition, such as "submap" or a rejection."""
 
     disposition: Text
     measurements: Count
 
 
 class Done(Message, frozen=True, kw_only=True, tag="done/1"):
-    """A robot has consumed every measurement of its stream and sent its last submap.
+    """End of a robot's work: all measurements are consumed, and the last submap is sent.
 
-    last_map: the sequence of its last own map, where the rule consumes own maps; −1: none.
+    last_map: sequence of the last own map, if the rule consumes own maps; −1: none.
     """
 
     robot: Name

@@ -1,4 +1,4 @@
-"""The team's map, and what goes out with it."""
+"""The team's map, priors and trajectories, with the parts of these messages."""
 
 from itertools import pairwise
 from typing import Annotated
@@ -32,10 +32,10 @@ from team.wire.messages.orders import Judgement
 
 
 class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """One entry of a version vector: all submaps of (robot, incarnation) up to `sequence` are in.
+    """One entry of a version vector: it contains the submaps of a stream up to `sequence`.
 
-    Of a rule on whole maps it is the robot's map of that sequence, of one on raw measurements the
-    robot's measurements up to that counter.
+    Under a rule on whole maps sequence is that of the robot's map, under a rule on raw measurements
+    their counter.
     """
 
     robot: Name
@@ -44,7 +44,7 @@ class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """What the map says of an error that the submaps of (robot, incarnation) share, ± one sigma."""
+    """Estimate of an error that all submaps of (robot, incarnation) share, with its sigma."""
 
     robot: Name
     incarnation: Count
@@ -54,12 +54,12 @@ class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class Membership(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """Of which landmark of the map each unnamed landmark of (robot, incarnation) is: M of them.
+    """The landmarks of the map to which M unnamed landmarks of (robot, incarnation) belong.
 
-    sequences, locals: of the submap, and its number less 2³¹; identities: as in the map. steps: M
-    bytes, why it went into another set than its own: 0 it has not, 1 track, 2 near, 3 sweep, 4
-    closure, 5 merge of robots, 6 verdict. figures: M × 3 floats: the log-likelihood ratio of one
-    landmark against two, that of the best rival, the standard deviation of the difference [m].
+    sequences, locals: submap, and number less 2³¹. identities: as in the map. steps: M bytes, the
+    step of association that merged it: 0 none, 1 track, 2 near, 3 sweep, 4 closure, 5 merge of
+    robots, 6 verdict. figures: M × 3 floats: log-likelihood ratio of one landmark against two, that
+    of the best rival, standard deviation of the difference [m].
     """
 
     robot: Name
@@ -74,12 +74,11 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """A closure or a merge of robots: accepted, undone, or waiting, with its figures.
 
-    kind: "closure", "merge", "undone" or "waits"; stamp_ns: the end of the last submap that it
-    rests on. about: between whom. pairs, llr: landmarks that are one, and the sum of their
-    log-likelihood ratios; rival_pairs, rival_llr: of the best other alignment. share: of the
-    landmarks there, of the side that has fewer. sd: the largest standard deviation of a pair [m].
-    why: the test that failed. absent: landmarks that one side has where the other looked and has
-    none.
+    kind: "closure", "merge", "undone" or "waits". stamp_ns: end of the last submap in it. about:
+    the two sides. pairs, llr: number of pairs, and the sum of their log-likelihood ratios;
+    rival_pairs, rival_llr: of the best other alignment. share: matched share of the landmarks
+    there, of the side that has fewer. sd: largest standard deviation of a pair [m]. why: the failed
+    test. absent: landmarks of one side that are missing where the other side looked.
     """
 
     stamp_ns: StampNs
@@ -99,22 +98,20 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
     members: the version vector of its set, ordered; missing: submaps known to be in a gap of it, as
-    (robot, incarnation, sequence). digest: 8-byte name of the set (and of the rule and its
-    settings). frame: the team's: "robot/incarnation" whose start fixes it. provisional: some
-    members lie ahead of the watermark. covariance: as in MapEstimate. chi2, dof: the joint cost; 0,
-    0 where the rule has none. exchange: of the lockstep round, 0 under `join`. reasons: why robots
-    are not joined, what speaks for another minimum, and that models do not fit the data. biases:
-    by robot, incarnation and name, where submaps have sensitivities. joined: how robots with an
-    unknown start were joined, and how sure that is. withdrawn: the robots that the team goes on
-    without, ascending. covariance_scale: how many times the submaps' covariances ought to be taken,
-    by how well they agree; 1 is right, 0: not known. lost: of a final map, the robots whose streams
-    are not wholly in it, since nobody waited for them any more, ascending; such a map is
-    provisional. heard: how many submaps and orders to withdraw a robot the centre had, in the map
-    or not: of two maps that with more is the newer one, and of equals that with more members.
-    memberships: by robot and incarnation, where landmarks have no names: a landmark with members of
-    one submap is tentative; a running map names the first and the last few members of each.
-    decisions: the newest closures and merges of robots, then what waits.
-    verdicts: an operator's that the map rests on.
+    (robot, incarnation, sequence). digest: 8-byte name of the set, the rule and its settings.
+    frame: the stream whose start fixes the frame, "robot/incarnation". provisional: some members
+    are ahead of the watermark. covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 if
+    the rule has none. exchange: number of the lockstep round, 0 under `join`. reasons: why robots
+    are not joined, signs of another minimum, and of models that do not fit the data. biases: by
+    robot, incarnation and name, if submaps have sensitivities. joined: how robots with an unknown
+    start were joined, with the evidence. withdrawn: withdrawn robots, ascending. covariance_scale:
+    factor by which the submaps' covariances should be multiplied, from their agreement; 1 is
+    consistent, 0: unknown. lost: robots whose streams are incomplete in the final map, ascending;
+    such a map is provisional. heard: number of submaps and withdrawals that the centre had
+    received; the newer of two maps has more, or as many and more members. memberships: by robot and
+    incarnation, if landmarks have no names; a landmark of one submap is tentative, and a running
+    map names the first and last few members of each. decisions: the newest closures and merges of
+    robots, then the waiting ones. verdicts: the operators' verdicts in the map.
     """
 
     rule: Text
@@ -157,16 +154,15 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
 
 
 class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
-    """For one robot: the joint marginal of its last fused end pose and the landmarks.
+    """The joint marginal of a robot's last fused end pose and landmarks.
 
-    The set is named by digest; `sequence` is the robot's last submap in it (−1: none; the pose is
-    the start pose). mean: 3 + 2L floats; covariance: packed upper triangle. The robot is to take
-    its submaps that are not in the set as the centre takes them: their covariances times
-    covariance_factor, their means moved by the errors that the robot's submaps share (biases).
-    members, heard: as in FusedMap, and withdrawn the number of robots that the team goes on
-    without; they give the newer one of two. frame: that of the pose and the landmarks, as in
-    FusedMap; in_team_frame: it is the team's. One that is not withdraws the priors before it: the
-    robot is not in the team's map, `frame` is its own, and ids, mean and covariance are empty.
+    digest: the set; sequence: the robot's last submap in it (−1: none; the pose is the start pose).
+    mean: 3 + 2L floats; covariance: packed upper triangle. The robot uses its further submaps as
+    the centre does: covariances times covariance_factor, means moved by the shared errors (biases).
+    members, heard: as in FusedMap; withdrawn: number of withdrawn robots; they order two priors.
+    frame: of pose and landmarks, as in FusedMap; in_team_frame: it is the team's. A prior that is
+    not in the team's frame withdraws the priors before it: the robot is not in the team's map,
+    `frame` is its own, and ids, mean and covariance are empty.
     """
 
     robot: Name
@@ -198,9 +194,9 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
 class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
     """A robot's smoothed poses in the final map: K stamps, K × 3 poses, K × 9 floats.
 
-    Under `join` those of its submaps' ends, under `batch` those of its keyframes. start,
-    start_covariance: where the first submap begins, 3 and 9 floats; crosses: K × 9 floats, the
-    covariance of each pose with the one before it, of the first with the start, row by row. These
+    Under `join` they are the ends of its submaps, under `batch` its keyframes. start,
+    start_covariance: start of the first submap, 3 and 9 floats; crosses: K × 9 floats, the
+    covariance of each pose with the one before it (of the first with the start), row by row. These
     three are empty under `batch`.
     """
 

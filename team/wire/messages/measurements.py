@@ -1,4 +1,4 @@
-"""What a robot's sensors say, and where its stream ends."""
+"""The measurements of a robot's sensors, and the end of its stream."""
 
 import math
 from typing import Annotated, Literal
@@ -23,9 +23,7 @@ from team.wire.messages.base import Count, Message, Name, Real, Text
 
 
 class Measurement(Message, frozen=True, kw_only=True):
-    """What every measurement of a sensor stream has: robot, incarnation and the robot's measurement
-    counter.
-    """
+    """A measurement of a sensor stream, with the robot's measurement counter as `number`."""
 
     robot: Name
     incarnation: Count
@@ -35,14 +33,14 @@ class Measurement(Message, frozen=True, kw_only=True):
 class InitialPose(Measurement, frozen=True, kw_only=True, tag="start/1"):
     """Measurement 0 of an incarnation: the start pose in the team's frame, if it is known.
 
-    pose: 3 floats (x, y, theta), or empty when unknown. covariance: 3 × 3 floats, row by row; empty
-    for a pose that is exactly known.
+    pose: 3 floats (x, y, theta); empty: unknown. covariance: 3 × 3 floats, row by row; empty:
+    exact.
     """
 
     pose: Floats
     covariance: Floats
 
-    def check(self) -> None:  # noqa: D102 - the base class says what a check is
+    def check(self) -> None:  # noqa: D102 - as in the base class
         if len(floats(self.pose, "pose")) not in (0, 3):
             raise ValueError("wrong length: pose has neither 0 nor 3 numbers")
         check_finite(self.pose, "pose")
@@ -63,7 +61,7 @@ class Increment(Measurement, frozen=True, kw_only=True, tag="increment/1"):
 
     increment: 3 floats (forward [m], left [m], turn [rad]), the pose of its end in the frame of its
     start. covariance: 3 × 3 floats, row by row, of an error in the frame of its end (pose ∘
-    Exp(error)), of any rank; empty where the source claims none.
+    Exp(error)), of any rank; empty: none is stated.
     """
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
@@ -82,7 +80,7 @@ class Steering(Measurement, frozen=True, kw_only=True, tag="steering/1"):
     """One odometry interval of a car that ends at stamp_ns, as its encoders read it.
 
     wheel_speed [m/s]: of the rear wheel that carries the encoder. steering [rad]: the angle of the
-    front wheels, left is positive. What the two mean is the robot's motion model's to say.
+    front wheels, left is positive. The robot's motion model converts both to a motion.
     """
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
@@ -95,10 +93,10 @@ class Steering(Measurement, frozen=True, kw_only=True, tag="steering/1"):
 
 
 class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1"):
-    """Range [m] and bearing [rad] of landmarks with known identities, seen at stamp_ns.
+    """Range [m] and bearing [rad] of landmarks with identities, at stamp_ns.
 
-    covariances: of each its own, 3 floats (range-range, range-bearing, bearing-bearing); empty
-    where they have the sensor's.
+    covariances: 3 floats of each (range-range, range-bearing, bearing-bearing); empty: the sensor's
+    noise.
     """
 
     ids: Ids
@@ -116,10 +114,10 @@ class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1")
 
 
 class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
-    """Places of landmarks with known identities in the sensor's frame, seen at stamp_ns.
+    """Positions of landmarks with identities in the sensor's frame, at stamp_ns.
 
-    positions: L × 2 floats (ahead [m], left [m]). covariances: of each its own, 3 floats (xx, xy,
-    yy); empty where they have the sensor's noise of range and bearing.
+    positions: L × 2 floats (ahead [m], left [m]). covariances: 3 floats of each (xx, xy, yy);
+    empty: the sensor's noise of range and bearing.
     """
 
     ids: Ids
@@ -135,18 +133,17 @@ class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
 
 
 AnyOdometry = Odometry | Increment | Steering
-"""What tells of one odometry interval."""
+"""A measurement of one odometry interval."""
 AnyScan = Observations | Points
-"""What tells of landmarks with known identities."""
+"""A measurement of landmarks with identities."""
 
 
 class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
-    """Range [m] and bearing [rad] of L landmarks without identities, seen at stamp_ns in one scan.
+    """Range [m] and bearing [rad] of L landmarks without identities, one scan at stamp_ns.
 
-    Some may be clutter, that is no landmark at all. Two of one scan are never the same landmark.
-    covariances: L × 3 floats, packed 2 × 2 of (range, bearing), or empty: the sensor's own.
-    signatures: L floats that look alike for the same landmark, such as a trunk's diameter [m], or
-    empty.
+    Some may be clutter. Two of one scan are different landmarks. covariances: L × 3 floats, packed
+    2 × 2 of (range, bearing), or empty: the sensor's noise. signatures: L floats that are similar
+    for one landmark, such as a trunk's diameter [m], or empty.
     """
 
     ranges: Floats
@@ -165,7 +162,7 @@ class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
 
 
 class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):
-    """Range [m] and bearing [rad] of teammates, seen at stamp_ns."""
+    """Range [m] and bearing [rad] of teammates at stamp_ns."""
 
     teammates: tuple[Name, ...]
     ranges: Floats
@@ -177,9 +174,7 @@ class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):
 
 
 class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """The last counters of one robot's stream: its measurements are numbered 0 … measurements −
-    1.
-    """
+    """End of a robot's stream: its measurements are numbered 0 … measurements − 1."""
 
     robot: Name
     incarnation: Count
@@ -187,18 +182,17 @@ class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class End(Message, frozen=True, kw_only=True, tag="end/1"):
-    """The world has published everything; its last counters."""
+    """End of all streams of a world, with their last counters."""
 
     streams: tuple[StreamEnd, ...]
     notes: tuple[Text, ...] = ()
 
 
 class StreamHead(Message, frozen=True, kw_only=True, tag="stream_head/1"):
-    """How far a robot's own source is: it has numbered 0 … measurements − 1; stamp_ns is the last
-    one's.
+    """Progress of a robot's source: it has numbered 0 … measurements − 1, the last at stamp_ns.
 
-    state: "open" while more is measured; "left" when the driver has stopped and may come back;
-    "ended" when this incarnation has no more.
+    state: "open": measurements follow; "left": the driver stopped and may return; "ended": the
+    incarnation is complete.
     """
 
     robot: Name
@@ -208,10 +202,10 @@ class StreamHead(Message, frozen=True, kw_only=True, tag="stream_head/1"):
 
 
 class MeasurementsRequest(Message, frozen=True, kw_only=True, tag="readings_wanted/1"):
-    """A query to a source: measurements first … last of (robot, incarnation); last −1: all there
-    are.
+    """Query to a source for measurements first … last of a stream; last −1: all.
 
-    only: the source gives what it has, and does not begin the stream anew for what it has not.
+    only: the source replies with stored measurements and does not begin a new incarnation for
+    missing ones.
     """
 
     robot: Name

@@ -1,4 +1,4 @@
-"""What processes say of themselves: configuration, progress, status, faults, life."""
+"""State of a process: configuration, progress, status, faults, liveliness, tally."""
 
 from typing import Annotated
 
@@ -17,12 +17,11 @@ class Configuration(Message, frozen=True, kw_only=True, tag="configured/1"):
 
 
 class Progress(Message, frozen=True, kw_only=True, tag="progress/1"):
-    """How far a node is: per (robot, incarnation) the count of measurements it is done with, and of
-    submaps.
+    """Progress of a node with a stream: counts of measurements and of submaps.
 
-    A robot reports itself: measurements consumed (while it waits for an exchange of maps:
-    received), and stamp_ns is the team time before which it sends no submap any more. The centre
-    reports submaps that are in its set; the recorder reports measurements that it has taken.
+    A robot reports consumed measurements (during an exchange of maps: received ones); stamp_ns is
+    the team time before which it sends no further submap. The centre reports submaps in its set,
+    the recorder recorded measurements.
     """
 
     node: Text
@@ -33,7 +32,7 @@ class Progress(Message, frozen=True, kw_only=True, tag="progress/1"):
 
 
 class Status(Message, frozen=True, kw_only=True, tag="status/1"):
-    """What a node is doing, for people: a state word, figures by name, warnings in words."""
+    """Status of a node, for people: a state, figures by name, warnings."""
 
     node: Text
     state: Text
@@ -42,12 +41,12 @@ class Status(Message, frozen=True, kw_only=True, tag="status/1"):
 
 
 class Fault(Message, frozen=True, kw_only=True, tag="fault/1"):
-    """A node could not handle a message and set it aside; stamp_ns is the message's.
+    """A message that a node could not handle and set aside; stamp_ns is the message's.
 
-    origin: its key, the query's for a reply, the duty's name if there was no message. count: its
-    publisher's count of the key; -1: none. message: its tag; empty where it raised before it was
-    one. error, text: the exception's class and words. place: module:function:line. digest: 8 bytes,
-    the payload's BLAKE2b.
+    origin: its key, or the query's for a reply, or the name of a duty without message. count: the
+    publisher's counter of the key; -1: none. message: its tag; empty before it was decoded. error,
+    text: the exception's class and text. place: module:function:line. digest: 8 bytes, the
+    payload's BLAKE2b.
     """
 
     node: Text
@@ -61,16 +60,16 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault/1"):
 
 
 class Liveliness(Message, frozen=True, kw_only=True, tag="liveliness/1"):
-    """A node's liveliness token appeared or went; a recorded input of whoever reacted to it."""
+    """Appearance or loss of a node's liveliness token; recorded as an input of other nodes."""
 
     node: Text
     alive: bool
 
 
 class Tally(Message, frozen=True, kw_only=True, tag="tally/1"):
-    """What a process has published of each key, said at its end: what is not in a log is missing.
+    """Number of messages that a process has published on each key, at its end.
 
-    since_ns: its wall clock at the beginning [ns since 1970]; what it published is not older.
+    since_ns: the process's wall clock at its beginning [ns since 1970].
     """
 
     node: Text
@@ -84,11 +83,11 @@ class Tally(Message, frozen=True, kw_only=True, tag="tally/1"):
 
 
 class KeptRequest(Message, frozen=True, kw_only=True, tag="kept_wanted/1"):
-    """A query to the router for samples that it stores, newest last.
+    """Query to the router for stored samples, newest last.
 
-    channels: the names of the channels that are wanted. node: the node that asks. run_ns: how long
-    ago its run began; of the messages that end a team only those are sent that are younger, or that
-    a process of this node missed: it was in that run and left without a `Tally`.
+    channels: names of the requested channels. node: the requesting node. run_ns: age of its run;
+    ends of a team are sent if they are younger, or if a process of this node was in that run and
+    left without a `Tally`.
     """
 
     channels: tuple[Text, ...]
@@ -97,9 +96,9 @@ class KeptRequest(Message, frozen=True, kw_only=True, tag="kept_wanted/1"):
 
 
 class Kept(Message, frozen=True, kw_only=True, tag="kept/1"):
-    """A sample that the router stores, as its author published it: key, payload, and attachment.
+    """A stored sample of the router, as its author published it.
 
-    stamp_ns: the sample's team time, wall_ns: its author's wall clock, counter: its author's.
+    stamp_ns, wall_ns, counter: of the sample's attachment.
     """
 
     key: Text

@@ -1,4 +1,4 @@
-"""What operators say: who is left out, what is one landmark, when a live team ends."""
+"""Operators' orders: withdrawals, verdicts, nodes that are given up, the end of a team."""
 
 from typing import Annotated
 
@@ -9,11 +9,10 @@ from team.wire.messages.base import Count, Message, Name, Text
 
 
 class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
-    """The team goes on without a robot: the map is that of the set without its submaps, and without
-    the inter-robot measurements by it or of it. A member of the set like a submap: there is no way
-    back.
+    """Withdrawal of a robot, for good; a member of the set.
 
-    by: who ordered it, "operator" or "central". reason: in words.
+    The map is that of the set without the robot's submaps and inter-robot factors. by: its author,
+    "operator" or "central". reason: text.
     """
 
     robot: Name
@@ -22,11 +21,9 @@ class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
 
 
 class WithdrawalHeard(Message, frozen=True, kw_only=True, tag="withdrawal_heard/1"):
-    """In logs of earlier versions: a robot repeats an order to withdraw `withdrawn`.
+    """An order to withdraw `withdrawn` that a robot repeated, in logs of earlier versions.
 
-    Now a centre that is started again reads the order from its own file, or from the router, which
-    stores it as its operator published it. robot: the one that repeats it. by, reason: as in the
-    order.
+    robot: the repeating one. by, reason: as in the order. No node publishes or receives it.
     """
 
     robot: Name
@@ -45,7 +42,7 @@ class LocalLandmark(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class Judgement(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """That two local landmarks are one landmark, or are two."""
+    """Statement that two local landmarks are one, or two."""
 
     first: LocalLandmark
     second: LocalLandmark
@@ -53,11 +50,10 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class Verdict(Message, frozen=True, kw_only=True, tag="verdict/1"):
-    """An operator says of two local landmarks that they are one, or two. A member of the set like a
-    submap; of a pair of which both were said they are two.
+    """An operator's statement that two local landmarks are one, or two; a member of the set.
 
-    robot: that of the first landmark. by: who says so. reason: in words. withdrawn: this very
-    judgement holds no more, whenever it was said, and for good.
+    Of contradicting verdicts "two" holds. robot: that of the first landmark. by: the author.
+    reason: text. withdrawn: this judgement is taken back, for good.
     """
 
     robot: Name
@@ -74,10 +70,10 @@ class Verdict(Message, frozen=True, kw_only=True, tag="verdict/1"):
 
 
 class GivenUp(Message, frozen=True, kw_only=True, tag="given_up/1"):
-    """Nobody waits for a node any more: what has come of a robot is in the map, what has not is
-    missing, and the final map names it as lost.
+    """Order that no process waits for a node.
 
-    by: "operator", "launch" or "central". reason: in words.
+    The final map names a robot with missing data as lost. by: "operator", "launch" or "central".
+    reason: text.
     """
 
     node: Text
@@ -86,9 +82,9 @@ class GivenUp(Message, frozen=True, kw_only=True, tag="given_up/1"):
 
 
 class TeamEnd(Message, frozen=True, kw_only=True, tag="team_end/1"):
-    """An operator's order to a live team: whoever measures ends now.
+    """Order that ends all streams of a live team.
 
-    by: who ordered it. reason: in words.
+    by: the author. reason: text.
     """
 
     by: Text

@@ -1,4 +1,4 @@
-"""What peers say of the team's set, and what proves who said what."""
+"""Summaries, requests and members of the team's set, and signatures of their authors."""
 
 from typing import Annotated
 
@@ -9,11 +9,11 @@ from team.wire.messages.base import Count, Digest, Message, Name, StampNs, Text
 
 
 class Holding(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """What a node has of one stream: whether its initial pose, and which submaps, each with all
-    inter-robot measurements from it.
+    """The members of one stream that a node has: initial pose, and submaps with their factors.
+
 
     sequences: first, last, first, last, … of closed intervals, ascending, with gaps between them.
-    digest: of what is there, whatever the order in which it came. newest_ns: the end of the newest.
+    digest: of these members, independent of their order. newest_ns: end of the newest submap.
     """
 
     robot: Name
@@ -25,7 +25,7 @@ class Holding(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class Statements(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """How many orders and last words about a robot a node has, and their digest."""
+    """Number of orders and ends about a robot that a node has, and their digest."""
 
     robot: Name
     count: Count
@@ -33,10 +33,10 @@ class Statements(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class SetSummary(Message, frozen=True, kw_only=True, tag="set_summary/1"):
-    """What a peer has of the team's set, so that others can ask for what they lack.
+    """Summary of a peer's set, from which others derive their requests.
 
-    serial: counts the summaries of this process. digest: of all of it; equal digests are equal
-    sets. holdings: by robot and incarnation, statements: by robot, both ascending.
+    serial: number of the summary of this process. digest: of the set; equal digests are equal sets.
+    holdings: by robot and incarnation, statements: by robot, both ascending.
     """
 
     node: Text
@@ -59,7 +59,7 @@ class SetSummary(Message, frozen=True, kw_only=True, tag="set_summary/1"):
 
 
 class Requested(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """Of one stream: its initial pose if `start`, and submaps first … last (none: last < first)."""
+    """Part of a stream: its initial pose if `start`; submaps first … last (none: last < first)."""
 
     robot: Name
     incarnation: Count
@@ -69,9 +69,10 @@ class Requested(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class MembersRequest(Message, frozen=True, kw_only=True, tag="members_wanted/1"):
-    """A query to a peer for members of the set. node: who asks.
+    """Query to a peer for members of the set. node: the requesting node.
 
-    statements: the robots of whom all orders and last words are wanted.
+
+    statements: the robots about which all orders and ends are requested.
     """
 
     node: Text
@@ -80,9 +81,9 @@ class MembersRequest(Message, frozen=True, kw_only=True, tag="members_wanted/1")
 
 
 class Members(Message, frozen=True, kw_only=True, tag="members/1"):
-    """Members of the set as `node` has them: the key and the very bytes of who first said each.
+    """Members of the set from `node`: key and bytes of each as its author published it.
 
-    signatures: of each, by who said it; empty where the team has no keys.
+    signatures: of each, by its author; empty in a team without keys.
     """
 
     node: Text
@@ -96,20 +97,20 @@ class Members(Message, frozen=True, kw_only=True, tag="members/1"):
 
 
 class FoldRequest(Message, frozen=True, kw_only=True, tag="fold_wanted/1"):
-    """A query to a peer that folds on request: the map of the set as it is there now."""
+    """Query to a peer that folds on request, for the map of its set."""
 
 
 class Certificate(Message, frozen=True, kw_only=True, tag="certificate/1"):
-    """A robot's certificate (DER), by which its signatures can be checked: a member of the set."""
+    """A robot's certificate (DER), which verifies its signatures; a member of the set."""
 
     robot: Name
     certificate: Annotated[bytes, Meta(min_length=1, max_length=8192)]
 
 
 class Signature(Message, frozen=True, kw_only=True, tag="signature/1"):
-    """A signature of a member, by who said it, for whoever carries it: a robot's, or an operator's.
+    """Signature of a member by its author, a robot or an operator, for peers that relay it.
 
-    robot: that the member is about. member: 32 bytes, the BLAKE2b of the key's length (2 bytes,
+    robot: the subject of the member. member: 32 bytes, the BLAKE2b of the key's length (2 bytes,
     little-endian), key and payload. signature: an operator's stands behind its certificate (DER),
     and this behind its length (2 bytes, little-endian).
     """
@@ -120,10 +121,10 @@ class Signature(Message, frozen=True, kw_only=True, tag="signature/1"):
 
 
 class Concluded(Message, frozen=True, kw_only=True, tag="concluded/1"):
-    """A peer has the final map of its own fold. digest: its set's. sha256: of the map's payload.
+    """The final map of a peer's fold; a member of the set that no map uses.
 
-    submaps: in its set. serial: counts the peer's final maps: one of a set that has grown since
-    is another one. A member of the set, on which no map rests.
+    digest: of its set. sha256: of the map's payload. submaps: number in its set. serial: number of
+    the final map; a set that grows afterwards has another one.
     """
 
     robot: Name

@@ -1,4 +1,4 @@
-"""What robots send in for fusion: submaps and inter-robot factors."""
+"""The inputs of fusion: submaps and inter-robot factors."""
 
 import math
 from itertools import pairwise
@@ -20,21 +20,19 @@ from team.wire.messages.base import Bias, Count, Digest, Message, Name, Real, St
 class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     """One window's Gaussian, the only input of the rule `join`; stamp_ns is its end pose's stamp.
 
-    It names its inputs: the measurements first_measurement … last_measurement of (robot,
-    incarnation), and the configuration by digest (the seed is in it). ids: L, ascending. mean: 3 +
-    3K + 2L floats (end pose, pose nodes, landmarks) in the frame of the start pose. covariance:
-    packed upper triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending.
-    sightings: how many SightingFactor messages belong to it. biases: errors that the robot's
-    submaps share, B of them, ascending; sensitivity: B × n floats, the mean's derivative by each:
-    given the error b of the bearings [rad], of the scale of the ranges or of the speed, the mean is
-    mean + b · sensitivity. gated: so many of its landmark measurements no others of the window
-    confirmed; they are not in it.
+    Its inputs are the measurements first_measurement … last_measurement of (robot, incarnation) and
+    the configuration with the digest `config` (seed included). ids: L, ascending. mean: 3 + 3K + 2L
+    floats (end pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed
+    upper triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings:
+    number of its SightingFactor messages. biases: errors that the robot's submaps share, B of them,
+    ascending; sensitivity: B × n floats, the mean's derivative by each: given the error b of the
+    bearings [rad], of the scale of the ranges or of the speed, the mean is mean + b · sensitivity.
+    gated: number of rejected landmark measurements, which no others of the window confirmed.
 
-    ids from 2³¹ on are landmarks without a name, which the window associated itself: 2³¹ + a local
-    index. counts: of each of these, ascending, by how many measurements. keyframes: the window's
-    keyframes with detections; seen: a row of ⌈keyframes/8⌉ bytes of each unnamed landmark, bit k of
-    it (the least of byte k // 8 first) says that keyframe k saw it: two that one keyframe saw are
-    two landmarks.
+    ids from 2³¹ on are unnamed landmarks, associated in the window: 2³¹ + a local index. counts:
+    number of measurements of each, ascending by id. keyframes: number of the window's keyframes
+    with detections. seen: ⌈keyframes/8⌉ bytes of each unnamed landmark; bit k (the least of byte k
+    // 8 first) is set if keyframe k contains it. Two landmarks in one keyframe are different.
     """
 
     robot: Name
@@ -86,11 +84,10 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
 
 
 class Association(Message, frozen=True, kw_only=True, tag="association/1"):
-    """What became of each detection without identity of a submap's window.
+    """Association of the detections without identity of a submap's window.
 
-    stamps: of M scans of detections; counts: the detections of each that came through the door;
-    rows: their places in the scan's message; landmarks: the submap's number of the landmark of each
-    (2³¹ + local), UNCONFIRMED or CLUTTER of what is in no submap.
+    stamps: of M scans; counts: accepted detections of each; rows: their indices in the scan's
+    message; landmarks: the landmark of each in the submap (2³¹ + local), or UNCONFIRMED or CLUTTER.
     """
 
     robot: Name
@@ -109,16 +106,15 @@ class Association(Message, frozen=True, kw_only=True, tag="association/1"):
 
 
 UNCONFIRMED, CLUTTER = 0, 1
-"""In `Association.landmarks`: too rarely seen for a landmark, and so rarely that it is none."""
+"""In `Association.landmarks`: too few detections for a landmark, and so few that it is none."""
 
 
 class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"):
-    """A teammate seen from a pose node of submap (robot, incarnation, sequence); stamp_ns is the
-    node's.
+    """An inter-robot factor from a pose node of a submap; stamp_ns is the node's.
 
     range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed 2
-    × 2 (range, bearing). measurements: the counters of the inter-robot measurements that went into
-    it, ascending; with the submap's odometry and configuration they are its inputs.
+    × 2 (range, bearing). measurements: counters of the inter-robot measurements in it, ascending;
+    with the submap's odometry and configuration they are its inputs.
     """
 
     robot: Name
@@ -142,10 +138,9 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
 
 
 class SubmapsRequest(Message, frozen=True, kw_only=True, tag="submaps_wanted/1"):
-    """A query for the submaps of one robot: to the centre for those in its set, or to the robot.
+    """Query for the submaps of a robot: to the centre for those in its set, or to the robot.
 
-    incarnation: whose alone; 0: of every incarnation. first: of that incarnation, those from this
-    sequence on.
+    incarnation: 0: all. first: the first sequence of that incarnation.
     """
 
     robot: Name

@@ -1,4 +1,4 @@
-"""What only an evaluator, a robot that localises itself, or a simulated radio is told."""
+"""Truth for the evaluation, the known map of localisation, the plan of a simulated radio."""
 
 from team.wire.arrays import (
     Floats,
@@ -37,10 +37,10 @@ class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"
 
 
 class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
-    """Which landmarks a robot's detections are of, for the evaluator only.
+    """True landmarks of a robot's detections, for the evaluator only.
 
-    stamps: of M scans of detections; counts: the detections of each; labels: by detection, the
-    landmark's number or NO_LABEL where it is clutter, or nobody knows.
+    stamps: of M scans of detections; counts: the detections of each; labels: of each detection the
+    landmark's number, or NO_LABEL.
     """
 
     robot: Name
@@ -54,13 +54,13 @@ class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
 
 
 NO_LABEL = 2**32 - 1
-"""The label of a detection that is clutter, or of which nobody knows the landmark."""
+"""The label of clutter, and of detections with an unknown landmark."""
 
 
 class TruthPositions(Message, frozen=True, kw_only=True, tag="truth_positions/1"):
-    """Where another sensor, such as a GPS, says that a robot was, for the evaluator only.
+    """Positions of a robot by another sensor, such as a GPS, for the evaluator only.
 
-    T stamps and T × 2 floats (x, y) in a frame of its own; some may be wrong by metres.
+    T stamps and T × 2 floats (x, y) in a frame of its own; some may be metres off.
     """
 
     robot: Name
@@ -84,9 +84,9 @@ class KnownMap(Message, frozen=True, kw_only=True, tag="known_map/1"):
 
 
 class RadioPlan(Message, frozen=True, kw_only=True, tag="radio/1"):
-    """Of a simulated radio: who reaches whom, by seconds of team time from stamp_ns on.
+    """Links of a simulated radio in each second of team time from stamp_ns on.
 
-    pairs: a row of bits for each second, of the robots two by two in their order, padded to bytes.
+    pairs: for each second a row of bits of the pairs of robots in their order, padded to bytes.
     ends_ns: when each robot's stream ends.
     """
 
