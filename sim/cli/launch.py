@@ -392,7 +392,7 @@ def _conclude(
 
     console = Console()
     join(outcome.log)  # here, since nobody ends this process for taking long
-    typer.echo("the run is over: scoring it", err=True)
+    typer.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
     steps = Steps()
     steps.begin("scoring the run")
     extra: dict[str, Any] = {

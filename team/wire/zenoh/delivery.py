@@ -5,7 +5,7 @@ that is slower than the team (`team.wire.zenoh.router`).
 
 stream: a plain publisher; samples sent while a link is cut, and those dropped, are lost.
 latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut or a drop
-    the receiver requests what it missed according to the heartbeat, as far back as the cache reaches.
+    the receiver requests what it missed by the heartbeat, as far back as the cache reaches.
 all: as `latest` with everything cached, and a late joiner requests everything.
 """
 
