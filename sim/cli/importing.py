@@ -155,11 +155,7 @@ def _as_read(folder: Path) -> list[str]:
             "and columns of its [odometry] (docs/your_data.md)"
         )
     lines = list(streams.notes)
-    spans = {
-        each.robot: (int(each.stamps_ns.min()), int(each.stamps_ns.max()))
-        for each in streams.streams
-    }
-    if (warning := separate_times_warning(spans)) is not None:
+    if (warning := separate_times_warning(streams.spans_ns)) is not None:
         lines.append(warning)
     for stream in streams.streams:
         seen, teammates = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)

@@ -15,6 +15,7 @@ from central.desk.evaluation.clocks import (
 from central.desk.evaluation.evaluation import evaluate, to_json
 from central.desk.evaluation.log import collected
 from central.desk.report.tables import team_rows
+from sim.cli.launch import _time_warnings
 from sim.cli.main import app
 from sim.publisher.node import WorldNode
 from sim.scenarios.scenario import load, with_options
@@ -126,6 +127,8 @@ def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path:
     expected = "r1 from 0 s to 60 s; r2 from 2023-11-14 22:13:20 UTC to 2023-11-14 22:14:20 UTC"
     assert expected in said.output
     of = with_options(load(str(scenario_beside(tmp_path / "mine"))), dataset=tmp_path / "mine")
+    *_, before = _time_warnings(streams_of(of))
+    assert expected in before
     node = WorldNode(streams_of(of), frozenset(), configured("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
