@@ -16,11 +16,13 @@ import zenoh
 from zenoh.handlers import Callback
 
 from team.keys.credentials import Credentials, credentials_of
+from team.wire import channels as ch
 from team.wire.bus import Sample
 from team.wire.zenoh.bus import ZenohBus
+from team.wire.zenoh.router import router
 from team.wire.zenoh.session import client
 from tests.keys.certificates import TEAM, Folders
-from tests.support import ROOT, wait_until
+from tests.support import ROOT, Link, wait_until
 
 READERS = 3
 ROBOTS = ("r1", "r2")
@@ -114,3 +116,32 @@ def test_stopped_readers_do_not_stop_the_others(keys: Folders, with_keys: bool) 
         )
     for times in arrivals.values():
         assert max(later - sooner for sooner, later in pairwise(times)) < MOST_S
+
+
+def test_a_reader_that_reads_again_fetches_what_was_dropped() -> None:
+    count = 300  # more than the queue and the sockets' buffers hold
+    with (
+        router() as endpoint,
+        Link(endpoint) as link,
+        ZenohBus(TEAM, link.endpoint, 60.0) as reader,
+        ZenohBus(TEAM, endpoint, 60.0) as source,
+    ):
+
+        def publish(number: int) -> None:
+            source.publish_raw(Sample("robot/r1/submap", PAYLOAD, 0, 0, number))
+
+        reader.subscribe(ch.SUBMAP)
+        publish(0)
+        wait_until(lambda: bool(reader.receive(0.05)), what="the first submap")
+        link.stall()
+        for number in range(1, count):
+            publish(number)
+        link.mend()
+        arrived: list[int] = []
+
+        def receive() -> bool:
+            arrived.extend(sample.counter for sample in reader.receive(0.05))
+            return len(arrived) >= count - 1
+
+        wait_until(receive, what="the submaps of meanwhile")
+        assert arrived == list(range(1, count))
