@@ -35,6 +35,8 @@ SIGMAS = 3.0
 SCALE_SIGMAS = 3.3
 NAMED = 3
 """Most submaps that are named, the worst first."""
+TOO_SMALL = "the reported covariances are too small by a factor of"
+TOO_LARGE = "the reported covariances are too large by a factor of"
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,8 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
     """The team's and every robot's figures, and who is out of bounds.
 
     normal: the covariance scale where the covariances are right; the scale is given relative to it.
-    final: of the final map. Before it nobody is warned that a map claims too little: it is cautious
-    meanwhile, and of a robot that has not come back anywhere yet the submaps hardly contradict each
-    other.
+    final: of the final map. Before it covariances that are too large are no warning: the submaps of
+    a robot that has not closed a loop yet hardly contradict each other.
     """
     figures = {}
     warnings = []
@@ -139,8 +140,8 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
 
 
 def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
-    """The team, or single robots, whose covariances are far too small or, if `small` scales are to
-    be told, too large, in words.
+    """Warnings about the team, or single robots, whose covariances are far too small; if `small`
+    scales count, also about those that are too large.
     """
     judged = {who: each for who, each in scales.items() if small or each.value > 1.0}
     words_of = {
@@ -149,21 +150,21 @@ def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
     team = _misscale(judged[""], SCALE_WARN) if "" in judged else ""
     robots = scales.keys() - {""}
     if team and (not words_of or 2 * len(words_of) > len(robots)):
-        return [f"the team's {team}"]
+        return [f"team: {team}"]
     return [f"{robot}: {words}" for robot, words in words_of.items()]
 
 
 def _misscale(scale: Scale, limit: float) -> str:
-    """What is wrong beyond the limit and beyond chance, in words; empty where nothing is."""
+    """The warning about a scale beyond the limit and beyond chance; empty without one."""
     value = scale.value
     if value <= 0.0:
         return ""
     if abs(elementary.log(value)) <= max(elementary.log(limit), SCALE_SIGMAS * scale.log_sigma):
         return ""
-    digits, much = (1, "much") if value > 1.0 else (2, "little")
+    wrong = f"{TOO_SMALL} {value:.1f}" if value > 1.0 else f"{TOO_LARGE} {1.0 / value:.1f}"
     return (
-        f"covariances ought to be {value:.{digits}f} times as large: their map claims too {much}; "
-        "learn the sensors' and odometry's noise by `teamslam calibrate` of the log or the data"
+        f"{wrong}, by the differences between submaps; learn the sensors' and odometry's noise by "
+        "`teamslam calibrate` of the log or the data"
     )
 
 

@@ -143,6 +143,7 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 def _as_read(folder: Path) -> list[str]:
     """What there is of each robot, and what its tables have that can not be used."""
+    from central.desk.evaluation.clocks import separate_times_warning
     from sim.datasets.tables import DatasetError
     from sim.scenarios.scenario import load, with_options
     from sim.scenarios.source import scenario_beside, streams_of
@@ -154,6 +155,8 @@ def _as_read(folder: Path) -> list[str]:
             "and columns of its [odometry] (docs/your_data.md)"
         )
     lines = list(streams.notes)
+    if (warning := separate_times_warning(streams.spans_ns)) is not None:
+        lines.append(warning)
     for stream in streams.streams:
         seen, teammates = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)
         driven = counted(len(stream.intervals.end_ns), "odometry interval")

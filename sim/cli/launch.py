@@ -151,7 +151,11 @@ def launch(
         typer.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == ANY_PORT:
         listen = LOOPBACK  # drivers have to find it
-    warnings = [*scenario_warnings(resolved), *([missing] if missing else []), *_paces(streams)]
+    warnings = [
+        *scenario_warnings(resolved),
+        *([missing] if missing else []),
+        *_time_warnings(streams),
+    ]
     for text in warnings:
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
@@ -241,14 +245,17 @@ def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStre
     return present, missing, streams_of(present)
 
 
-def _paces(streams: "WorldStreams | None") -> list[str]:
-    """Notes on robots whose times are probably not in seconds."""
+def _time_warnings(streams: "WorldStreams | None") -> list[str]:
+    """Warnings about robots whose times are probably not in seconds, or of different clocks."""
     if streams is None:
         return []
+    from central.desk.evaluation.clocks import separate_times_warning
     from sim.datasets.folder_odometry import PACE
 
     notes = ((each.robot, note) for each in streams.streams for note in each.notes)
-    return [f"{robot}: {note}" for robot, note in notes if note.startswith(PACE)]
+    paces = [f"{robot}: {note}" for robot, note in notes if note.startswith(PACE)]
+    separate = separate_times_warning(streams.spans_ns)
+    return [*paces, *([separate] if separate is not None else [])]
 
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
@@ -392,7 +399,7 @@ def _conclude(
 
     console = Console()
     join(outcome.log)  # here, since nobody ends this process for taking long
-    typer.echo("the run is over: scoring it", err=True)
+    typer.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
     steps = Steps()
     steps.begin("scoring the run")
     extra: dict[str, Any] = {

@@ -39,7 +39,6 @@ from sim.world.streams import (
 )
 from team.config import RobotConfig
 
-DAY_NS = 86_400 * 10**9
 COVARIANCE = POSE_COVARIANCE
 TABLES = {
     "odometry": (
@@ -98,7 +97,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
             f"{', '.join(steered)}: wheel speed and steering can not be used: give "
             'kind = "ackermann" and wheel_base in [defaults.motion] of scenario.toml'
         )
-    notes += [*unused, *_apart(read)]
+    notes += unused
     return WorldStreams(
         streams=tuple(_stream(each, world, clocks) for each in read),
         landmark_ids=ids,
@@ -199,17 +198,6 @@ def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detectio
         return seen
     first, last = np.searchsorted(seen.stamps_ns, [driven[0], driven[1] + 1])
     return seen.only(int(first), int(last))
-
-
-def _apart(read: Sequence[RobotRows]) -> list[str]:
-    """A note on robots whose times do not overlap: their clocks may differ."""
-    first = min(read, key=lambda each: each.start_ns)
-    return [
-        f"{each.robot} begins {(each.start_ns - first.start_ns) / DAY_NS:.1f} days after "
-        f"{first.robot}: all robots of a team are to have one clock"
-        for each in read
-        if each.start_ns - first.start_ns > DAY_NS
-    ]
 
 
 def _table(place: File, kind: str, robot: str) -> CsvTable | None:

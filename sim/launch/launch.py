@@ -41,7 +41,7 @@ class Outcome:
     deaths: processes that were killed at the very end, so that none was started again: no failure
     where map and log are whole. restarts: how often each process was started again. used: the
     resources of each process, over all its lives. compiling_s: the share of wall_s that went into
-    compiling kernels.
+    compiling kernels. end_reason: the reason why the run ended, in words.
     """
 
     log: Path
@@ -54,6 +54,7 @@ class Outcome:
     given_up: list[str] = field(default_factory=list)
     used: dict[str, Used] = field(default_factory=dict)
     compiling_s: float = 0.0
+    end_reason: str = ""
 
 
 def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
@@ -71,7 +72,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         router = _start_router(plan, services, starter)
         ids = tuple(robot.id for robot in plan.scenario.robots)
         drivers = ids if plan.scenario.is_live else None
-        watch = Watch(began=began, robots=len(ids), drivers=drivers)
+        watch = Watch(began=began, robots=ids, drivers=drivers)
         team = plan.scenario.team
         own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
@@ -118,6 +119,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         restarts=watch.restarts,
         given_up=watch.given_up,
         used={s.name: s.used.and_later(e.used) for s, e in zip(services, ended, strict=True)},
+        end_reason=watch.end_reason,
     )
 
 

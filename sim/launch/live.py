@@ -90,14 +90,13 @@ class _Lines:
             self._print(watch, line)
 
     def _progress(self, watch: Watch, world: m.Status) -> str:
-        """The line on how far the team is; of what a live team waits for it says who and what."""
+        """The line on the team's progress; while it starts, on the processes that are missing."""
         robots = [s for n, s in watch.statuses.items() if n.startswith("robot/")]
         if world.state == "waiting":
-            lacking = (
-                world.warnings if progress.is_live(watch) and len(robots) >= watch.robots else ()
-            )
+            missing = watch.missing_robots
+            lacking = world.warnings if progress.is_live(watch) and not missing else ()
             self._shown |= {without_decimals(f"{DRIVERS}: {text}") for text in lacking}
-            return "; ".join(lacking) or f"waiting: {len(robots)} of {watch.robots} robots"
+            return "; ".join(lacking) or progress.starting(watch)
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
@@ -151,7 +150,7 @@ def _view(title: str, watch: Watch, width: int = WIDE) -> Group:
         parts.append(Text(f"other commands reach the team by {watch.place}", style="dim"))
     robots = {n: watch.statuses[n] for n in in_order(watch.statuses) if n.startswith("robot/")}
     if world is None or world.state == "waiting":
-        parts.append(Text(f"starting: {len(robots)} of {watch.robots} robots are there"))
+        parts.append(Text(progress.starting(watch)))
     else:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(

@@ -9,6 +9,8 @@ from team.wire import messages as m
 
 AHEAD_S = 10.0
 """A world that is ahead of the map by less [s] is not worth a word."""
+NAMED = 5
+"""Number of missing robots that are named."""
 PATIENCE_S = 8.0
 """Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
 
@@ -58,6 +60,16 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
         fresh = [s for s in statuses if watch.last_message.get(s[0], math.inf) >= oldest]
         texts = [f"{node}: {w}" for node, status in fresh for w in status.warnings]
     return [*watch.failures, *(each for each in texts if not any(not_joined([each])))]
+
+
+def starting(watch: Watch) -> str:
+    """The number of robots that have started, and the names of the others."""
+    missing = watch.missing_robots
+    there = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
+    if not missing:
+        return f"{there}; waiting for the first measurements"
+    more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+    return f"{there}; waiting for {', '.join(missing[:NAMED])}{more}"
 
 
 def share(watch: Watch) -> str:

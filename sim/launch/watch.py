@@ -40,7 +40,7 @@ def _no_errors() -> "LiveErrors":
 class Watch:
     """The state of the team while it runs: the last status of each node, and the last map.
 
-    robots: their number. drivers: of a live team, whose drivers are waited for. errors: of poses
+    robots: their names. drivers: of a live team, whose drivers are waited for. errors: of poses
     and map, where there is truth. place: the options by which other commands reach the team. call:
     the same as a driver's program has them. notes: events of processes, in words. restarts: how
     often each process was started again. given_up: the nodes that were given up. last_message: the
@@ -53,7 +53,7 @@ class Watch:
     fused: m.FusedMap | None = None
     failures: list[str] = field(default_factory=list)
     began: float = field(default_factory=time.monotonic)
-    robots: int = 0
+    robots: tuple[str, ...] = ()
     errors: "LiveErrors" = field(default_factory=_no_errors)
     place: str = ""
     call: str = ""
@@ -109,6 +109,20 @@ class Watch:
                 )
             elif status.state == "waiting":
                 yield f"the driver of {robot} is there and has handed over no odometry yet"
+
+    @property
+    def missing_robots(self) -> list[str]:
+        """The robots that have not sent a status yet."""
+        return [each for each in self.robots if f"robot/{each}" not in self.statuses]
+
+    @property
+    def end_reason(self) -> str:
+        """The reason why a run that has ended did so, in words."""
+        if self.is_over:
+            return "the final map is there"
+        if self.given_up:
+            return f"{', '.join(self.given_up)} was given up"
+        return "all processes have ended, without a final map"
 
     @property
     def is_over(self) -> bool:

@@ -264,6 +264,13 @@ class WorldStreams:
     source: str
     notes: tuple[str, ...] = ()
 
+    @property
+    def spans_ns(self) -> dict[str, tuple[int, int]]:
+        """The times of each robot's first and last measurement."""
+        return {
+            each.robot: (int(each.stamps_ns[0]), int(each.stamps_ns[-1])) for each in self.streams
+        }
+
     def order(self) -> tuple[Int64[np.ndarray, " A"], Int64[np.ndarray, " A"]]:
         """All measurements of the team by (stamp, stream, counter): their stream indices and
         counters.

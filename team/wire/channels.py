@@ -19,7 +19,8 @@ from typing import Literal
 from team.wire import messages as m
 
 Delivery = Literal["stream", "latest", "all"]
-"""How a message is delivered. No message is dropped because of congestion; beyond that:
+"""How a message is delivered. A publisher blocks while its link is busy. The router drops a message
+to a receiver that is slower than the team; the receiver fetches it as after a cut link.
 
 stream: a receiver requests a missed message from its source, by the measurement counter.
 latest: a late joiner receives the newest message; after a cut link the missed ones are recovered.

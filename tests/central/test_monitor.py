@@ -80,18 +80,22 @@ def test_one_submap_that_the_rest_contradicts_is_named():
 def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
     """Whatever the loss; the factors 25 are what the bounded cost takes for nearly right."""
     for seed in range(4):
-        for factor, words in ((1.0, None), (0.5, "too much"), (2.0, "too little")):
+        for factor, words in (
+            (1.0, None),
+            (0.5, "too small by a factor of"),
+            (2.0, "too large by a factor of"),
+        ):
             found = watched(seed, with_covariance_times(factor, lambda _: True), settings)
             assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.25)
-            said = [w for w in found.warnings if "ought to be" in w]
+            said = [w for w in found.warnings if "covariances are too" in w]
             assert bool(said) == (words is not None), (seed, factor, found)
-            assert all(words in w and w.startswith("the team's") for w in said)
+            assert all(words in w and w.startswith("team: ") for w in said)
 
 
-def test_that_a_map_claims_too_little_is_told_of_the_final_one_only():
+def test_covariances_that_are_too_large_are_reported_of_the_final_map_only():
     for factor, told in ((0.5, 1), (2.0, 0)):
         found = watched(0, with_covariance_times(factor, lambda _: True), final=False)
-        assert len([w for w in found.warnings if "ought to be" in w]) == told
+        assert len([w for w in found.warnings if "covariances are too" in w]) == told
         assert "covariance_scale" in found.figures
 
 
@@ -99,7 +103,7 @@ def test_that_a_map_claims_too_little_is_told_of_the_final_one_only():
 def test_no_loss_bounds_the_covariance_scale(factor):
     found = watched(0, with_covariance_times(factor, lambda _: True), ROBUST)
     assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.4)
-    (said,) = (w for w in found.warnings if "ought to be" in w)
+    (said,) = (w for w in found.warnings if "covariances are too" in w)
     assert "learn the sensors' and odometry's noise by `teamslam calibrate`" in said
 
 
@@ -116,14 +120,14 @@ def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
     clean, spoilt = watched(3, settings=ROBUST), watched(3, shifted, ROBUST)
     of = "covariance_scale"
     assert spoilt.figures[of] == pytest.approx(clean.figures[of], rel=0.35)
-    assert not [w for w in spoilt.warnings if "ought to be" in w]
+    assert not [w for w in spoilt.warnings if "covariances are too" in w]
 
 
 def test_a_profile_says_which_scale_is_normal():
     small = with_covariance_times(2.0, lambda _: True)
     found = watched(0, small, normal=0.5)
     assert found.figures["covariance_scale"] == pytest.approx(1.0, rel=0.25)
-    assert not [w for w in found.warnings if "ought to be" in w]
+    assert not [w for w in found.warnings if "covariances are too" in w]
 
 
 @pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])

@@ -63,7 +63,9 @@ def seen(name: str, scenario: Scenario) -> bool:
     line, right = [], True
     for claimed, words in CLAIMED:
         told = found_at(fold, claimed, scenario.central.normal_scale)
-        of_team = [said for said in told.warnings if said.startswith("the team's covariances")]
+        of_team = [
+            said for said in told.warnings if said.startswith("team: the reported covariances")
+        ]
         right &= bool(of_team) == bool(words) and all(words in said for said in of_team)
         line.append(f"{told.figures['covariance_scale']:.2f}")
     figures = ", ".join(

@@ -11,11 +11,14 @@ and Zeger 1986), so errors may be correlated within a stretch.
 
 import math
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from central.desk.names import in_order
 from team import translate
 from team.config import RobotConfig, Sensor
 from team.estimation.odometry import moved, steered
@@ -47,6 +50,8 @@ BEYOND_DOUBT = 5.0
 """Number of standard deviations from which an offset is reported."""
 LEAST_S = 0.02
 """A smaller offset [s] is not reported."""
+UNIX_S = 1e9
+"""Times [s] from here on are Unix times."""
 
 
 @dataclass
@@ -64,6 +69,13 @@ class Timed:
     stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
     ids: "array[int]" = field(default_factory=lambda: array("q"))
     seen: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def span_ns(self, clock_offset_s: float) -> tuple[int, int] | None:
+        """The team times of the first and the last measurement; None without one."""
+        ends = np.array(self.ends_ns, np.int64) + round(1e9 * clock_offset_s)
+        begins = ends - np.array(self.durations_ns, np.int64)
+        stamps = np.concatenate([begins, ends, np.array(self.stamps_ns, np.int64)])
+        return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
     def take(self, message: m.AnyOdometry | m.AnyScan) -> None:
         """Add an interval of odometry or the measurements of a scan."""
@@ -118,6 +130,43 @@ def clock_warning(robot: str, timed: Timed, config: RobotConfig) -> str | None:
         f"{config.clock_offset_s + found.offset_s:.2f} (`teamslam calibrate` learns it where there "
         "is a ground truth)"
     )
+
+
+def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | None:
+    """The warning about robots that no other robot's time of measurement overlaps with, directly or
+    by a chain of others; None without one.
+
+    spans_ns: by robot, the times of its first and its last measurement.
+    """
+    groups: list[list[str]] = []
+    until_ns = 0
+    for robot in sorted(spans_ns, key=lambda each: spans_ns[each]):
+        first_ns, last_ns = spans_ns[robot]
+        if groups and first_ns <= until_ns:
+            groups[-1].append(robot)
+        else:
+            groups.append([robot])
+        until_ns = max(until_ns, last_ns)
+    if len(groups) < 2:
+        return None
+    times = "; ".join(
+        f"{', '.join(in_order(group))} from {_time(min(spans_ns[each][0] for each in group))} to "
+        f"{_time(max(spans_ns[each][1] for each in group))}"
+        for group in groups
+    )
+    return (
+        f"the robots' times do not overlap: {times}. If these robots drove at the same time their "
+        "clocks differ: give all stamps of the team one clock (a data set: `offset` of t_s in a "
+        "map of columns; robots: NTP or PTP)"
+    )
+
+
+def _time(stamp_ns: int) -> str:
+    """A time in seconds; as date and time where it is Unix time."""
+    seconds = 1e-9 * stamp_ns
+    if seconds < UNIX_S:
+        return f"{seconds:,.0f} s"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def lateness(timed: Timed, config: RobotConfig) -> Late | None:

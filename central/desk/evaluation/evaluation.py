@@ -21,7 +21,7 @@ from central.desk.evaluation.association import (
     association_json,
     association_result,
 )
-from central.desk.evaluation.clocks import Timed, clock_warning
+from central.desk.evaluation.clocks import Timed, clock_warning, separate_times_warning
 from central.desk.evaluation.errors import (
     MapErrors,
     Path,
@@ -43,6 +43,7 @@ from central.desk.evaluation.running import TruthFrames
 from central.desk.evaluation.states import RobotState, not_in_the_map, robot_states
 from central.desk.evaluation.verdicts import verdicts_given
 from central.desk.names import in_order, not_joined, short
+from central.monitor import TOO_LARGE
 from central.team_config import TeamConfig, team_config
 from team import translate
 from team.config import UNNAMED, RobotConfig
@@ -150,7 +151,7 @@ class Evaluation:
     without identities, from the final map. verdicts: an operator's on such landmarks, in words.
     states: of every robot of the team in the final map. data_set: the name of its folder or file;
     empty for a simulated world. clocks: the robots whose detections are late or early beyond doubt,
-    in words.
+    and those whose times do not overlap, in words.
     """
 
     scenario: TeamConfig | None
@@ -281,13 +282,17 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
 def _clocks(log: Collected) -> tuple[str, ...]:
     """The warnings about the robots' clocks, each by its incarnation with most measurements."""
     longest: dict[str, Timed] = {}
+    spans: dict[str, tuple[int, int]] = {}
+    configs = {robot: _config(log, robot) for robot, _ in log.timed}
     for (robot, _), timed in sorted(log.timed.items()):
         if robot not in longest or len(timed.ids) > len(longest[robot].ids):
             longest[robot] = timed
-    found = (
-        clock_warning(robot, longest[robot], _config(log, robot)) for robot in in_order(longest)
-    )
-    return tuple(filter(None, found))
+        span = timed.span_ns(configs[robot].clock_offset_s)
+        if span is not None:
+            first, last = spans.get(robot, span)
+            spans[robot] = min(first, span[0]), max(last, span[1])
+    found = (clock_warning(robot, longest[robot], configs[robot]) for robot in in_order(longest))
+    return tuple(filter(None, (*found, separate_times_warning(spans))))
 
 
 def _config(log: Collected, robot: str) -> RobotConfig:
@@ -540,7 +545,7 @@ def _map_result(
         known=known,
         errors=errors,
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
-        reasons=message.reasons,
+        reasons=tuple(each for each in message.reasons if not _is_refuted(each, errors)),
         joined=message.joined,
         withdrawn=message.withdrawn,
         covariance_scale=message.covariance_scale or None,
@@ -548,6 +553,13 @@ def _map_result(
         gospa=_gospa(means, errors, positions),
         matching=matching,
     )
+
+
+def _is_refuted(reason: str, errors: MapErrors | None) -> bool:
+    """Whether the true landmarks contradict a warning that covariances are too large: an error that
+    all submaps share, as of a late clock, does not show in their differences.
+    """
+    return TOO_LARGE in reason and errors is not None and errors.nees_per_dof > 1.0
 
 
 def _match_unnamed(

@@ -5,10 +5,11 @@ particles base64 of little-endian float32 and uint32. Frames, by `k`:
 
 hello: team, title, colours, live. now: the team time of all robots at work. pose: rows x, y,
 heading, xx, xy, yy, variance of the heading. outside: whether the robot is outside the team's map
-from this time on; its poses are then not in the team's frame, and not sent. err: rows of three
-errors, three 3σ bounds, NEES per degree of freedom. truth: rows x, y, heading. truth_map, map,
-cloud, path: as their names. fig: a node's figures. bytes: [key, t, messages, bytes] of one second.
-ev: an event. eof: the log has been read.
+from this time on; its poses are then not in the team's frame, and not sent. frame: from this time
+on a robot's poses are in another frame than before. err: rows of three errors, three 3σ bounds,
+NEES per degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as their names.
+fig: a node's figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log
+has been read.
 """
 
 import base64
@@ -55,6 +56,7 @@ class _Stream:
     errors: RunningErrors = field(default_factory=RunningErrors)
     by_team: bool = False
     outside: bool = False
+    frame: str | None = None
     pose_ns: int | None = None
     truth_ns: int | None = None
     rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
@@ -180,6 +182,10 @@ class PageFrames:
             self._say("outside", r=message.robot, t=self._t(message.stamp_ns), v=outside)
         if outside:
             return
+        frame = "" if self._frames.has(message.frame) else message.frame
+        if stream.frame not in (None, frame):
+            self._say("frame", r=message.robot, t=self._t(message.stamp_ns))
+        stream.frame = frame
         x, y, heading = floats(message.pose, "pose").tolist()
         P = floats(message.covariance, "covariance").reshape(3, 3)
         spread = [float(P[0, 0]), float(P[0, 1]), float(P[1, 1]), float(P[2, 2])]

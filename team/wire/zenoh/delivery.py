@@ -1,8 +1,11 @@
 """Implements a channel's delivery, as the table of channels promises it, by Zenoh's own means.
 
-stream: a plain publisher that blocks and never drops; samples sent while a link is cut are lost.
-latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut the
-    receiver requests what it missed according to the heartbeat, as far back as the cache reaches.
+All publishers block while their link to the router is busy; the router drops samples to a receiver
+that is slower than the team (`team.wire.zenoh.router`).
+
+stream: a plain publisher; samples sent while a link is cut, and those dropped, are lost.
+latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut or a drop
+    the receiver requests what it missed by the heartbeat, as far back as the cache reaches.
 all: as `latest` with everything cached, and a late joiner requests everything.
 """
 

@@ -27,17 +27,33 @@ if TYPE_CHECKING:  # a router without keys needs none of it
 
 REFUSALS = "error,zenoh_link_tls=warn"
 """The part of Zenoh's log that a router with keys shows: refused connections, with the reasons."""
-PUSH_US = 2_000_000
-"""Time [us] that a message waits for a subscriber whose queue is full: then its link is closed.
+DROP_US = 100_000
+"""Time [us] that a publication waits for a subscriber whose queue is full; then it is dropped.
 
-It delays all others meanwhile. A process that is cut off connects again and fetches the missed
-samples.
-A message of S bytes needs a link of (S - 5 MB) in that time.
+Zenoh marks that queue as congested, and drops further publications to it without a wait until the
+subscriber reads again. A subscriber that stops reading therefore delays the others once. It fetches
+the missed samples as after a cut link.
+"""
+DROP_LARGE_US = 1_000_000
+"""Additional time [us] for a publication of more than one batch."""
+CLOSE_US = 2_000_000
+"""Time [us] that a reply or a query waits for a full queue; then the link is closed.
+
+Its process connects again. A publication that was dropped for its size is fetched by a query, so a
+message of S bytes needs a link of (S - 5 MB) in that time.
 """
 QUEUE_BATCHES = 16
 """Batches of 64 kB in the queue to each subscriber, Zenoh's largest number."""
 RX_THREADS = 128
 """Threads that receive; more than a team has links."""
+_CONGESTION = "transport/link/tx/queue/congestion_control"
+_DROPS = {
+    "messages": ["put"],
+    "flows": ["egress"],
+    "overwrite": {"congestion_control": "drop"},
+}
+"""Publishers block on a full queue of their own; on its way out of the router a publication does
+not."""
 MOST_TEAMS = 1_000
 """Number of teams of which a router without keys stores messages."""
 
@@ -56,11 +72,14 @@ def router(
         "mode": "router",
         "listen/endpoints": [listen],
         "adminspace/enabled": True,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": PUSH_US,
+        f"{_CONGESTION}/drop/wait_before_drop": DROP_US,
+        f"{_CONGESTION}/drop/max_wait_before_drop_fragments": DROP_LARGE_US,
+        f"{_CONGESTION}/block/wait_before_close": CLOSE_US,
         "transport/link/tx/queue/size/data": QUEUE_BATCHES,
+        "qos/network": [_DROPS],
     }
-    # Each link whose messages wait for a slow subscriber blocks a thread, and the slow link is
-    # closed on one of them, too: with two threads, the default, it never would be.
+    # A message that waits for a slow subscriber blocks the thread of its publisher's link, and the
+    # slow link is closed on one of these threads, too. The default is two.
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RX_THREADS}))")
     if keys is not None:
         if not listen.startswith("tls/"):

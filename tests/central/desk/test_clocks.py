@@ -4,14 +4,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from central.desk.evaluation.clocks import BEYOND_DOUBT, Timed, lateness
+from central.desk.evaluation.clocks import (
+    BEYOND_DOUBT,
+    Timed,
+    lateness,
+    separate_times_warning,
+)
 from central.desk.evaluation.evaluation import evaluate, to_json
 from central.desk.evaluation.log import collected
 from central.desk.report.tables import team_rows
+from sim.cli.launch import _time_warnings
+from sim.cli.main import app
 from sim.publisher.node import WorldNode
 from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
+from sim.scenarios.source import scenario_beside, streams_of
 from team.config import RobotConfig, Sensor
 from team.wire.bus import Sample
 from team.wire.digest import configured
@@ -85,3 +93,45 @@ def test_clocks_that_are_right_are_not_mentioned(tmp_path: Path) -> None:
         found = lateness(timed_of(log, robot), RobotConfig(robot))
         assert found is not None, "the world must be able to tell"
         assert abs(found.offset_s) < 4.0 * found.sigma_s < 4.0 * 0.02
+
+
+@pytest.mark.parametrize(
+    ("spans_s", "said"),
+    [
+        ({"r1": (0, 612), "r2": (500, 700)}, ""),
+        ({"r1": (0, 612), "r2": (700, 900), "r3": (600, 800)}, ""),  # by way of r3
+        ({"r1": (0, 612), "r2": (1.7e9, 1.7e9 + 60)},
+         "r1 from 0 s to 612 s; r2 from 2023-11-14 22:13:20 UTC to 2023-11-14 22:14:20 UTC"),
+        ({"r3": (2_000, 2_600), "r1": (0, 612), "r2": (100, 700)},
+         "r1, r2 from 0 s to 700 s; r3 from 2,000 s to 2,600 s"),
+    ],
+)  # fmt: skip
+def test_robots_whose_times_do_not_overlap_are_named_with_their_times(
+    spans_s: dict[str, tuple[float, float]], said: str
+) -> None:
+    spans = {robot: (int(a * 1e9), int(b * 1e9)) for robot, (a, b) in spans_s.items()}
+    warning = separate_times_warning(spans)
+    assert (warning is not None) == bool(said)
+    assert said in (warning or "")
+    if warning is not None:
+        assert "map of columns" in warning
+
+
+def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path: Path) -> None:
+    rows = "t_s,forward_m_s,yaw_rate_rad_s\n{0},1,0\n{1},1,0\n{2},0,0\n"
+    for robot, begin in (("r1", 0), ("r2", 1_700_000_000)):
+        (tmp_path / "set" / robot).mkdir(parents=True)
+        times = rows.format(begin, begin + 30, begin + 60)
+        (tmp_path / "set" / robot / "odometry.csv").write_text(times)
+    said = CliRunner().invoke(app, ["import", str(tmp_path / "set"), "-o", str(tmp_path / "mine")])
+    expected = "r1 from 0 s to 60 s; r2 from 2023-11-14 22:13:20 UTC to 2023-11-14 22:14:20 UTC"
+    assert expected in said.output
+    of = with_options(load(str(scenario_beside(tmp_path / "mine"))), dataset=tmp_path / "mine")
+    *_, before = _time_warnings(streams_of(of))
+    assert expected in before
+    node = WorldNode(streams_of(of), frozenset(), configured("world", 0, 0, of))
+    out = node.begin()
+    while not node.ended:
+        out += node.publish(0.0)
+    (warning,) = evaluate(samples(out)).warnings
+    assert expected in warning

@@ -15,6 +15,7 @@ from central.desk.evaluation.errors import Path, interpolated, map_errors, moved
 from central.desk.evaluation.evaluation import evaluate, to_json
 from central.desk.report.tables import robot_note, robot_row, team_rows, title_of
 from central.desk.side_by_side import comparison_rows
+from central.monitor import TOO_LARGE
 from sim.scenarios.scenario import Scenario
 from sim.world.config import FolderWorld
 from team.estimation.consistency import chi2_interval, nees, state_error
@@ -23,6 +24,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing, Sample
+from team.wire.codec import decoded, encoded
 from team.wire.digest import configured
 from tests.sim.logs import (
     final_map,
@@ -228,6 +230,24 @@ def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
         # The map's own alignment takes its shift of (0.3, −0.3) off; (0.15, −0.15) is left.
         assert robot.aligned_rmse_m == pytest.approx(0.15 * np.sqrt(2.0))
         assert robot.online_aligned_rmse_m is None
+
+
+@pytest.mark.parametrize(("shift", "is_shown"), [(0.3, False), (0.05, True)])
+def test_covariances_are_not_called_too_large_where_the_errors_are_larger(
+    shift: float, is_shown: bool
+) -> None:
+    """All submaps share the error, as of a late clock: their differences do not show it."""
+    too_large = f"r2: {TOO_LARGE} 2.5, by the differences between submaps"
+    log = []
+    for sample in joined_log(scenario(robots=2), shift):
+        payload = sample.payload
+        if sample.key == ch.FINAL_MAP.key():
+            final = decoded(payload, m.FusedMap)
+            payload = encoded(msgspec.structs.replace(final, reasons=(too_large, "another")))
+        log.append(msgspec.structs.replace(sample, payload=payload))
+    run = evaluate(log)
+    assert run.map is not None
+    assert run.map.reasons == ((too_large, "another") if is_shown else ("another",))
 
 
 def own_map(shift: float, of: Scenario) -> Outgoing:

@@ -22,6 +22,7 @@ from central.desk.view.export import with_views
 from central.desk.view.foxglove_door import refusal
 from central.desk.view.foxglove_server import Player, Views
 from central.desk.view.layout import layout
+from central.desk.view.page_frames import PageFrames
 from central.desk.view.server import Feed, ServerError, page_files, serving
 from central.desk.view.session import Shown, session
 from team.recording.reader import LogError
@@ -29,6 +30,7 @@ from team.recording.recorder import Recorder
 from team.recording.tail import Tail
 from team.wire import channels as ch
 from team.wire import messages as m
+from team.wire.arrays import from_floats
 from team.wire.bus import Sample
 from team.wire.codec import encoded
 from tests.crowd import crowd
@@ -90,6 +92,32 @@ def test_the_page_gets_every_pose_and_its_error(frames):
         assert len(errors) == len(rows)
         np.testing.assert_allclose(errors[0, 3:6], [0.6, 0.9, 3 * 1e-3**0.5], rtol=1e-6)
         assert 0.7 < errors[:, 6].mean() < 1.3
+
+
+def test_the_page_is_told_when_a_robots_poses_are_in_another_frame() -> None:
+    """Its earlier path is in its own frame, which is no place in the team's map."""
+    page = PageFrames()
+
+    def take(channel: ch.Channel, robot: str, message: m.Message) -> None:
+        sample = Sample(channel.key(robot), encoded(message), message.stamp_ns, 0, 0)
+        page.take(sample, (channel, message))
+
+    for robot in ("r1", "r2"):
+        start = m.InitialPose(
+            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
+        )
+        take(ch.START, robot, start)
+    for second in range(4):
+        for robot in ("r1", "r2"):
+            own = second < 2
+            pose = m.PoseEstimate(
+                stamp_ns=second * 10**9, robot=robot, incarnation=1, sequence=0,
+                map_digest=bytes(8), pose=bytes(24), covariance=from_floats(np.eye(3)),
+                frame=f"{robot}/1" if own else "r1/1", in_team_frame=not own,
+            )  # fmt: skip
+            take(ch.OWN_POSE if own else ch.TEAM_POSE, robot, pose)
+    told = [json.loads(frame) for frame in page.flush()]
+    assert [(each["r"], each["t"]) for each in told if each["k"] == "frame"] == [("r2", 2.0)]
 
 
 def test_the_page_gets_the_maps_and_how_they_fit(frames, samples):

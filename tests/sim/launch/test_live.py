@@ -25,7 +25,7 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     monkeypatch.setattr(live, "LINE_S", 0.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
-    watch = Watch(robots=3, place="--team t --connect tcp/127.0.0.1:1")
+    watch = Watch(robots=("r1", "r2", "r3"), place="--team t --connect tcp/127.0.0.1:1")
     watch.statuses["world"] = status("world", "waiting", measurements=0.0, of=100.0)
     watch.statuses["robot/r1"] = status("robot/r1", "waiting")
     lines.show(watch)
@@ -35,7 +35,7 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
     lines.show(watch)
     place, waiting, running = out.getvalue().splitlines()
     assert place.endswith("by --team t --connect tcp/127.0.0.1:1")
-    assert waiting.endswith("] waiting: 1 of 3 robots")
+    assert waiting.endswith("] 1 of 3 robots have started; waiting for r2, r3")
     assert " 50%  team time 0 s, 2 robots" in running
 
 
@@ -47,7 +47,7 @@ def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repea
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
     place, call = "--team lab --connect tcp/[::1]:9", 'team="lab", connect="tcp/[::1]:9"'
-    watch = Watch(robots=2, drivers=("r1", "r2"), place=place, call=call, began=-1e9)
+    watch = Watch(robots=("r1", "r2"), drivers=("r1", "r2"), place=place, call=call, began=-1e9)
 
     def shown() -> list[str]:
         begin = len(out.getvalue())
@@ -77,7 +77,7 @@ def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repea
 
 
 def told(robots: int, *, truth: bool) -> Watch:
-    watch = Watch(robots=robots)
+    watch = Watch(robots=tuple(f"r{k}" for k in range(1, robots + 1)))
     watch.statuses["world"] = status("world", "publishing", measurements=5.0, of=10.0)
     watch.statuses["central"] = status("central", "joining", joint_cost_per_dof=1.07, submaps=9.0)
     for k in range(1, robots + 1):
@@ -150,7 +150,7 @@ def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
 
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
-    watch = Watch(robots=2)
+    watch = Watch(robots=("r1", "r2"))
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
     watch.statuses["recorder"] = m.Status(
         stamp_ns=0, node="recorder", state="recording", figures={}, warnings=missing
@@ -180,7 +180,7 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
     monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
-    watch = Watch(robots=1)
+    watch = Watch(robots=("r1",))
     watch.statuses["world"] = status("world", "publishing", measurements=1.0, of=2.0)
     for cost in ("8.8", "9.1", "9.4"):
         warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
@@ -199,7 +199,7 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
 def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one() -> None:
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
-    watch = Watch(robots=1, began=-1e9)
+    watch = Watch(robots=("r1",), began=-1e9)
     watch.statuses["world"] = status("world", "waiting")
     watch.statuses["world"] = m.Status(
         stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
@@ -212,7 +212,7 @@ def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one()
         stamp_ns=0, node="central", state="joining", figures={}, warnings=("two maps disagree",)
     )
     lines.show(watch)
-    assert "waiting for" not in out.getvalue()
+    assert "warning" not in out.getvalue()
     lines.end()
     said = [line for line in out.getvalue().splitlines() if "warning" in line]
     assert [line.partition("warning: ")[2] for line in said] == ["central: two maps disagree"]
@@ -281,3 +281,12 @@ def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
     assert progress.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"
     watch.fused = fused_map(stamp_ns=305 * 10**9)
     assert progress.times(watch, world) == "team time 300 s"
+
+
+def test_a_run_that_has_ended_gives_the_reason() -> None:
+    watch = Watch()
+    assert watch.end_reason == "all processes have ended, without a final map"
+    watch.given_up.append("central")
+    assert watch.end_reason == "central was given up"
+    watch.fused = fused_map(final=True)
+    assert watch.end_reason == "the final map is there"

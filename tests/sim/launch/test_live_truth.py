@@ -133,7 +133,7 @@ def test_a_watch_without_truth_has_the_robots_own_figures_only() -> None:
     )
     others.publish(Outgoing(ch.STATUS, "robot/r1", status))
     others.publish(Outgoing(ch.TEAM_POSE, "r1", pose(1.0, np.zeros(3))))
-    watch = Watch(robots=1)
+    watch = Watch(robots=("r1",))
     watch.take(bus)
     assert watch.statuses["robot/r1"].figures["nis_per_dof"] == 1.02
     assert watch.errors.of("r1").mean is None

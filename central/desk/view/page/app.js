@@ -199,10 +199,10 @@ function lookAtMap() {
   put('covariance-scale', scale ? scale.toFixed(2) : '–', scale && scaleSays(scale) ? 'warn' : '');
 }
 
-/** What is wrong with covariances of this scale; empty where nothing is. */
+/** The warning about covariances of this scale; empty without one. */
 function scaleSays(scale) {
-  if (scale > SCALE_WARN) return `covariances ought to be ${scale.toFixed(1)} times as large`;
-  return scale < 1 / SCALE_WARN ? `covariances ought to be ${scale.toFixed(2)} times as large` : '';
+  if (scale > SCALE_WARN) return `the reported covariances are too small by a factor of ${scale.toFixed(1)}`;
+  return scale < 1 / SCALE_WARN ? `the reported covariances are too large by a factor of ${(1 / scale).toFixed(1)}` : '';
 }
 
 function metresText(v) { return v < 0.995 ? `${(100 * v).toFixed(v < 0.0995 ? 1 : 0)} cm` : `${v.toFixed(2)} m`; }

@@ -278,12 +278,15 @@ export class MapView {
 
   paintPaths(time, view) {
     const g = this.paths.getContext('2d');
-    const sameView = this.painted.paths === view && time >= this.painted.time && this.painted.store === this.store.hello;
+    const inside = [...this.store.robots.values()].filter((robot) => !this.store.isOutside(robot, time));
+    const shown = inside.map((robot) => `${robot.name} ${this.store.firstInFrame(robot, time)}`).join();
+    const sameView = this.painted.paths === view && time >= this.painted.time && this.painted.store === this.store.hello && this.painted.shown === shown;
     if (!sameView) {
       g.clearRect(0, 0, this.canvas.width, this.canvas.height);
       this.painted.ends = new Map();
     }
     this.painted.paths = view;
+    this.painted.shown = shown;
     this.painted.time = time;
     this.painted.store = this.store.hello;
     if (!this.on.paths) return;
@@ -291,13 +294,14 @@ export class MapView {
     g.lineJoin = 'bevel';
     for (const robot of this.store.robots.values()) {
       if (this.on.truth) this.extendPath(g, robot, 'truth', robot.truth, time, this.colours.truth, 1 * r, 0.55);
-      this.extendPath(g, robot, 'pose', robot.pose, time, robot.colour, 2 * r, 0.75);
     }
+    // Poses from before a robot was in the team's frame are in its own frame.
+    for (const robot of inside) this.extendPath(g, robot, 'pose', robot.pose, time, robot.colour, 2 * r, 0.75, this.store.firstInFrame(robot, time));
   }
 
-  extendPath(g, robot, what, series, time, colour, width, alpha) {
+  extendPath(g, robot, what, series, time, colour, width, alpha, first = 0) {
     const key = `${what} ${robot.name}`;
-    const from = this.painted.ends.get(key) || 0;
+    const from = Math.max(first, this.painted.ends.get(key) || 0);
     const to = series.at(time);
     if (to <= from) return;
     g.strokeStyle = colour;

@@ -64,7 +64,7 @@ export class Store {
       found = {
         name, pose: new Series(POSE), error: new Series(ERROR), truth: new Series(TRUTH),
         clouds: [], cloudTimes: [], smoothed: null, states: [], stateTimes: [], colour: '#888',
-        outside: new Series(1),
+        outside: new Series(1), frames: new Series(0),
       };
       this.robots.set(name, found);
       this.robots = new Map([...this.robots].sort((a, b) => inOrder.compare(a[0], b[0])));
@@ -89,6 +89,7 @@ export class Store {
       case 'eof': this.complete = frame.complete; break;
       case 'pose': this.robot(frame.r).pose.push(frame.t, frame.v); this.extend(frame.v, POSE); break;
       case 'outside': this.robot(frame.r).outside.push([frame.t], [Number(frame.v)]); break;
+      case 'frame': this.robot(frame.r).frames.push([frame.t], []); break;
       case 'err': this.robot(frame.r).error.push(frame.t, frame.v); break;
       case 'truth': this.robot(frame.r).truth.push(frame.t, frame.v); this.extend(frame.v, TRUTH); break;
       case 'truth_map':
@@ -159,6 +160,12 @@ export class Store {
   isOutside(robot, time) {
     const i = robot.outside.at(time);
     return i >= 0 && robot.outside.get(i, 0) === 1;
+  }
+
+  /** The index of the first pose in the frame that a robot's poses have at a time. */
+  firstInFrame(robot, time) {
+    const i = robot.frames.at(time);
+    return i < 0 ? 0 : upTo(robot.pose.t, robot.frames.t[i] - 1e-6);
   }
 
   stateAt(robot, time) {
