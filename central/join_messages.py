@@ -15,11 +15,12 @@ from central.rule import Tail
 from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
+from team.estimation.association.verification import find_possible_duplicates
 from team.estimation.contribution import Stream, named
 from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.alignment import SharedPoints
-from team.estimation.map_joining.associating import IslandView
-from team.estimation.map_joining.distinctness import lost, maybe_the_same, missed, weakly_placed
+from team.estimation.map_joining.distinctness import lost, missed, weakly_placed
+from team.estimation.map_joining.fold_association import view_island
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
 from team.estimation.map_joining.misfits import worst_landmark
@@ -146,8 +147,8 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
         return Shown(ids)
     weak = weakly_placed(fold.main, unnamed)
     seldom = missed(fold, {*unnamed} - {*weak})
-    out, view = {*weak, *seldom}, IslandView(fold.main, fold.landmarks)
-    undecided = maybe_the_same(view, {*unnamed} - out)
+    out, view = {*weak, *seldom}, view_island(fold.main, fold.landmarks)
+    undecided = find_possible_duplicates(view, {*unnamed} - out)
     left = [id_ for id_ in ids if id_ not in out | {*undecided}]
     repeated = repetitions(fold.main, left)
     copies = {id_ for each in repeated for id_ in each.ids}

@@ -7,8 +7,8 @@ from itertools import groupby
 
 import numpy as np
 
-from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
-from team.estimation.map_joining.association.member_log import (
+from team.estimation.association.landmark_sets import Landmarks, LocalLandmark, Verdict
+from team.estimation.association.member_log import (
     KINDS,
     LAST,
     MemberRecord,

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Int64
 from msgspec.structs import replace
 
 from team.config import UNNAMED, AssociationSettings, Sensor
-from team.estimation.association.association import associated
-from team.estimation.association.scans import NOBODY, Scans, points_of
+from team.estimation.association.clustering import associate_window
+from team.estimation.association.scans import UNASSIGNED, Scans, points_of
 from team.estimation.association.tracking import Slip, slip_covariance
 from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.hybrid_slam.reduction import KeyframeScan, Measured, reduced, variances
@@ -63,12 +63,12 @@ def settled(
     """
     events = events_of(keyframes)
     scans = scans_of(events, sensor)
-    found = associated(scans, settings)
-    is_detection = scans.names == NOBODY
+    found = associate_window(scans, settings)
+    is_detection = scans.names == UNASSIGNED
     order = np.argsort(-found.counts, kind="stable")[:most]
-    has_number = np.isin(found.landmark_of, order) & (found.landmark_of != NOBODY)
-    local = np.nonzero((found.names == NOBODY) & np.isin(np.arange(len(found.names)), order))[0]
-    number = np.zeros(len(found.names) + 1, np.int64)  # the last is that of NOBODY
+    has_number = np.isin(found.landmark_of, order) & (found.landmark_of != UNASSIGNED)
+    local = np.nonzero((found.names == UNASSIGNED) & np.isin(np.arange(len(found.names)), order))[0]
+    number = np.zeros(len(found.names) + 1, np.int64)  # the last is that of UNASSIGNED
     number[local] = UNNAMED + np.arange(len(local))
     numbers = np.where(has_number, number[found.landmark_of], 0)[is_detection]
     with_detections = np.array([each.look is not None for each in events], np.bool_)
@@ -117,7 +117,7 @@ def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
         keyframes=np.repeat(np.arange(len(events)), counts),
         points=points,
         covariances=covariances,
-        names=np.where(ids >= UNNAMED, NOBODY, ids),
+        names=np.where(ids >= UNNAMED, UNASSIGNED, ids),
     )
 
 

@@ -11,50 +11,10 @@ from collections.abc import Collection
 import numpy as np
 
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.associating import IslandView
-from team.estimation.map_joining.association.growing import Indices, likelihoods
 from team.estimation.map_joining.gauss_newton import Island
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.memory import MOST
 from team.estimation.map_joining.nonlinearity import heading_sigma
-
-
-def maybe_the_same(view: IslandView, ids: Collection[int]) -> dict[int, int]:
-    """Of these landmarks, those that may be one with another one, each with the likeliest other
-    one, which stays.
-
-    They may be one where they are within the gate, and have the log-likelihood ratio (`growing`)
-    with which a pair is merged that has no rival, or would not have it even at one place: where
-    more landmarks may lie in the gate than there is evidence for, nothing is known. The landmark
-    whose position is known best stays, by the area of its covariance's ellipse.
-    """
-    profile, joint = view.profile, view.joint
-    own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)
-    one, two = (own[each] for each in np.triu_indices(len(own), 1))
-    at = likelihoods(joint, one, two, profile)
-    decidable = at.llr + 0.5 * at.chi2 >= profile.llr_tight
-    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~decidable)
-    maybe &= ~joint.apart[one, two]
-    llr: dict[int, dict[int, float]] = {}
-    for a, b, ratio in zip(
-        one[maybe].tolist(), two[maybe].tolist(), at.llr[maybe].tolist(), strict=True
-    ):
-        llr.setdefault(a, {})[b] = llr.setdefault(b, {})[a] = ratio
-    n = len(joint.mean)
-    xx, xy, _, yy = (
-        joint.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].reshape(n, 4).T
-    )
-    area = xx * yy - xy * xy
-    stays: set[int] = set()
-    out: dict[int, int] = {}
-    for each in sorted(llr, key=lambda k: (float(area[k]), view.ids[k])):
-        others = [other for other in llr[each] if other in stays]
-        if others:
-            likeliest = max(others, key=lambda other: (llr[each][other], -view.ids[other]))
-            out[view.ids[each]] = view.ids[likeliest]
-        else:
-            stays.add(each)
-    return out
 
 
 def weakly_placed(island: Island, ids: Collection[int]) -> list[int]:

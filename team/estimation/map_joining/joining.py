@@ -15,6 +15,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from team.estimation.association.landmark_sets import (
+    NO_LANDMARKS,
+    Landmarks,
+    Opened,
+    Verdict,
+    add_landmarks,
+)
 from team.estimation.contribution import (
     Contribution,
     InitialPoseFactor,
@@ -24,13 +31,6 @@ from team.estimation.contribution import (
     named,
 )
 from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.association.landmarks import (
-    NO_LANDMARKS,
-    Landmarks,
-    Opened,
-    Verdict,
-    founded,
-)
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -264,7 +264,7 @@ def folded(
             home[stream] = common[0] if common and stream in fold.starts else stream
         arrived.setdefault(home[stream], []).append(contribution)
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
-    landmarks, numbers = founded(fold.landmarks, contributions)
+    landmarks, numbers = add_landmarks(fold.landmarks, contributions)
     seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
     islands = {
         key: woken(replace(island, settings=settings), seen) for key, island in fold.islands.items()

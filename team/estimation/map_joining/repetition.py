@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED
 from team.estimation import elementary, elementwise
+from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.association.voting import PointSet, Vote, moved, voted
 from team.estimation.map_joining.gauss_newton import Island
 
 LEAST_PAIRS = 6
@@ -59,7 +59,7 @@ class Repetition(NamedTuple):
     begin_ns: int
     end_ns: int
     place: tuple[float, float]
-    moved: tuple[float, float, float]
+    apply_motion: tuple[float, float, float]
 
 
 def repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
@@ -111,7 +111,7 @@ def _of_stream(
         submap = island.graph.submaps[rows[k]].contribution
         start = island.graph.submaps[rows[k]].nodes[0]
         place = island.state[island.graph.offset[start] :][:2]
-        there = moved(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
+        there = apply_motion(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
         gone = there - place
         if math.hypot(*gone.tolist()) < FARTHER * island.settings.association.same:
             continue
@@ -137,7 +137,9 @@ def _laid(
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
-    votes = voted(a, b, same, float(np.ptp(np.concatenate((own, others)), axis=0).max()))
+    votes = propose_alignments(
+        a, b, same, float(np.ptp(np.concatenate((own, others)), axis=0).max())
+    )
     if not votes:
         return None
     matched = len(votes[0].first)

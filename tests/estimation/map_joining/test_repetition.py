@@ -12,7 +12,7 @@ from team.estimation.contribution import Contribution
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from team.estimation.map_joining.repetition import BY_CHANCE, log_by_chance, repetitions
-from tests.estimation.map_joining.association.unnamed_worlds import circle, drive
+from tests.estimation.association.unnamed_worlds import circle, drive
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
 ROUND = 14

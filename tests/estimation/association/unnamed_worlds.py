@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import UNNAMED
+from team.estimation.association.landmark_sets import Landmarks, LocalLandmark
 from team.estimation.contribution import Contribution
 from team.estimation.geometry import between, inverse, transformed
-from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark
 from team.estimation.submap import LocalMap, Unnamed
 
 POSE_SD = (0.03, 0.03, 0.004)

@@ -5,9 +5,9 @@ import pytest
 
 from team.association import AssociationProfile
 from team.config import UNNAMED
-from team.estimation.map_joining.association.crowding import Crowd
-from team.estimation.map_joining.association.growing import Joint, grow, likelihoods
-from team.estimation.map_joining.association.hypotheses import jointly
+from team.estimation.association.density import LandmarkDensity
+from team.estimation.association.gating import Joint, evaluate_pairs
+from team.estimation.association.joint_compatibility import assign_jointly, grow_pairs
 from team.estimation.submap import LocalMap, Unnamed
 
 PROFILE = AssociationProfile(slack=0.0, density=1.0)
@@ -30,16 +30,16 @@ def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarra
 
 def test_neighbours_are_told_apart_by_one_another_where_each_by_itself_is_not():
     joint, one, two = _twins([0, 1, 2, 3], common=0.15)
-    alone = grow(joint, (one, two), PROFILE)
+    alone = grow_pairs(joint, (one, two), PROFILE)
     assert alone is not None
     assert not alone.pairs
-    found = jointly(joint, one, two, PROFILE, 0.5)
+    found = assign_jointly(joint, one, two, PROFILE, 0.5)
     assert sorted((p.first, p.second) for p in found.pairs) == [(4, 0), (5, 1), (6, 2), (7, 3)]
 
 
 def test_one_of_two_neighbours_alone_waits():
     joint, one, two = _twins([0], common=0.15)
-    assert not jointly(joint, one, two, PROFILE, 0.5).pairs
+    assert not assign_jointly(joint, one, two, PROFILE, 0.5).pairs
 
 
 def test_a_few_loosely_known_landmarks_that_fit_others_by_chance_wait() -> None:
@@ -54,7 +54,7 @@ def test_a_few_loosely_known_landmarks_that_fit_others_by_chance_wait() -> None:
         apart = (seen[:, None] == seen) & ~np.eye(n, dtype=np.bool_)
         joint = Joint(points, sd**2 * np.eye(2 * n) + shift @ shift.T, apart)
         one, two = (each.ravel() for each in np.meshgrid(np.arange(3, n), np.arange(3)))
-        found = jointly(joint, one, two, profile, 2.0)
+        found = assign_jointly(joint, one, two, profile, 2.0)
         assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(pairs)]
 
 
@@ -69,7 +69,7 @@ def test_what_only_a_doubtful_pair_makes_well_known_is_not_well_known() -> None:
     one, two = (each.ravel() for each in np.meshgrid([3, 4], [0, 1, 2], indexing="ij"))
     for density, pairs in ((0.05, []), (0.006, [(4, 2)])):
         profile = AssociationProfile(slack=0.0, density=density, same=0.1)
-        found = jointly(joint, one, two, profile, 2.0)
+        found = assign_jointly(joint, one, two, profile, 2.0)
         assert [(p.first, p.second) for p in found.pairs] == pairs
         assert all(p.sd > 1.0 for p in found.pairs), "it is known to a metre, whatever the first is"
 
@@ -86,18 +86,20 @@ def test_a_profiles_lengths_are_bounded_by_the_spacing_of_what_is_seen_together(
     rng = np.random.default_rng(2)
     groups = np.repeat(rng.uniform(0.0, 12.0, (8, 2)), 2, axis=0)
     groups[1::2] += [0.2, 0.0]
-    crowd = Crowd([_submap(groups, together=True).spacings])
-    bounded = crowd.bounded(AssociationProfile(same=1.7, tight=0.5, slack=0.1))
+    crowd = LandmarkDensity([_submap(groups, together=True).spacings])
+    bounded = crowd.limit_lengths(AssociationProfile(same=1.7, tight=0.5, slack=0.1))
     assert bounded.same == pytest.approx(0.3)
     assert (bounded.tight, bounded.slack) == pytest.approx((0.1, 0.036))
     assert bounded.near == PROFILE.near
-    within = crowd.density(np.array([0.3]))[0]
+    within = crowd.around_landmarks(np.array([0.3]))[0]
     assert within == pytest.approx(1.0 / (np.pi * 0.3**2), rel=0.1)
-    few = Crowd([_submap(groups[:3], together=True).spacings]).bounded(AssociationProfile(same=1.7))
+    few = LandmarkDensity([_submap(groups[:3], together=True).spacings]).limit_lengths(
+        AssociationProfile(same=1.7)
+    )
     assert few.same == pytest.approx(0.3)
-    nobody = Crowd([_submap(groups, together=False).spacings])
-    assert nobody.bounded(PROFILE) == PROFILE
-    assert nobody.density(np.array([0.3]))[0] < 0.1 * within
+    nobody = LandmarkDensity([_submap(groups, together=False).spacings])
+    assert nobody.limit_lengths(PROFILE) == PROFILE
+    assert nobody.around_landmarks(np.array([0.3]))[0] < 0.1 * within
 
 
 def test_two_places_are_one_landmark_sooner_where_the_maps_landmarks_stand_far_apart() -> None:
@@ -105,13 +107,13 @@ def test_two_places_are_one_landmark_sooner_where_the_maps_landmarks_stand_far_a
     places = np.array([(0.0, 0.0), (0.25, 0.0)])  # 2.5 standard deviations of their difference
     strangers = Joint(places, 0.005 * np.eye(4), apart)
     pair = np.array([0]), np.array([1])
-    llr = {"the profile's density": float(likelihoods(strangers, *pair, PROFILE).llr[0])}
+    llr = {"the profile's density": float(evaluate_pairs(strangers, *pair, PROFILE).llr[0])}
     for name, spacing in (("far apart", 2.0), ("close", 0.3)):
         at = spacing * np.array([(i, j) for i in range(10) for j in range(10)], float)
-        crowd = Crowd([_submap(at, together=True).spacings], at)
-        of_one_map = strangers._replace(crowd=crowd, unseen=np.ones(2))
-        llr[name] = float(likelihoods(of_one_map, *pair, PROFILE).llr[0])
-        between = likelihoods(strangers._replace(crowd=crowd), *pair, PROFILE).llr[0]
+        crowd = LandmarkDensity([_submap(at, together=True).spacings], at)
+        of_one_map = strangers._replace(density=crowd, unseen=np.ones(2))
+        llr[name] = float(evaluate_pairs(of_one_map, *pair, PROFILE).llr[0])
+        between = evaluate_pairs(strangers._replace(density=crowd), *pair, PROFILE).llr[0]
         assert between <= llr["the profile's density"]  # of two maps nothing is known
     assert llr["close"] < llr["the profile's density"] < PROFILE.llr_tight < llr["far apart"]
     assert llr["far apart"] - llr["the profile's density"] == pytest.approx(3.8, abs=0.1)

@@ -1,8 +1,8 @@
-"""Proposes alignments of two sets of points from their shapes alone, by votes of pairs of points.
+"""Alignments of two sets of points from their shapes alone, by votes of pairs of points.
 
-Two points of one side at the distance of two points of the other propose a rigid motion; motions
-that many pairs propose are refined by nearest neighbours. All places are searched: an alignment
-that is not proposed could not be counted as a rival.
+Two points of one side at the distance of two points of the other propose a rigid motion (a Hough
+transform over SE(2)); motions that many pairs propose are refined by nearest neighbours. All places
+are searched: an alignment that is not proposed could not be counted as a rival.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,10 @@ MOST_BINS = 60
 ANGLE_BIN = np.radians(6.0)
 REFINEMENTS = 4
 MOST_HYPOTHESES = 100_000
-OF_A_PART = 16
+"""Number of pairs of baselines that vote: those of the longest baselines, which determine the
+heading best.
+"""
+MOST_OF_PART = 16
 """Number of a part's motions that are refined on all points."""
 MOST_COUNTED = 4_000_000
 """Number of cells up to which votes are counted cell by cell."""
@@ -34,23 +37,21 @@ class PointSet(NamedTuple):
 
 
 class Vote(NamedTuple):
-    """The motion b_from_a (x, y, θ) about the centroid of a's points, and the pairs that it
-    matches.
-    """
+    """The motion b_from_a (x, y, θ) about the centroid of a's points, and the pairs it matches."""
 
     motion: Float[np.ndarray, "3"]
     first: Int64[np.ndarray, " k"]
     second: Int64[np.ndarray, " k"]
 
 
-def voted(
+def propose_alignments(
     a: PointSet,
     b: PointSet,
     tolerance: float,
     longest: float,
     parts: Sequence[Int64[np.ndarray, " _"]] = (),
 ) -> list[Vote]:
-    """Distinct rigid motions of a onto b, in descending number of matched points.
+    """Propose distinct rigid motions of a onto b, in descending number of matched points.
 
     tolerance: largest distance of matched points [m].
     longest: largest distance [m] of two points that vote together, since maps are not rigid over
@@ -61,26 +62,28 @@ def voted(
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
     centre = a.mean.mean(axis=0)
-    motions = [_proposed(a.mean - centre, b.mean, tolerance, longest)]
+    motions = [_propose_motions(a.mean - centre, b.mean, tolerance, longest)]
     for part in parts:
         if not 2 <= len(part) < len(a.mean):
             continue
         own = PointSet(a.mean[part], a.sd[part])
         middle = own.mean.mean(axis=0)
-        proposed = _proposed(own.mean - middle, b.mean, tolerance, longest)
-        found = _distinct(_refined(own, b, middle, proposed, tolerance), len(part))[:OF_A_PART]
+        proposed = _propose_motions(own.mean - middle, b.mean, tolerance, longest)
+        found = _keep_distinct(_refine(own, b, middle, proposed, tolerance), len(part))[
+            :MOST_OF_PART
+        ]
         if found:
             moving = np.array([vote.motion for vote in found])
             s, c = elementwise.sin_and_cos(moving[:, 2])
             x, y = centre - middle
             moving[:, :2] += np.column_stack([c * x - s * y, s * x + c * y])
             motions.append(moving)
-    return _distinct(_refined(a, b, centre, np.concatenate(motions), tolerance), len(a.mean))
+    return _keep_distinct(_refine(a, b, centre, np.concatenate(motions), tolerance), len(a.mean))
 
 
-def _distinct(found: list[Vote], points: int) -> list[Vote]:
-    """The votes that are no variant of one with more matched points, in descending number of
-    them.
+def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
+    """Drop the votes that are variants of one with more matched points; sort by that number,
+    descending.
     """
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
@@ -93,18 +96,18 @@ def _distinct(found: list[Vote], points: int) -> list[Vote]:
     return distinct
 
 
-def _proposed(
+def _propose_motions(
     a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"], tolerance: float, longest: float
 ) -> Float[np.ndarray, "_ 3"]:
-    """The motions (of a's origin, its centroid) in the bins with the most votes."""
+    """Propose the motions of a's origin, its centroid, in the bins with the most votes."""
     shortest = 4.0 * tolerance
-    i, j, length_a = _baselines(a, shortest, longest)
-    k, last, length_b = _baselines(b, shortest - 2.0 * tolerance, longest + 2.0 * tolerance)
+    i, j, length_a = _list_baselines(a, shortest, longest)
+    k, last, length_b = _list_baselines(b, shortest - 2.0 * tolerance, longest + 2.0 * tolerance)
     order = np.argsort(length_b, kind="stable")
     k, last, length_b = k[order], last[order], length_b[order]
     begin = np.searchsorted(length_b, length_a - 1.4 * tolerance)
     count = np.searchsorted(length_b, length_a + 1.4 * tolerance) - begin
-    if count.sum() > MOST_HYPOTHESES:  # the longest baselines tell most of the heading
+    if count.sum() > MOST_HYPOTHESES:
         keep = np.argsort(-length_a, kind="stable")
         keep = keep[np.cumsum(count[keep]) <= MOST_HYPOTHESES]
         i, j, begin, count = i[keep], j[keep], begin[keep], count[keep]
@@ -120,25 +123,25 @@ def _proposed(
         turn = elementwise.atan2(across[:, 1], across[:, 0]) - heading
         s, c = elementwise.sin_and_cos(turn)
         middle = 0.5 * (one + two)
-        moved = np.column_stack(
+        rotated = np.column_stack(
             [c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]]
         )
-        motions.append(np.column_stack([0.5 * (b[p] + b[q]) - moved, turn]))
-    return np.array(_peaks(np.concatenate(motions), 3.0 * tolerance)).reshape(-1, 3)
+        motions.append(np.column_stack([0.5 * (b[p] + b[q]) - rotated, turn]))
+    return np.array(_find_peaks(np.concatenate(motions), 3.0 * tolerance)).reshape(-1, 3)
 
 
-def _baselines(
+def _list_baselines(
     points: Float[np.ndarray, "n 2"], shortest: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of points with a distance in this interval, and their distances."""
+    """List the pairs of points with a distance in this interval, and their distances."""
     i, j = np.triu_indices(len(points), 1)
     length = elementwise.hypot(*(points[i] - points[j]).T)
     chosen = (length >= shortest) & (length <= longest)
     return i[chosen], j[chosen], length[chosen]
 
 
-def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndarray, "3"]]:
-    """The mean motion of each of the fullest cells, in two grids that lie half a cell apart."""
+def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndarray, "3"]]:
+    """Find the mean motion of each of the fullest cells, in two grids half a cell apart."""
     peaks = []
     turns = round(2.0 * np.pi / ANGLE_BIN)
     for shift in (0.0, 0.5):
@@ -147,7 +150,7 @@ def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndar
         low = cells.min(axis=0, initial=0)
         size = cells.max(axis=0, initial=0) - low + 1
         code = ((cells[:, 0] - low[0]) * size[1] + cells[:, 1] - low[1]) * turns + angle
-        of, counts = _numbered(code, int(size[0] * size[1]) * turns)
+        of, counts = _rank_codes(code, int(size[0] * size[1]) * turns)
         fullest = np.argsort(-counts, kind="stable")[:MOST_BINS]
         rank = np.full(len(counts), -1)
         rank[fullest] = np.arange(len(fullest))
@@ -162,10 +165,10 @@ def _peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndar
     return peaks
 
 
-def _numbered(
+def _rank_codes(
     codes: Int64[np.ndarray, " v"], beyond: int
 ) -> tuple[Int64[np.ndarray, " v"], Int64[np.ndarray, " _"]]:
-    """For each code the rank of its value among the distinct ones, and how often each occurs.
+    """Rank each code among the distinct ones, and count how often each of these occurs.
 
     beyond: all codes are smaller. Codes of a small range are counted, which is faster than sorting.
     """
@@ -177,15 +180,14 @@ def _numbered(
     return rank[codes], counts[counts > 0]
 
 
-def _refined(
+def _refine(
     a: PointSet,
     b: PointSet,
     centre: Float[np.ndarray, "2"],
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """The motions that the nearest neighbours confirm, with a tolerance that narrows to
-    `tolerance`.
+    """Refine the motions by nearest neighbours, with a tolerance that narrows to `tolerance`.
 
     Motions that no two points confirm are left out.
     """
@@ -193,22 +195,22 @@ def _refined(
     return [
         vote
         for k in range(0, len(motions), most)
-        for vote in _refined_together(a, b, centre, motions[k : k + most], tolerance)
+        for vote in _refine_batch(a, b, centre, motions[k : k + most], tolerance)
     ]
 
 
-def _refined_together(
+def _refine_batch(
     a: PointSet,
     b: PointSet,
     centre: Float[np.ndarray, "2"],
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """As `_refined`, with all distances in memory at once."""
+    """Refine as `_refine` does, with all distances in memory at once."""
     local = a.mean - centre
     for step in range(REFINEMENTS):
         reach = tolerance * (1.5 if step < 2 else 1.0)
-        to, agree = _neighbours(motions, local, b.mean, reach)
+        to, agree = _find_neighbours(motions, local, b.mean, reach)
         lasting = agree.sum(axis=1) >= 2
         motions, to, agree = motions[lasting], to[lasting], agree[lasting]
         if step < REFINEMENTS - 1 and len(motions):
@@ -217,20 +219,20 @@ def _refined_together(
                 + elementary.squared(b.sd[to])
                 + elementary.squared(tolerance)
             )
-            motions = _aligned(local, b.mean[to], weights)
+            motions = _fit_motions(local, b.mean[to], weights)
     return [
         Vote(motion, np.flatnonzero(own), of[own])
         for motion, of, own in zip(motions, to, agree, strict=True)
     ]
 
 
-def _neighbours(
+def _find_neighbours(
     motions: Float[np.ndarray, "B 3"],
     a: Float[np.ndarray, "n 2"],
     b: Float[np.ndarray, "m 2"],
     reach: float,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """For each point the nearest one of b, and whether the two are mutually nearest and within
+    """Find for each point the nearest one of b, and whether the two are mutually nearest and within
     reach.
     """
     s, c = elementwise.sin_and_cos(motions[:, 2:])
@@ -243,12 +245,12 @@ def _neighbours(
     return to_b, mutual & (nearest < elementary.squared(reach))
 
 
-def _aligned(
+def _fit_motions(
     a: Float[np.ndarray, "n 2"],
     to: Float[np.ndarray, "B n 2"],
     weights: Float[np.ndarray, "B n"],
 ) -> Float[np.ndarray, "B 3"]:
-    """The (x, y, θ) that minimise Σ w ‖to − R(θ) a − (x, y)‖², for each of B sets of weights."""
+    """Minimise Σ w ‖to − R(θ) a − (x, y)‖² over (x, y, θ), for each of B sets of weights."""
     share = weights / weights.sum(axis=1, keepdims=True)
     from_, onto = dense.product(share, a), (share[:, :, None] * to).sum(axis=1)
     p, q = a - from_[:, None], to - onto[:, None]
@@ -261,10 +263,10 @@ def _aligned(
     return np.column_stack([x, y, angle])
 
 
-def moved(
+def apply_motion(
     motion: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """The points, given about the centroid, in the other side's frame."""
+    """Map points, given about the centroid, into the other side's frame."""
     s, c = elementwise.sin_and_cos(motion[2])
     placed: Float[np.ndarray, "n 2"] = (
         dense.product(points, np.array([[c, s], [-s, c]])) + motion[:2]

@@ -4,14 +4,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from team.association import AssociationProfile
-from team.estimation.map_joining.association.comparing import (
-    AGAIN,
-    by_turns,
-    comparable,
-    undecided,
+from team.estimation.association.gating import Joint, list_pairs
+from team.estimation.association.island_view import (
+    REEXAMINED,
+    find_undecided,
+    select_by_turns,
+    select_comparisons,
 )
-from team.estimation.map_joining.association.growing import Joint
-from team.estimation.map_joining.association.hypotheses import jointly
+from team.estimation.association.joint_compatibility import assign_jointly
 
 OWN = 0.01
 PROFILE = AssociationProfile(slack=0.0, density=1.0)
@@ -41,39 +41,43 @@ def _rows(submaps: list[np.ndarray], joint: Joint) -> Bool[np.ndarray, "K n"]:
 
 
 def _pairs(joint: Joint, own: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int]]:
-    one, two = (each.ravel() for each in np.meshgrid(own, candidates, indexing="ij"))
-    return sorted((p.first, p.second) for p in jointly(joint, one, two, PROFILE, 0.5).pairs)
+    found = assign_jointly(joint, *list_pairs(own, candidates), PROFILE, 0.5)
+    return sorted((pair.first, pair.second) for pair in found.pairs)
 
 
 def test_fragments_that_wait_do_not_keep_a_submap_from_being_told_apart():
     joint, (own, *others) = _seen([[0, 1, 2, 3]] * 5, common=0.15)
     assert not _pairs(joint, own, np.concatenate(others))
     found = set()
-    for candidates in comparable(joint, own, _rows(others, joint), PROFILE, 0.5):
+    for candidates in select_comparisons(joint, own, _rows(others, joint), PROFILE, 0.5):
         found |= {(one, two % 4) for one, two in _pairs(joint, own, candidates)}
     assert found == {(k, k) for k in range(4)}
 
 
 def test_what_the_other_submap_missed_is_a_rival_of_what_it_has():
     joint, (own, other, whole) = _seen([[1], [0], [0, 1]], common=0.04)
-    fits = comparable(joint, own, _rows([other], joint), PROFILE, 0.5)
+    fits = select_comparisons(joint, own, _rows([other], joint), PROFILE, 0.5)
     assert [each.tolist() for each in fits] == [other.tolist()]
     apart = joint.apart.copy()
     apart[other, whole[1]] = apart[whole[1], other] = True  # one keyframe saw the two together
-    with_rival = comparable(joint._replace(apart=apart), own, _rows([other], joint), PROFILE, 0.5)
+    with_rival = select_comparisons(
+        joint._replace(apart=apart), own, _rows([other], joint), PROFILE, 0.5
+    )
     assert [each.tolist() for each in with_rival] == [other.tolist()]
-    both = comparable(joint._replace(apart=apart), own, _rows([other, whole], joint), PROFILE, 0.5)
+    both = select_comparisons(
+        joint._replace(apart=apart), own, _rows([other, whole], joint), PROFILE, 0.5
+    )
     assert [other[0], whole[1]] in [each.tolist() for each in both]
 
 
 def test_undecided_are_those_that_may_be_one():
     joint, (one, two) = _seen([[0, 1], [0, 2]], common=0.15)
-    assert undecided(joint, np.arange(4), PROFILE).tolist() == [one[0], one[1], two[0]]
+    assert find_undecided(joint, np.arange(4), PROFILE).tolist() == [one[0], one[1], two[0]]
 
 
 def test_every_older_submap_is_examined_again_by_turns():
     submaps = list(range(100, 130))
-    seen = [by_turns(submaps, turn) for turn in range(len(submaps))]
+    seen = [select_by_turns(submaps, turn) for turn in range(len(submaps))]
     assert set().union(*seen) == set(submaps)
-    assert all(len(each) == len(set(each)) <= AGAIN for each in seen)
-    assert by_turns(submaps[:AGAIN], 3) == submaps[:AGAIN]
+    assert all(len(each) == len(set(each)) <= REEXAMINED for each in seen)
+    assert select_by_turns(submaps[:REEXAMINED], 3) == submaps[:REEXAMINED]

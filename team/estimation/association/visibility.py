@@ -13,16 +13,16 @@ from jaxtyping import Bool, Float, Int64
 from team.estimation import elementary, elementwise
 
 OVERLOOKED = 0.4
-"""Upper bound of the probability that a window which sees a landmark misses one beside it."""
+"""Upper bound of the probability that a window which observes a landmark misses one beside it."""
 LEAST_OVERLOOKED = 0.1
-"""Lower bound of the same probability: some landmarks can be seen from one side only."""
+"""Lower bound of the same probability: some landmarks are visible from one side only."""
 
-SeenTogether = Int64[np.ndarray, "_ _"]
+Views = Int64[np.ndarray, "_ _"]
 """For each keyframe the landmarks that it observed together; rows are padded with −1."""
 
 
-def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> SeenTogether:
-    """Lists of landmarks as the rows of one array."""
+def pad_views(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
+    """Arrange lists of landmarks as the rows of one array."""
     each = list(views)
     out = np.full((len(each), max(map(len, each), default=0)), -1)
     for row, view in zip(out, each, strict=True):
@@ -30,19 +30,21 @@ def rows(views: Iterable[Int64[np.ndarray, " _"]]) -> SeenTogether:
     return out
 
 
-def renumbered(views: SeenTogether, to: Int64[np.ndarray, " n"]) -> SeenTogether:
-    """The views with renumbered landmarks; −1 leaves a landmark out."""
+def renumber_views(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
+    """Renumber the landmarks of the views; −1 leaves a landmark out, and a view with fewer than
+    three.
+    """
     if not views.size:
         return views
-    now = np.where(views >= 0, to[views], -1)
-    polygons: SeenTogether = now[(now >= 0).sum(axis=1) >= 3]
+    numbered = np.where(views >= 0, to[views], -1)
+    polygons: Views = numbered[(numbered >= 0).sum(axis=1) >= 3]
     return polygons
 
 
-def covered(
-    points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: SeenTogether
+def mark_visible(
+    points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: Views
 ) -> Bool[np.ndarray, " n"]:
-    """Marks the points in the convex hull of the landmarks of any one view, at their positions
+    """Mark the points in the convex hull of the landmarks of any one view, at their positions
     `own`.
 
     A point lies in a hull when the directions from it to the hull's points leave no gap of half a
@@ -58,7 +60,7 @@ def covered(
     if not len(point):
         return inside
     x, y = (at[view] - points[point, None]).transpose(2, 0, 1)
-    angle = np.sort(elementwise.atan2(y, x), axis=1)  # what is filled up is last
+    angle = np.sort(elementwise.atan2(y, x), axis=1)  # NaN, the padding, is last
     last = np.fmax.reduce(angle, axis=1)
     widest = np.fmax.reduce(angle[:, 1:] - angle[:, :-1], axis=1)
     gap = np.fmax(widest, angle[:, 0] + 2.0 * np.pi - last)
@@ -66,7 +68,7 @@ def covered(
     return inside
 
 
-def overlooked(
+def miss_probabilities(
     points: Float[np.ndarray, "n 2"], seen_by: Sequence[Int64[np.ndarray, " _"]], radius: float
 ) -> Float[np.ndarray, " n"]:
     """Probability, for each landmark, that all windows that saw it missed another one beside it.

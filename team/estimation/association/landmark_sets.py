@@ -1,9 +1,9 @@
-"""The landmarks as sets of (submap, local landmark), with the evidence for each union.
+"""Unnamed landmarks as sets of (submap, local landmark), with the evidence for each merge.
 
-A submap adds each of its unnamed landmarks as a new one, with a number derived from the submap's
-name; association unites them to sets. A set has the number of its smallest member, so that its
-identity lasts while members are added; a set with a named landmark has that name. Everything here
-depends only on the order in which submaps are added.
+A submap adds each of its unnamed landmarks as a set of its own, with a number derived from the
+submap's name; association merges sets. A set has the number of its smallest member, so its identity
+lasts while members are added; a set with a named landmark has that name. All of this depends only
+on the order in which submaps are added.
 """
 
 import hashlib
@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from team.config import UNNAMED
-from team.estimation.contribution import Contribution, Key, Stream, named
-from team.estimation.map_joining.association.member_log import (
+from team.estimation.association.member_log import (
     LocalLandmark,
     MemberLog,
     MemberRecord,
@@ -24,14 +23,10 @@ from team.estimation.map_joining.association.member_log import (
     MergeRecord,
     record_of,
 )
-
-__all__ = [
-    "LocalLandmark",
-    "MergeRecord",
-]
+from team.estimation.contribution import Contribution, Key, Stream, named
 
 OPEN = 2**62
-"""The last submap of a side that all later submaps belong to."""
+"""Sequence number of the last submap of a side that all later submaps belong to."""
 MOST_DECISIONS = 400
 """Number of newest decisions that are stored."""
 
@@ -40,7 +35,7 @@ class Decision(NamedTuple):
     """A closure, or a merge of robots, that was accepted, undone or deferred.
 
     kind: "closure", "merge", "undone", "waits".
-    about: in words, between which robots.
+    about: the robots concerned, in words.
     why: the test that failed; empty where it was accepted.
     absent: number of landmarks that one side has where the other side observed and has none.
     rival_llr: the evidence for the best other alignment.
@@ -82,8 +77,8 @@ class Opened(NamedTuple):
 class Landmarks:
     """The sets of unnamed landmarks.
 
-    present: the members of each landmark that a map has, by its identity.
-    log: all members that there have ever been, those of landmarks that were given up included.
+    present: the members of each landmark of the map, by its identity.
+    log: all members, those of dropped landmarks included.
     names: names that an operator has declared to be another one.
     waits: the last failed attempt of each stream.
     opened: the closures of the last tick.
@@ -106,7 +101,7 @@ class Landmarks:
 
     @cached_property
     def sets(self) -> Mapping[int, tuple[LocalLandmark, ...]]:
-        """All members of each identity, ascending; its time grows with the run."""
+        """All members of each identity, ascending; O(members of the run)."""
         sets: dict[int, list[LocalLandmark]] = {}
         identities = self.identities()
         for stream, sequence, rows in self.log.all_rows():
@@ -116,36 +111,34 @@ class Landmarks:
         return {id_: tuple(sets[id_]) for id_ in sorted(sets)}
 
     def identities(self) -> Mapping[int, int]:
-        """The identity of each number that was ever given; its time grows with the run."""
-        return {number: self._name_now(id_) for number, id_ in self.log.identities().items()}
+        """The identity of each number that was ever given; O(members of the run)."""
+        return {number: self._resolve_name(id_) for number, id_ in self.log.identities().items()}
 
     def identity(self, member: LocalLandmark) -> int | None:
-        """The number of the landmark that a member belongs to; None where there is no such
-        member.
-        """
+        """Look up the number of a member's landmark; None for an unknown member."""
         found = self.log.identity(member)
-        return None if found is None else self._name_now(found)
+        return None if found is None else self._resolve_name(found)
 
     def judged(self) -> set[int]:
         """The identities that an operator has judged."""
         members = (member for verdict in self.verdicts for member in verdict[:2])
         return {id_ for member in members if (id_ := self.identity(member)) is not None}
 
-    def _name_now(self, number: int) -> int:
+    def _resolve_name(self, number: int) -> int:
         while number in self.names:
             number = self.names[number]
         return number
 
     def without(self, ids: Collection[int]) -> "Landmarks":
-        """The landmarks without those that a map gives up."""
+        """Return the landmarks without those that the map drops."""
         present = {id_: of for id_, of in self.present.items() if id_ not in ids}
         return replace(self, present=present)
 
-    def restored(
+    def restore(
         self, contributions: Iterable[Contribution]
     ) -> tuple["Landmarks", dict[Key, list[int]]]:
-        """The landmarks with those of these submaps that were given up; and the present identities
-        of each submap's landmarks.
+        """Return the landmarks with those of these submaps that were dropped, and the present
+        identities of each submap's landmarks.
         """
         identities, numbers = self.identities(), {}
         back: dict[int, MemberSummary] = {}
@@ -157,12 +150,12 @@ class Landmarks:
                 id_ = found[at] = identities[row[1]]
                 if id_ not in self.present:
                     one = MemberSummary(1, record_of(each.stream, each.sequence, row))
-                    back[id_] = back[id_].united(one) if id_ in back else one
+                    back[id_] = back[id_].merge(one) if id_ in back else one
             numbers[each.key] = found
         return replace(self, present={**self.present, **back}), numbers
 
-    def decided(self, *decisions: Decision) -> "Landmarks":
-        """The landmarks with further decisions, of which the newest are stored."""
+    def add_decisions(self, *decisions: Decision) -> "Landmarks":
+        """Return the landmarks with further decisions, of which the newest are stored."""
         return replace(self, decisions=(*self.decisions, *decisions)[-MOST_DECISIONS:])
 
     def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
@@ -179,7 +172,7 @@ NO_LANDMARKS = Landmarks()
 
 
 def members_of(contribution: Contribution) -> list[LocalLandmark | None]:
-    """The member for each landmark of a submap; None for a named one."""
+    """Name the member for each landmark of a submap; None for a named one."""
     of = contribution
     return [
         LocalLandmark(of.robot, of.incarnation, of.sequence, id_ - UNNAMED)
@@ -189,10 +182,10 @@ def members_of(contribution: Contribution) -> list[LocalLandmark | None]:
     ]
 
 
-def founded(
+def add_landmarks(
     landmarks: Landmarks, contributions: Sequence[Contribution]
 ) -> tuple[Landmarks, dict[Key, list[int]]]:
-    """Adds each unnamed landmark of the submaps as a set of its own; returns also the numbers, per
+    """Add each unnamed landmark of the submaps as a set of its own; returns also the numbers, by
     submap.
     """
     members = {each.key: members_of(each) for each in contributions}
@@ -200,12 +193,12 @@ def founded(
     if not names:
         return landmarks, {}
     present, log = dict(landmarks.present), landmarks.log
-    number = dict(zip(names, _numbers(log, names), strict=True))
+    number = dict(zip(names, _choose_numbers(log, names), strict=True))
     for own in (tuple(each for each in of if each is not None) for of in members.values()):
         if own:
             robot, incarnation, sequence, _ = own[0]
             locals_, numbers = [each.local for each in own], [number[each] for each in own]
-            log = log.founded((robot, incarnation), sequence, locals_, numbers)
+            log = log.add_submap((robot, incarnation), sequence, locals_, numbers)
     present |= {own: MemberSummary(1, MemberRecord(each)) for each, own in number.items()}
     return replace(landmarks, present=present, log=log), {
         each.key: [
@@ -217,16 +210,16 @@ def founded(
     }
 
 
-def _numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[int]:
-    """The numbers of new members; one that was given before is passed over."""
+def _choose_numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[int]:
+    """Choose the numbers of new members; one that was given before is skipped."""
     numbers = [number_of(each) for each in members]
-    if len(set(numbers)) == len(numbers) and not log.given(np.array(numbers, np.uint32)).any():
+    if len(set(numbers)) == len(numbers) and not log.mark_given(np.array(numbers, np.uint32)).any():
         return numbers
-    taken = set[int]()
+    used = set[int]()
     for k, own in enumerate(numbers):
-        while own in taken or log.given(np.array([own], np.uint32))[0]:
+        while own in used or log.mark_given(np.array([own], np.uint32))[0]:
             own = UNNAMED | (own + 1) % UNNAMED
-        taken.add(own)
+        used.add(own)
         numbers[k] = own
     return numbers
 
@@ -237,19 +230,19 @@ def number_of(member: LocalLandmark) -> int:
     return UNNAMED | int.from_bytes(digest, "little") & (UNNAMED - 1)
 
 
-def united(
+def merge_sets(
     landmarks: Landmarks, ties: Sequence[tuple[int, MergeRecord]]
 ) -> tuple[Landmarks, dict[int, int]]:
-    """Unites sets; returns them with the new number of each identity that was renumbered.
+    """Merge sets; returns them with the new number of each identity that was renumbered.
 
-    ties: each identity that is united with `tie.into`. A union has the name of a named set, else
-        the number of its smallest member; where that is the identity to be given up, the tie is
+    ties: each identity that is merged with `tie.into`. The result has the name of a named set, else
+        the number of its smallest member; where that is the identity to be lost, the tie is
         recorded in the other direction.
     """
     present, log, names = dict(landmarks.present), landmarks.log, dict(landmarks.names)
     becomes: dict[int, int] = {}
 
-    def now(number: int) -> int:
+    def resolve(number: int) -> int:
         while number in becomes:
             number = becomes[number]
         return number
@@ -258,7 +251,7 @@ def united(
         return number >= UNNAMED, (present[number].first.name,) if number in present else ()
 
     for number, tie in ties:
-        one, two = now(number), now(tie.into)
+        one, two = resolve(number), resolve(tie.into)
         if one == two:
             continue
         stays, goes = sorted((one, two), key=order)
@@ -268,15 +261,15 @@ def united(
             names[goes] = stays
         elif left is not None:
             into = present[stays].first.name if stays >= UNNAMED else None
-            log = log.united(left.first.name, tie, into)
+            log = log.record_merge(left.first.name, tie, into)
             left = left._replace(first=left.first._replace(tie=tie))
         if left is not None:
-            present[stays] = present[stays].united(left) if stays in present else left
+            present[stays] = present[stays].merge(left) if stays in present else left
         becomes[goes] = stays
     after = replace(landmarks, present=present, log=log, names=names)
-    return after, {each: now(each) for each in becomes}
+    return after, {each: resolve(each) for each in becomes}
 
 
-def between(one: Stream, two: Stream) -> str:
-    """Names the two sides of a decision, in words."""
+def name_sides(one: Stream, two: Stream) -> str:
+    """Name the two sides of a decision, in words."""
     return named(one) if one == two else f"{named(one)} and {named(two)}"

@@ -2,13 +2,8 @@ import numpy as np
 import pytest
 
 from team.association import AssociationProfile
-from team.estimation.map_joining.association.growing import (
-    SPLIT,
-    Joint,
-    conditioned,
-    grow,
-    likelihoods,
-)
+from team.estimation.association.gating import SPLIT, Joint, evaluate_pairs
+from team.estimation.association.joint_compatibility import condition_on_pair, grow_pairs
 
 PROFILE = AssociationProfile(slack=0.0)
 
@@ -24,7 +19,7 @@ def _joint(points: list[tuple[float, float]], sd: float, common: float = 0.0) ->
 
 def test_a_pairs_likelihood_is_that_of_its_difference_against_a_stray_landmark():
     joint = _joint([(0.0, 0.0), (0.1, -0.05)], sd=0.1)
-    at = likelihoods(joint, np.array([0]), np.array([1]), PROFILE)
+    at = evaluate_pairs(joint, np.array([0]), np.array([1]), PROFILE)
     S = 0.02 * np.eye(2)
     d = np.array([-0.1, 0.05])
     chi2 = d @ np.linalg.solve(S, d)
@@ -42,7 +37,7 @@ def test_conditioning_on_a_pair_is_the_kalman_filters_measurement_of_no_differen
     H[:, 2:4], H[:, 6:8] = np.eye(2), -np.eye(2)
     S = H @ joint.covariance @ H.T
     K = joint.covariance @ H.T @ np.linalg.inv(S)
-    found = conditioned(joint, 1, 3, PROFILE)
+    found = condition_on_pair(joint, 1, 3, PROFILE)
     assert found.mean.ravel() == pytest.approx(joint.mean.ravel() - K @ H @ joint.mean.ravel())
     assert found.covariance == pytest.approx(joint.covariance - K @ S @ K.T)
 
@@ -53,7 +48,7 @@ def test_an_error_that_all_have_in_common_is_found_with_the_first_pair_and_the_o
     new = [(x + shift, y) for x, y in old]
     joint = _joint([*old, *new], sd=0.02, common=3.0)
     one, two = (each.ravel() for each in np.meshgrid([3, 4, 5], [0, 1, 2], indexing="ij"))
-    found = grow(joint, (one, two), PROFILE, seeds=[(3, 0)])
+    found = grow_pairs(joint, (one, two), PROFILE, seeds=[(3, 0)])
     assert found is not None
     assert {(pair.first, pair.second) for pair in found.pairs} == {(3, 0), (4, 1), (5, 2)}
     assert found.pairs[0].sd > 1.0 > found.pairs[1].sd
@@ -64,11 +59,11 @@ def test_of_two_equal_partners_none_is_taken_and_fragments_of_one_do_not_block_e
     one, two = np.array([0, 0]), np.array([1, 2])
     rivals = joint._replace(apart=joint.apart.copy())
     rivals.apart[1, 2] = rivals.apart[2, 1] = True
-    waits = grow(rivals, (one, two), PROFILE)
+    waits = grow_pairs(rivals, (one, two), PROFILE)
     assert waits is not None
     assert not waits.pairs
     assert waits.doubtful == 2
-    fragments = grow(joint, (one, two), PROFILE)
+    fragments = grow_pairs(joint, (one, two), PROFILE)
     assert fragments is not None
     assert len(fragments.pairs) == 1
 
@@ -76,10 +71,10 @@ def test_of_two_equal_partners_none_is_taken_and_fragments_of_one_do_not_block_e
 def test_what_one_scan_saw_as_two_is_never_one_and_this_is_passed_on_to_whom_they_join():
     joint = _joint([(0.0, 0.0), (0.02, 0.0), (0.01, 0.0)], sd=0.05)
     joint.apart[0, 1] = joint.apart[1, 0] = True
-    found = grow(joint, (np.array([0, 1, 0]), np.array([2, 2, 1])), PROFILE)
+    found = grow_pairs(joint, (np.array([0, 1, 0]), np.array([2, 2, 1])), PROFILE)
     assert found is not None
     assert len(found.pairs) <= 1
-    after = conditioned(joint, 0, 2, PROFILE)
+    after = condition_on_pair(joint, 0, 2, PROFILE)
     assert after.apart[2, 1]
     assert after.apart[1, 2]
 
@@ -87,15 +82,15 @@ def test_what_one_scan_saw_as_two_is_never_one_and_this_is_passed_on_to_whom_the
 def test_what_one_window_has_as_two_needs_more_and_so_do_those_whom_either_joins():
     joint = _joint([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0)], sd=0.08)
     one, two = np.array([0]), np.array([1])
-    llr = likelihoods(joint, one, two, PROFILE).llr[0]
+    llr = evaluate_pairs(joint, one, two, PROFILE).llr[0]
     assert PROFILE.llr_tight < llr < PROFILE.llr_tight + SPLIT
     split = np.zeros((3, 3), np.bool_)
     split[0, 1] = split[1, 0] = True
     for beside, pairs in ((None, 1), (split, 0)):
-        found = grow(joint._replace(apart_in_window=beside), (one, two), PROFILE)
+        found = grow_pairs(joint._replace(apart_in_window=beside), (one, two), PROFILE)
         assert found is not None
         assert len(found.pairs) == pairs
-    after = conditioned(joint._replace(apart_in_window=split), 1, 2, PROFILE).apart_in_window
+    after = condition_on_pair(joint._replace(apart_in_window=split), 1, 2, PROFILE).apart_in_window
     assert after is not None
     assert after[0, 2]
     assert after[2, 0]

@@ -1,7 +1,7 @@
 import numpy as np
 
-from team.estimation.map_joining.association import voting
-from team.estimation.map_joining.association.voting import PointSet, moved, voted
+from team.estimation.association import voting
+from team.estimation.association.voting import PointSet, apply_motion, propose_alignments
 
 
 def _points(mean: np.ndarray) -> PointSet:
@@ -14,8 +14,8 @@ def test_the_motion_between_two_sets_is_found_among_points_that_only_one_of_them
     motion = np.array([4.0, -7.0, 2.2])
     a = np.concatenate([shared, rng.uniform(0.0, 20.0, (10, 2))])
     centre = a.mean(axis=0)
-    b = np.concatenate([rng.uniform(-30.0, 30.0, (60, 2)), moved(motion, shared - centre)])
-    best = voted(_points(a), _points(b), 0.3, 15.0)[0]
+    b = np.concatenate([rng.uniform(-30.0, 30.0, (60, 2)), apply_motion(motion, shared - centre)])
+    best = propose_alignments(_points(a), _points(b), 0.3, 15.0)[0]
     pairs = set(zip(best.first.tolist(), best.second.tolist(), strict=True))
     assert {(k, 60 + k) for k in range(15)} <= pairs
     assert np.abs(best.motion - motion).max() < 0.05
@@ -25,19 +25,19 @@ def test_a_pattern_that_stands_twice_gives_two_alignments_of_equal_size():
     rng = np.random.default_rng(2)
     room = rng.uniform(0.0, 8.0, (10, 2))
     twice = np.concatenate([room, room + np.array([30.0, 0.0])])
-    first, second = voted(_points(room), _points(twice), 0.3, 15.0)[:2]
+    first, second = propose_alignments(_points(room), _points(twice), 0.3, 15.0)[:2]
     assert len(first.first) == len(second.first) == 10
     assert abs(first.motion[0] - second.motion[0]) > 29.0
 
 
 def test_two_maps_of_one_point_have_no_alignment():
-    assert voted(_points(np.zeros((1, 2))), _points(np.zeros((5, 2))), 0.3, 15.0) == []
+    assert propose_alignments(_points(np.zeros((1, 2))), _points(np.zeros((5, 2))), 0.3, 15.0) == []
 
 
 def test_votes_are_counted_cell_by_cell_as_they_are_sorted() -> None:
     codes = np.random.default_rng(0).integers(0, 900, 400)
     counted, ordered = (
-        voting._numbered(codes, beyond) for beyond in (900, voting.MOST_COUNTED + 1)
+        voting._rank_codes(codes, beyond) for beyond in (900, voting.MOST_COUNTED + 1)
     )
     for one, two in zip(counted, ordered, strict=True):
         np.testing.assert_array_equal(one, two)

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 
 from team.config import AssociationSettings
-from team.estimation.association.association import Associated, associated
-from team.estimation.association.matching import best_pairs_first, squared_distances
+from team.estimation.association.clustering import WindowAssociation, associate_window
 from team.estimation.association.scans import (
-    NOBODY,
+    UNASSIGNED,
     Scans,
     path_of,
     points_of,
+    relative_to,
     rotations,
-    seen_from,
 )
-from team.estimation.association.smoothing import smoothed
+from team.estimation.association.smoothing import smooth_window
 
 SETTINGS = AssociationSettings()
 MOTION_NOISE = np.diag([0.02, 0.01, 0.01]) ** 2
@@ -25,7 +24,7 @@ RANGE_M, VIEW_M = 0.05, 6.0
 
 
 def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
-    """(scans, the landmark of each detection or NOBODY): a drive through a grid of landmarks."""
+    """(scans, the landmark of each detection): a drive through a grid of landmarks."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(np.arange(-4, 12), np.arange(-4, 5)), -1).reshape(-1, 2) * spacing
     landmarks = grid[rng.random(len(grid)) < 0.5] + 0.1 * rng.normal(size=(1, 2))
@@ -36,7 +35,7 @@ def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
         measured[slip[0]] += slip[1]
     keyframes, points, labels = [], [], []
     for k, pose in enumerate(poses):
-        seen = seen_from(np.tile(pose, (len(landmarks), 1)), landmarks)
+        seen = relative_to(np.tile(pose, (len(landmarks), 1)), landmarks)
         near = np.hypot(*seen.T) < VIEW_M
         for label in np.nonzero(near & (rng.random(len(near)) >= missed))[0]:
             keyframes.append(k)
@@ -45,7 +44,7 @@ def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
         for _ in range(rng.poisson(clutter * near.sum())):
             keyframes.append(k)
             points.append(rng.uniform(-VIEW_M, VIEW_M, 2))
-            labels.append(NOBODY)
+            labels.append(UNASSIGNED)
     n = len(points)
     scans = Scans(
         measured,
@@ -53,17 +52,17 @@ def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
         np.array(keyframes),
         np.array(points),
         np.tile(RANGE_M**2 * np.eye(2), (n, 1, 1)),
-        np.full(n, NOBODY),
+        np.full(n, UNASSIGNED),
     )
     return scans, np.array(labels)
 
 
 def pairs(found: np.ndarray, labels: np.ndarray) -> tuple[float, float]:
     """Pairwise (precision, recall) of the detections that are of a landmark."""
-    real = labels != NOBODY
+    real = labels != UNASSIGNED
     found, labels = found[real], labels[real]
     same = labels[:, None] == labels[None]
-    said = (found[:, None] == found[None]) & (found[:, None] != NOBODY)
+    said = (found[:, None] == found[None]) & (found[:, None] != UNASSIGNED)
     np.fill_diagonal(same, False)
     np.fill_diagonal(said, False)
     return (same & said).sum() / said.sum(), (same & said).sum() / same.sum()
@@ -72,23 +71,23 @@ def pairs(found: np.ndarray, labels: np.ndarray) -> tuple[float, float]:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_window_of_separate_landmarks_is_associated_without_an_error(seed):
     scans, labels = window(seed, clutter=0.2, missed=0.1)
-    result = associated(scans, SETTINGS)
+    result = associate_window(scans, SETTINGS)
     precision, recall = pairs(result.landmark_of, labels)
     assert precision == 1.0
     assert recall > 0.95
-    kept_clutter = (result.landmark_of != NOBODY) & (labels == NOBODY)
-    assert kept_clutter.sum() < 0.2 * (labels == NOBODY).sum()
+    kept_clutter = (result.landmark_of != UNASSIGNED) & (labels == UNASSIGNED)
+    assert kept_clutter.sum() < 0.2 * (labels == UNASSIGNED).sum()
 
 
 def test_landmarks_nearer_than_the_noise_are_not_told_apart_which_the_score_notices():
     scans, labels = window(0, spacing=0.1)
-    assert pairs(associated(scans, SETTINGS).landmark_of, labels)[0] < 0.9
+    assert pairs(associate_window(scans, SETTINGS).landmark_of, labels)[0] < 0.9
 
 
 def test_one_scan_never_sees_a_landmark_twice():
     scans, _ = window(1, clutter=0.5, spacing=0.5)
-    result = associated(scans, SETTINGS)
-    used = result.landmark_of != NOBODY
+    result = associate_window(scans, SETTINGS)
+    used = result.landmark_of != UNASSIGNED
     seen = list(zip(scans.keyframes[used], result.landmark_of[used], strict=True))
     assert len(seen) == len(set(seen))
     assert result.seen.sum() == len(seen)
@@ -98,17 +97,17 @@ def test_one_scan_never_sees_a_landmark_twice():
 
 def test_what_is_looked_at_again_in_vain_is_clutter_and_what_is_not_is_unconfirmed():
     scans, labels = window(2, clutter=0.3)
-    result = associated(scans, SETTINGS)
-    out = result.landmark_of == NOBODY
+    result = associate_window(scans, SETTINGS)
+    out = result.landmark_of == UNASSIGNED
     assert not result.clutter[~out].any()
-    assert result.clutter[labels == NOBODY].mean() > 0.5
-    assert not result.clutter[labels != NOBODY].any()
+    assert result.clutter[labels == UNASSIGNED].mean() > 0.5
+    assert not result.clutter[labels != UNASSIGNED].any()
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.8])
 def test_a_slip_of_the_odometry_is_named_and_costs_no_landmark(reach):
     scans, labels = window(3, slip=(12, np.array([0.3, 0.25, 0.0])))
-    result = associated(scans, AssociationSettings(slip_m=reach))
+    result = associate_window(scans, AssociationSettings(slip_m=reach))
     recall = pairs(result.landmark_of, labels)[1]
     if not reach:
         assert recall < 0.9, "without the search the window falls into two halves"
@@ -130,45 +129,30 @@ def test_a_slip_among_as_many_new_landmarks_as_known_ones_is_found():
         np.repeat(np.arange(8), list(map(len, scans))),
         np.concatenate(scans),
         np.tile(0.03**2 * np.eye(2), (n, 1, 1)),
-        np.full(n, NOBODY),
+        np.full(n, UNASSIGNED),
     )
-    result = associated(still, AssociationSettings(slip_m=0.6))
+    result = associate_window(still, AssociationSettings(slip_m=0.6))
     assert [each.keyframe for each in result.slips] == [6]
     assert len(result.counts) == 6, "three before the slip, and three beside them since"
 
 
 def test_named_detections_are_believed_beside_those_without_a_name():
     scans, labels = window(4)
-    tags = np.where(labels % 3 == 0, labels + 7, NOBODY)
-    result = associated(replace(scans, names=tags), SETTINGS)
-    assert (result.names[result.landmark_of[tags != NOBODY]] == tags[tags != NOBODY]).all()
+    tags = np.where(labels % 3 == 0, labels + 7, UNASSIGNED)
+    result = associate_window(replace(scans, names=tags), SETTINGS)
+    assert (result.names[result.landmark_of[tags != UNASSIGNED]] == tags[tags != UNASSIGNED]).all()
     assert pairs(result.landmark_of, labels) == (1.0, 1.0)
-    named = result.names[result.names != NOBODY]
+    named = result.names[result.names != UNASSIGNED]
     assert (np.diff(named) > 0).all()
-    assert (result.names[len(named) :] == NOBODY).all()
+    assert (result.names[len(named) :] == UNASSIGNED).all()
 
 
 def test_the_same_window_gives_the_same_bits_and_truth_is_no_input():
     scans, _ = window(5, clutter=0.2)
-    first, second = (associated(scans, SETTINGS) for _ in range(2))
+    first, second = (associate_window(scans, SETTINGS) for _ in range(2))
     for name in ("landmark_of", "counts", "seen", "clutter"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
-    assert isinstance(first, Associated)
-
-
-def test_the_best_pair_comes_first_and_each_is_taken_once():
-    squared = np.array([[1.0, 0.5], [2.0, 0.1], [30.0, 40.0]])
-    assert best_pairs_first(squared, squared, 13.8).tolist() == [0, 1, NOBODY]
-
-
-def test_squared_distances_are_those_of_the_matrix_inverse():
-    rng = np.random.default_rng(0)
-    roots = rng.normal(size=(4, 3, 2, 2))
-    S = roots @ roots.transpose(0, 1, 3, 2) + 0.1 * np.eye(2)
-    d = rng.normal(size=(4, 3, 2))
-    squared, logs = squared_distances(d, S)
-    assert np.allclose(squared, np.einsum("abi,abij,abj->ab", d, np.linalg.inv(S), d))
-    assert np.allclose(logs, np.linalg.slogdet(S)[1])
+    assert isinstance(first, WindowAssociation)
 
 
 def test_points_carry_the_covariance_of_range_and_bearing():
@@ -196,7 +180,7 @@ def test_the_smoothed_window_is_consistent_and_one_with_half_the_noise_claimed_i
             at = poses[scans.keyframes[first]]
             turned = np.einsum("nij,nj->ni", rotations(at[:, 2]), scans.points[first])
             landmarks = at[:, :2] + turned
-            result = smoothed(scans, landmark_of, poses, landmarks)
+            result = smooth_window(scans, landmark_of, poses, landmarks)
             squared, dof = squared + result.squared, dof + result.dof
         ratios.append(squared / dof)
     assert 0.9 < ratios[0] < 1.1
@@ -205,7 +189,7 @@ def test_the_smoothed_window_is_consistent_and_one_with_half_the_noise_claimed_i
 
 def test_landmarks_that_one_scan_saw_together_are_never_merged():
     scans, labels = window(6, spacing=1.0)
-    result = associated(scans, AssociationSettings(slack_m=5.0, certain=0.0))
+    result = associate_window(scans, AssociationSettings(slack_m=5.0, certain=0.0))
     by_scan = [labels[scans.keyframes == k] for k in range(len(scans.motions))]
     together = {pair for seen in by_scan for pair in combinations(sorted(seen), 2)}
     members = [set(labels[result.landmark_of == i]) for i in range(len(result.counts))]

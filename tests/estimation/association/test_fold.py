@@ -7,14 +7,14 @@ import pytest
 
 from central.join_messages import Shown, reasons
 from team.association import AssociationProfile
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.association.landmarks import (
+from team.estimation.association.landmark_sets import (
     OPEN,
     Landmarks,
     LocalLandmark,
     Opened,
     Verdict,
 )
+from team.estimation.map_joining import marginals
 from team.estimation.map_joining.auditing import share_now, taken
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -23,7 +23,7 @@ from team.estimation.map_joining.joining import (
     JoinSettings,
     Tick,
 )
-from tests.estimation.map_joining.association.unnamed_worlds import (
+from tests.estimation.association.unnamed_worlds import (
     circle,
     drive,
     duplicates,

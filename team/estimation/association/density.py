@@ -1,13 +1,14 @@
-"""The local density of landmarks, from the landmarks that one keyframe observed together.
+"""The local density λ of landmarks, and the lengths that follow from their spacing.
 
-Landmarks observed by one keyframe are different ones, whatever else is unknown. Their distances
+Landmarks observed by one keyframe are different ones, whatever else is uncertain. Their distances
 give the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976,
 J. Appl. Prob. 13). Where landmarks stand in groups it is far above the mean density of the map: a
-pair whose difference is no better known than the spacing within a group may be either of its
-members. What one keyframe observes together says nothing of neighbours that hide each other: these
-are counted in the map, among the landmarks that several submaps have observed. The distances also
-bound the lengths of a profile: two landmarks that are farther apart than their neighbours are not
-one landmark that was split.
+pair whose difference is as uncertain as the spacing within a group may be either of its members.
+The observations of one keyframe do not contain neighbours that hide each other: these are counted
+in the map, among the landmarks that several submaps have observed.
+
+The distances also bound the lengths of a profile: two landmarks that are farther apart than their
+neighbours are not one landmark that was split.
 """
 
 from collections.abc import Iterable
@@ -21,9 +22,9 @@ from team.association import AssociationProfile
 from team.estimation import elementary, elementwise
 
 CLOSE = 0.1
-"""Quantile of the landmarks' spacing that is taken as the spacing within groups."""
+"""Quantile of the landmarks' spacing that is used as the spacing within groups."""
 FEWEST = 10
-"""With fewer landmarks that have a neighbour the smallest spacing is taken."""
+"""With fewer landmarks that have a neighbour the smallest spacing is used."""
 SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
 """Upper bounds of a profile's lengths, in multiples of this spacing."""
 
@@ -31,7 +32,7 @@ SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
 Spacings = Float[np.ndarray, "U U"]
 
 
-class Crowd:
+class LandmarkDensity:
     """The spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
     spacings: of each submap (`LocalMap.spacings`).
@@ -55,9 +56,11 @@ class Crowd:
         found = np.concatenate([np.zeros(0), *(away.ravel() for away in self._each)])
         return np.sort(found[np.isfinite(found)])
 
-    def density(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Density [1/m²] of further landmarks within each radius [m] of a landmark; where no pair
-        was observed half a pair is assumed.
+    def around_landmarks(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Density [1/m²] of further landmarks within each radius [m] of a landmark, as single
+        keyframes observed them.
+
+        (ordered pairs within R + 1) / (n π R²): half a pair is assumed beside those observed.
         """
         within = np.searchsorted(self._distances, radius) + 1.0
         found: Float[np.ndarray, " k"] = within / (
@@ -70,11 +73,11 @@ class Crowd:
         one, two = np.triu_indices(len(self.confirmed), 1)
         return np.sort(elementwise.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
 
-    def density_in_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """The same of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
+    def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Density [1/m²] of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
 
-        Two that are one and wait are counted as neighbours, so that it is too large, never too
-        small, while association is incomplete.
+        Two landmarks that are one but not merged yet are counted as neighbours, so the density is
+        too large, never too small, while association is incomplete.
         """
         pairs = np.searchsorted(self._in_map, radius, side="right")
         found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (
@@ -82,8 +85,8 @@ class Crowd:
         )
         return found
 
-    def bounded(self, profile: AssociationProfile) -> AssociationProfile:
-        """The profile with lengths that distinguish neighbours."""
+    def limit_lengths(self, profile: AssociationProfile) -> AssociationProfile:
+        """Return the profile with lengths small enough to distinguish neighbours."""
         if not len(self.nearest):
             return profile
         share = CLOSE if len(self.nearest) >= FEWEST else 0.0

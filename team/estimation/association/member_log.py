@@ -1,9 +1,9 @@
-"""All members of unnamed landmarks that there have ever been, in few bytes and shared arrays.
+"""Append-only log of the members of all unnamed landmarks, in few bytes and shared arrays.
 
-A member is a local landmark of a submap. It is founded with a number of its own, which is given up
-when its landmark is united with another one. What is written once stays: a log with more in it
-shares all but the last rows with the log before, so that a checkpoint stores nothing again, and a
-tick takes the time of what it brings.
+A member is a local landmark of a submap. It starts with a number of its own, which it loses when
+its landmark is merged with another one. Rows that are written once stay: a longer log shares all
+but its last rows with the log before, so checkpoints store no row twice, and the time of a tick
+depends on its own submaps only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,14 +17,13 @@ from team.config import UNNAMED
 from team.estimation.contribution import Stream
 
 KINDS = ("track", "near", "sweep", "closure", "merge", "verdict")
-"""The steps that unite landmarks."""
+"""The steps that merge landmarks."""
 RUN = 64
 """Number of a stream's submaps whose rows are stored together."""
 CHUNK = 4096
 """Number of given numbers that are stored together."""
-
 LAST = 11
-"""Number of a landmark's last members that are at hand; all are in the log."""
+"""Number of a landmark's last members in its summary; all are in the log."""
 
 Rows = np.ndarray
 """The unnamed landmarks of one submap, ascending by their local number, as records of `ROW`."""
@@ -43,7 +42,7 @@ ROW = np.dtype(
         ("stamp_ns", np.int64),
     ]
 )
-"""step: 1 + the index in KINDS of the step by which the number was given up, 0 while it is not."""
+"""step: 1 + the index in KINDS of the step that merged the landmark into another; 0: none."""
 NO_ROWS: Rows = np.zeros(0, ROW)
 
 
@@ -61,7 +60,7 @@ class LocalLandmark(NamedTuple):
 
 
 class MergeRecord(NamedTuple):
-    """Why the set with this number was united with another: by which step and with which figures.
+    """The step that merged the set of this number into another one, and its figures.
 
     rival: the best log-likelihood ratio of a pair that excludes it.
     stamp_ns: the last end of a submap in the tick.
@@ -76,7 +75,7 @@ class MergeRecord(NamedTuple):
 
 
 class MemberRecord(NamedTuple):
-    """A member of a landmark; tie: why its own number was given up, if it was."""
+    """A member of a landmark; tie: the merge by which it lost its own number, if any."""
 
     name: LocalLandmark
     tie: MergeRecord | None = None
@@ -89,8 +88,8 @@ class MemberSummary(NamedTuple):
     first: MemberRecord
     last: tuple[MemberRecord, ...] = ()
 
-    def united(self, others: "MemberSummary") -> "MemberSummary":
-        """With the members of another landmark."""
+    def merge(self, others: "MemberSummary") -> "MemberSummary":
+        """Merge with the members of another landmark."""
         first, *rest = sorted((self.first, others.first, *self.last, *others.last))
         return MemberSummary(self.size + others.size, first, tuple(rest[-LAST:]))
 
@@ -104,7 +103,7 @@ class MemberLog:
     chunks: tuple[UInt32[np.ndarray, " _"], ...] = ()
 
     def rows(self, stream: Stream, sequence: int) -> Rows:
-        """The rows of a submap; none where it has no unnamed landmark or is not there."""
+        """Return the rows of a submap; none where it has no unnamed landmark or is absent."""
         if stream not in self.streams:
             return NO_ROWS
         runs = self.runs[self.streams.index(stream)]
@@ -112,38 +111,38 @@ class MemberLog:
         return of_run[sequence % RUN] if sequence % RUN < len(of_run) else NO_ROWS
 
     def all_rows(self) -> Iterator[tuple[Stream, int, Rows]]:
-        """Stream, sequence and rows of each submap, in the order of the streams' names."""
+        """Iterate over stream, sequence and rows of each submap, by the streams' names."""
         for stream in sorted(self.streams):
             for k, of_run in enumerate(self.runs[self.streams.index(stream)]):
                 for n, rows in enumerate(of_run):
                     yield stream, RUN * k + n, rows
 
-    def given(self, numbers: UInt32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Which of these numbers have been given to a member before."""
+    def mark_given(self, numbers: UInt32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Mark the numbers that a member has had before."""
         found = np.zeros(len(numbers), np.bool_)
         for chunk in self.chunks:
             at = np.minimum(np.searchsorted(chunk, numbers), len(chunk) - 1)
             found |= chunk[at] == numbers
         return found
 
-    def founded(
+    def add_submap(
         self, stream: Stream, sequence: int, locals_: Sequence[int], numbers: Sequence[int]
     ) -> "MemberLog":
-        """The log with the unnamed landmarks of one more submap."""
+        """Return the log with the unnamed landmarks of one more submap."""
         rows = np.zeros(len(numbers), ROW)
         rows["local"], rows["number"] = locals_, numbers
-        log = self._written(stream, sequence, rows)
+        log = self._write(stream, sequence, rows)
         *full, last = log.chunks or (rows["number"][:0],)
         more = np.sort(np.concatenate([last, rows["number"]]))
         chunks = (*full, more) if len(last) < CHUNK else (*full, last, np.sort(rows["number"]))
         return replace(log, chunks=chunks)
 
-    def united(
+    def record_merge(
         self, member: LocalLandmark, tie: MergeRecord, into: LocalLandmark | None
     ) -> "MemberLog":
-        """The log after a member's number was given up.
+        """Return the log in which a member has lost its number to `tie.into`.
 
-        into: the member whose number `tie.into` is; None for a name.
+        into: the member whose number that is; None for a name.
         """
         stream = (member.robot, member.incarnation)
         rows = self.rows(stream, member.sequence).copy()
@@ -155,9 +154,9 @@ class MemberLog:
         step = 1 + KINDS.index(tie.kind)
         figures = (tie.llr, tie.rival, tie.sd, tie.stamp_ns)
         rows[at] = (member.local, rows["number"][at], step, tie.into, *where, *figures)
-        return self._written(stream, member.sequence, rows)
+        return self._write(stream, member.sequence, rows)
 
-    def _written(self, stream: Stream, sequence: int, rows: Rows) -> "MemberLog":
+    def _write(self, stream: Stream, sequence: int, rows: Rows) -> "MemberLog":
         streams, runs = self.streams, list(self.runs)
         if stream not in streams:
             streams = (*streams, stream)
@@ -173,9 +172,7 @@ class MemberLog:
         return MemberLog(streams, tuple(runs), self.chunks)
 
     def identity(self, member: LocalLandmark) -> int | None:
-        """The number or the name of the landmark that a member belongs to; None where there is no
-        such member.
-        """
+        """Look up the number or the name of a member's landmark; None for an unknown member."""
         while True:
             rows = self.rows((member.robot, member.incarnation), member.sequence)
             at = int(np.searchsorted(rows["local"], member.local))
@@ -191,7 +188,7 @@ class MemberLog:
             member = LocalLandmark(robot, incarnation, *there)
 
     def identities(self) -> dict[int, int]:
-        """The identity of each number that has ever been given."""
+        """Look up the identity of each number that was ever given."""
         into: dict[int, int] = {}
         numbers: list[int] = []
         for _, _, rows in self.all_rows():
@@ -209,7 +206,7 @@ class MemberLog:
 
 
 def record_of(stream: Stream, sequence: int, row: Sequence[Any]) -> MemberRecord:
-    """The member of a row of the log."""
+    """Convert a row of the log to its member."""
     local, _, step, into, *_, llr, rival, sd, stamp_ns = row
     name = LocalLandmark(*stream, sequence, local)
     tie = MergeRecord(KINDS[step - 1], into, llr, rival, sd, stamp_ns) if step else None

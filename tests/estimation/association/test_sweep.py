@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from team.config import UNNAMED
-from team.estimation.map_joining.associating import IslandView
+from team.estimation.association.island_view import IslandView
 from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.fold_association import view_island
 from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, JoinSettings, Tick
 from team.estimation.submap import LocalMap, Unnamed
 
@@ -26,7 +27,7 @@ def view_of_a_group_shifted_by(shift: float) -> IslandView:
         unnamed=Unnamed(np.full(count, 5, np.uint32), np.zeros((count, 0), np.bool_)),
     )
     fold = taken(EMPTY_FOLD, Tick([Contribution("r1", 1, 0, 10**10, local)]), JoinSettings())
-    view = IslandView(fold.main, fold.landmarks)
+    view = view_island(fold.main, fold.landmarks)
     order = np.argsort(view.joint.mean[:, 0] * 10.0 + view.joint.mean[:, 1])
     mean = view.joint.mean.copy()
     mean[order[3:]] += [0.0, shift] - AWAY
@@ -38,7 +39,7 @@ def view_of_a_group_shifted_by(shift: float) -> IslandView:
         covariance=covariance,
         apart=np.zeros((count, count), np.bool_),
         apart_in_window=None,
-        crowd=None,
+        density=None,
     )
     return view
 
