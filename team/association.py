@@ -1,4 +1,4 @@
-"""The thresholds of data association between submaps: one profile for each kind of sensor."""
+"""Thresholds of data association between submaps: one profile for each kind of sensor."""
 
 from math import hypot
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.config import NonNegative, Positive, Sensor, Share
+from team.config import GATE, NonNegative, Positive, Sensor, Share
 
 Few = Annotated[int, Meta(ge=1, le=1000)]
 
@@ -14,25 +14,39 @@ Few = Annotated[int, Meta(ge=1, le=1000)]
 class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Thresholds by which landmarks without identities are merged; lengths in metres.
 
-    gate: χ² (2 numbers) beyond which two are not one. slack: what two submaps' places of one
-    landmark differ by beside their covariance. density: λ, landmarks to be expected per square
-    metre. llr_tight, llr_loose: the log-likelihood ratio that a pair needs where the standard
-    deviation of its difference is below `tight`, and elsewhere. odds: how much more it needs than
-    its best rival. near: up to this standard deviation old landmarks are candidates without a
-    closure. same: two landmarks nearer than this may be one that was split. recent: so many last
-    submaps of a robot are followed by tracking, and are the patch for which a closure is searched.
-    absent: the cost of a landmark that one side has and the other, which observed its place, has
-    not: −ln of the probability of that. closure_pairs, closure_llr, margin, ratio: what a closure
-    needs: pairs, evidence (the sum of their log-likelihood ratios less what is absent), how much
-    more and how many times the evidence of the best other alignment. island_pairs, island_llr: the
-    same between robots with unknown initial poses. context: least number of landmarks of both sides
-    outside the matched place, relative to the pairs; with fewer it is unknown whether the place is
-    unique. share: of the landmarks of either side near the matched places (of the side that has
-    fewer), how many are matched. A closure whose share falls below undone_below within `audited`
-    ticks is undone.
+    Pairs of landmarks:
+    gate: χ² (2 degrees of freedom) beyond which two are not one landmark: `GATE`.
+    slack: standard deviation beside the covariance by which two submaps' positions of one landmark
+        differ: SCALE_M.
+    density: λ, upper bound of the expected landmarks per square metre; the map's own density
+        replaces it where it is larger, or known.
+    llr_tight, llr_loose: log-likelihood ratio that a pair needs where the standard deviation of its
+        difference is below `tight`, and elsewhere.
+    odds: how much more it needs than its best rival [nat]; 4 are odds of 55 to 1.
+    near: up to this standard deviation old landmarks are candidates without a closure.
+    same: two landmarks nearer than this may be parts of one.
+    recent: number of a robot's last submaps that tracking follows, and that are the patch of a
+        closure.
+
+    Closures:
+    absent: cost of a landmark that one side has where the other side observed and has none,
+        −ln P(missed); 1.5 is P = 0.22.
+    closure_pairs, closure_llr: least number of pairs, and least evidence (the sum of their
+        log-likelihood ratios less the cost of absent landmarks).
+    margin, ratio: how much more evidence than the best other alignment, and how many times as much.
+    island_pairs, island_llr: as closure_*, between robots with unknown initial poses.
+    context: least number of landmarks of both sides outside the matched place, relative to the
+        pairs; with fewer nothing shows whether the place is unique.
+    share: least share of the landmarks near the matched places, of the side that has fewer, that
+        are matched.
+    undone_below, audited: a closure whose share falls below this within so many ticks is undone.
+
+    Thresholds without a derivation are empirical; their evidence is in
+    docs/decisions/29-association-in-the-fold.md. `tight`, `same` and `slack` are reduced where a
+    map's landmarks stand closer (`team.estimation.association.density`).
     """
 
-    gate: Positive = 13.8
+    gate: Positive = GATE
     slack: NonNegative = 0.03
     density: Positive = 0.5
     llr_tight: float = 1.0
@@ -62,10 +76,10 @@ SCALE_M = 0.03
 
 
 def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:
-    """The default profile in the lengths of a sensor: times its error at the far end of its view.
+    """Scale the lengths of the default profile with a sensor's error at the far end of its view.
 
-    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m; in units of it the sensors that the
-    default thresholds were found with, and simulated ones, need the same thresholds.
+    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m, and at least SCALE_M; in units of
+    it real and simulated sensors need the same thresholds.
     """
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)

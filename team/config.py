@@ -195,21 +195,24 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.mount != (0.0, 0.0, 0.0)
 
 
+GATE = 13.8
+"""χ² of two degrees of freedom that one in a thousand correct pairs exceeds: −2 ln 10⁻³."""
+
+
 class AssociationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Parameters of the association of detections without identities inside a window.
 
     gate: the largest squared Mahalanobis distance of a detection from its landmark, χ² of two
-    degrees of freedom (13.8: one in a thousand of the right ones is beyond). variance_factor:
-    factor on detections' covariances during association; below 1 where the noise for estimation
-    includes systematic errors, so that neighbours would be merged. least_seen: a landmark that
-    fewer detections of the window support stays out. slack_m: two landmarks that no scan saw
-    together are one if they are within the gate with this much slack. slip_m: the largest jump of
-    the odometry that is looked for; 0: none. detection_probability: of a landmark in view; what was
-    seen too rarely for it is clutter. certain: a detection that is of its landmark with a smaller
-    probability stays out (`team.estimation.association.certainty`).
+    degrees of freedom. variance_factor: factor on detections' covariances during association; below
+    1 where the noise for estimation includes systematic errors, with which neighbours would be
+    merged. least_seen: a landmark with fewer detections in the window is left out. slack_m: two
+    landmarks that no scan saw together are one if they are within the gate with this much slack.
+    slip_m: the largest slip of the odometry that is searched; 0: none. detection_probability: of a
+    landmark in view; detections too rare for it are clutter. certain: a detection whose association
+    has a smaller probability is left out (`team.estimation.association.certainty`).
     """
 
-    gate: Positive = 13.8
+    gate: Positive = GATE
     variance_factor: Positive = 1.0
     least_seen: Annotated[int, Meta(ge=1, le=1000)] = 2
     slack_m: NonNegative = 0.03

@@ -12,16 +12,13 @@ from jaxtyping import Float, Int64, UInt32
 
 from sim.studies.estimators import ekf_slam
 from sim.studies.estimators.ekf_slam import EkfSlam
-from team.config import UNNAMED, Sensor
+from team.config import GATE, UNNAMED, Sensor
 from team.estimation import dense, elementary, elementwise
 from team.estimation.association.gating import compute_mahalanobis, match_best_first
 from team.estimation.association.scans import UNASSIGNED
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.models import Increment
-
-GATE = 13.8
-"""χ² of two degrees of freedom that one in a thousand right pairs exceeds."""
 
 
 @dataclass(frozen=True)

@@ -68,8 +68,12 @@ PART = 15
 """Number of neighbouring landmarks in a part of the patch that votes for an alignment of its
 own.
 """
+TOLERANCE, REACH = 0.4, 30.0
+"""Largest distance of matched points in a proposal, and of two points that vote together, in radii
+of one object.
+"""
 NEARLY = 2.0
-"""Largest standard deviation of a pair's difference in `assign_nearby`, in object radii."""
+"""Largest standard deviation of a pair's difference in `assign_nearby`, in radii of one object."""
 
 
 class Side(NamedTuple):
@@ -124,9 +128,9 @@ def align(
     patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile
 ) -> list[Placement]:
     """Find the alignments of a patch with a target, the one with the most evidence first."""
-    votes = propose_alignments(
-        patch.points, target.points, tolerance(profile), reach(profile), patch.parts
-    )[:EXAMINED]
+    tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
+    votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
+    votes = votes[:EXAMINED]
     votes.sort(key=lambda vote: -_estimate_evidence(vote, patch, target, profile))
     found: list[Placement] = []
     most = 0
@@ -258,16 +262,6 @@ def _count_missing(
         if len(left):
             surely += int((nearest_distance(left, own) >= profile.same).sum())
     return count, surely
-
-
-def tolerance(profile: AssociationProfile) -> float:
-    """Largest distance [m] of matched points in a proposal."""
-    return 0.4 * profile.same
-
-
-def reach(profile: AssociationProfile) -> float:
-    """Largest distance [m] of two points that vote together."""
-    return 30.0 * profile.same
 
 
 def combine_maps(

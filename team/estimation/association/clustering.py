@@ -82,7 +82,7 @@ def associate_window(scans: Scans, settings: AssociationSettings) -> WindowAssoc
     """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
     found = cluster_window(scans, settings)
     scans, names, window = found.scans, found.names, found.window
-    landmark_of = _drop_uncertain(scans, found.landmark_of, names, window, settings)
+    landmark_of = _drop_uncertain(scans, found.landmark_of, window, settings)
     confirmed = _mark_confirmed(landmark_of, names, settings)
     clutter = _mark_clutter(scans, landmark_of, confirmed, window, settings)
     remaining = np.where(np.append(confirmed, False)[landmark_of], landmark_of, UNASSIGNED)
@@ -197,7 +197,6 @@ def _merge_split(
 def _drop_uncertain(
     scans: Scans,
     landmark_of: Int64[np.ndarray, " N"],
-    names: Int64[np.ndarray, " L"],
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> Int64[np.ndarray, " N"]:

@@ -46,14 +46,10 @@ HOPELESS = 12.0
 
 
 class MergedPairs(NamedTuple):
-    """Pairs in the order in which they were merged, and the joint Gaussian given them.
-
-    doubtful: number of pairs that passed gate and likelihood, and were rejected because of a rival.
-    """
+    """Pairs in the order in which they were merged, and the joint Gaussian given them."""
 
     pairs: tuple[Pair, ...]
     joint: Joint
-    doubtful: int = 0
 
     @property
     def llr(self) -> float:
@@ -136,18 +132,15 @@ def grow_pairs(
     first, second = first[open_], second[open_]
     near = evaluate_pairs(joint, first, second, profile).chi2 < PREGATE * profile.gate
     first, second = first[near], second[near]
-    doubtful = 0
     while len(first):
         at = evaluate_pairs(joint, first, second, profile)
         least = required_llr(joint, first, second, at.sd, profile)
         limit = min(most_sd, sure_sd) if len(merged) >= SURE_AFTER else most_sd
         fits = (at.chi2 < profile.gate) & (at.llr >= least) & (at.sd <= limit)
         if not fits.any():
-            doubtful = 0
             break
         rival = _find_rivals(joint, first, second, at, profile)
         clear = fits & (at.llr - rival >= profile.odds)
-        doubtful = int((fits & ~clear).sum())
         if not clear.any():
             break
         best = int(np.argmax(np.where(clear, at.llr, -np.inf)))
@@ -156,7 +149,7 @@ def grow_pairs(
         joint = condition_on_pair(joint, one, two, profile)
         open_ = (first != one) & (second != one) & ~joint.apart[first, second]
         first, second = first[open_], second[open_]
-    return MergedPairs(tuple(merged), joint, doubtful)
+    return MergedPairs(tuple(merged), joint)
 
 
 def _find_rivals(

@@ -171,43 +171,29 @@ class Landmarks:
 NO_LANDMARKS = Landmarks()
 
 
-def members_of(contribution: Contribution) -> list[LocalLandmark | None]:
-    """Name the member for each landmark of a submap; None for a named one."""
-    of = contribution
-    return [
-        LocalLandmark(of.robot, of.incarnation, of.sequence, id_ - UNNAMED)
-        if id_ >= UNNAMED
-        else None
-        for id_ in of.local.ids.tolist()
-    ]
-
-
 def add_landmarks(
     landmarks: Landmarks, contributions: Sequence[Contribution]
 ) -> tuple[Landmarks, dict[Key, list[int]]]:
-    """Add each unnamed landmark of the submaps as a set of its own; returns also the numbers, by
-    submap.
+    """Add each unnamed landmark of the submaps as a set of its own; returns also the numbers of the
+    landmarks of each submap that has some.
     """
-    members = {each.key: members_of(each) for each in contributions}
-    names = [each for of in members.values() for each in of if each is not None]
-    if not names:
-        return landmarks, {}
     present, log = dict(landmarks.present), landmarks.log
-    number = dict(zip(names, _choose_numbers(log, names), strict=True))
-    for own in (tuple(each for each in of if each is not None) for of in members.values()):
-        if own:
-            robot, incarnation, sequence, _ = own[0]
-            locals_, numbers = [each.local for each in own], [number[each] for each in own]
-            log = log.add_submap((robot, incarnation), sequence, locals_, numbers)
-    present |= {own: MemberSummary(1, MemberRecord(each)) for each, own in number.items()}
-    return replace(landmarks, present=present, log=log), {
-        each.key: [
-            id_ if member is None else number[member]
-            for id_, member in zip(each.local.ids.tolist(), members[each.key], strict=True)
+    numbers: dict[Key, list[int]] = {}
+    for each in contributions:
+        ids = each.local.ids.tolist()  # ascending: those with a name come first
+        members = [
+            LocalLandmark(*each.stream, each.sequence, id_ - UNNAMED)
+            for id_ in ids
+            if id_ >= UNNAMED
         ]
-        for each in contributions
-        if len(each.local.ids) and each.local.ids[-1] >= UNNAMED
-    }
+        if not members:
+            continue
+        own = _choose_numbers(log, members)
+        log = log.add_submap(each.stream, each.sequence, [one.local for one in members], own)
+        for number, member in zip(own, members, strict=True):
+            present[number] = MemberSummary(1, MemberRecord(member))
+        numbers[each.key] = [*ids[: -len(own)], *own]
+    return (replace(landmarks, present=present, log=log), numbers) if numbers else (landmarks, {})
 
 
 def _choose_numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[int]:

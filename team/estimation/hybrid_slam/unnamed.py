@@ -1,8 +1,8 @@
-"""An open window's detections without identities, and their association when it closes.
+"""Association of a window's detections without identities, when the window closes.
 
 While the window is open, its pose follows the odometry and the landmarks with identities alone. At
-its close the detections are associated once, for all particles, and the particles take the window
-again with them.
+its close the detections are associated once, for all particles, and the particles run over the
+window again with the identities found.
 """
 
 from collections.abc import Sequence
@@ -25,11 +25,12 @@ from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 
 
 @dataclass(frozen=True)
-class Settled:
-    """A window's keyframes with their associated detections, and the detections that are left out.
+class AssociatedKeyframes:
+    """A window's keyframes with their associated detections.
 
+    unnamed: the landmarks without identities, and the scans that saw them.
     gated: number of detections that are left out.
-    slips: motions that the odometry missed.
+    slips: slips of the odometry.
     became: the outcome of each detection.
     """
 
@@ -43,7 +44,7 @@ class Settled:
 class Event(NamedTuple):
     """An instant of a window: a scan without identities, or the end of a keyframe.
 
-    keyframe: its place in the window. motion: since the event before.
+    keyframe: index of the keyframe in the window. motion: since the event before.
     """
 
     at_ns: int
@@ -53,13 +54,13 @@ class Event(NamedTuple):
     named: Keyframe | None
 
 
-def settled(
+def associate_keyframes(
     keyframes: Sequence[Keyframe], settings: AssociationSettings, sensor: Sensor, most: int
-) -> Settled:
+) -> AssociatedKeyframes:
     """Associate the window's detections. Raises LinAlgError where the window has no solution.
 
     keyframes: with their measurements of landmarks with identities, and the scans without. most:
-    number of landmarks of a submap; those that were seen most often stay.
+    largest number of landmarks of a submap; those with the most detections stay.
     """
     events = events_of(keyframes)
     scans = scans_of(events, sensor)
@@ -68,13 +69,13 @@ def settled(
     order = np.argsort(-found.counts, kind="stable")[:most]
     has_number = np.isin(found.landmark_of, order) & (found.landmark_of != UNASSIGNED)
     local = np.nonzero((found.names == UNASSIGNED) & np.isin(np.arange(len(found.names)), order))[0]
-    number = np.zeros(len(found.names) + 1, np.int64)  # the last is that of UNASSIGNED
+    number = np.zeros(len(found.names) + 1, np.int64)  # the last is for UNASSIGNED
     number[local] = UNNAMED + np.arange(len(local))
     numbers = np.where(has_number, number[found.landmark_of], 0)[is_detection]
     with_detections = np.array([each.look is not None for each in events], np.bool_)
-    became = _became(events, numbers, found.clutter[is_detection])
-    return Settled(
-        keyframes=_keyframes(keyframes, events, numbers, found.slips),
+    became = _list_outcomes(events, numbers, found.clutter[is_detection])
+    return AssociatedKeyframes(
+        keyframes=_number_keyframes(keyframes, events, numbers, found.slips),
         unnamed=Unnamed(
             found.counts[local].astype(np.uint32), found.seen[local][:, with_detections]
         ),
@@ -85,7 +86,7 @@ def settled(
 
 
 def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
-    """The scans of a window and the ends of its keyframes, in order of time.
+    """List the scans of a window and the ends of its keyframes, in order of time.
 
     A keyframe that is itself a scan without identities, and nothing else, is one event.
     """
@@ -99,12 +100,13 @@ def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
 
 
 def _is_none(motion: Increment) -> bool:
+    """Whether a motion is exactly none."""
     return not motion.mean.any() and not motion.covariance.any()
 
 
 def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
-    """The window's detections as points with their covariances, as the association takes them."""
-    seen = [_seen_at(event) for event in events]
+    """Convert the window's detections to points with covariances."""
+    seen = [_measurements_of(event) for event in events]
     counts = [len(ids) for ids, *_ in seen]
     ids = np.concatenate([ids for ids, *_ in seen]).astype(np.int64)
     ranges = np.concatenate([ranges for _, ranges, *_ in seen])
@@ -121,16 +123,17 @@ def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
     )
 
 
-def _seen_at(event: Event) -> Measured:
+def _measurements_of(event: Event) -> Measured:
+    """Return the measurements of an event."""
     source = event.named if event.look is None else event.look
     assert source is not None
     return source.ids, source.ranges, source.bearings, source.own
 
 
-def _became(
+def _list_outcomes(
     events: Sequence[Event], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
 ) -> Became:
-    """The outcomes, by the stamps of the scans and the detections' places in them."""
+    """List the outcomes, by the stamps of the scans and the detections' places in them."""
     looks = [event.look for event in events if event.look is not None]
     return Became(
         stamps=np.array([each.stamp_ns for each in looks], np.int64),
@@ -141,13 +144,13 @@ def _became(
     )
 
 
-def _keyframes(
+def _number_keyframes(
     keyframes: Sequence[Keyframe],
     events: Sequence[Event],
     numbers: Int64[np.ndarray, " n"],
     slips: tuple[Slip, ...],
 ) -> tuple[Keyframe, ...]:
-    """The keyframes with their scans' detections under these landmark numbers (0: left out).
+    """Add the scans' detections to their keyframes, under these landmark numbers (0: left out).
 
     Each keyframe gets one measurement per landmark; a motion that slipped gets a larger covariance.
     """
@@ -156,14 +159,14 @@ def _keyframes(
     for event in events:
         if event.look is not None:
             own = numbers[first : first + len(event.look.ids)]
-            looks.setdefault(event.keyframe, []).append(_only(event.look, own))
+            looks.setdefault(event.keyframe, []).append(_select_numbered(event.look, own))
             first += len(event.look.ids)
     slipped = {events[slip.keyframe].keyframe: slip_covariance(slip.by) for slip in slips}
     out = []
     for k, each in enumerate(keyframes):
         keyframe = each
         if k in looks:
-            keyframe = _with(keyframe, _measured(looks[k]))
+            keyframe = _add_measurements(keyframe, _reduce_scans(looks[k]))
         if k in slipped:
             motion = Increment(each.increment.mean, each.increment.covariance + slipped[k])
             keyframe = replace(keyframe, increment=motion)
@@ -171,8 +174,8 @@ def _keyframes(
     return tuple(out)
 
 
-def _only(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
-    """The detections of a scan that have a number, under it."""
+def _select_numbered(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
+    """Select the detections of a scan that have a number, and give them this number."""
     has_number = numbers > 0
     return replace(
         look,
@@ -183,9 +186,9 @@ def _only(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
     )
 
 
-def _measured(looks: Sequence[KeyframeScan]) -> Measured:
-    """The detections of a keyframe's scans, relative to its end or, for a scan that is the
-    keyframe, as they are.
+def _reduce_scans(looks: Sequence[KeyframeScan]) -> Measured:
+    """Reduce the detections of a keyframe's scans to its end; those of a scan that is the keyframe
+    are unchanged.
     """
     if len(looks) == 1 and looks[0].back is None:
         (look,) = looks
@@ -193,8 +196,8 @@ def _measured(looks: Sequence[KeyframeScan]) -> Measured:
     return reduced([(look, np.zeros(3) if look.back is None else look.back) for look in looks])
 
 
-def _with(keyframe: Keyframe, seen: Measured) -> Keyframe:
-    """The keyframe with further measurements."""
+def _add_measurements(keyframe: Keyframe, seen: Measured) -> Keyframe:
+    """Add further measurements to a keyframe."""
     ids, ranges, bearings, own = seen
     parts: list[tuple[int, Own]] = [(len(keyframe.ids), keyframe.own), (len(ids), own)]
     return replace(

@@ -1,8 +1,8 @@
-"""Which landmarks of a map are known to be different ones, which are placed by a known heading, and
-which most submaps miss that look there.
+"""Landmarks that a final map leaves out: placed by an uncertain heading, or missed by most submaps
+that look there; and the streams that were lost.
 
-Association merges two landmarks only where no rival comes near, and otherwise waits. Until it is
-decided they may be one: a map that shows both may show one landmark twice.
+Those that may be one with another landmark are found by
+`team.estimation.association.verification.find_possible_duplicates`.
 """
 
 import math
@@ -17,12 +17,12 @@ from team.estimation.map_joining.memory import MOST
 from team.estimation.map_joining.nonlinearity import heading_sigma
 
 
-def weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
-    """Of these landmarks, those that only submaps of a poorly known heading have, ascending.
+def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
+    """Find the landmarks among these that only submaps of an uncertain heading have, ascending.
 
-    A covariance is linear in the heading: of a place at a distance d that turns by an error θ it
-    leaves out d (1 − cos θ), which at the limit for a rigid alignment (`alignment_heading_sigma`)
-    and three standard deviations is d/3, in a direction that it takes for known.
+    A covariance is linear in the heading. A place at a distance d that turns by an error θ moves by
+    d (1 − cos θ) in a direction that the linearised covariance takes for certain: d/3 at the limit
+    for a rigid alignment (`alignment_heading_sigma`) and three standard deviations.
     """
     best: dict[int, float] = {}
     for submap in island.graph.submaps:
@@ -33,14 +33,14 @@ def weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
     return [id_ for id_ in sorted(ids) if best.get(node_of.get(id_, -1), 0.0) > limit]
 
 
-def missed(fold: Fold, ids: Collection[int]) -> list[int]:
-    """Of these landmarks of the main island, those that nearly all submaps miss which look at their
-    place, ascending; none that an operator has judged.
+def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
+    """Find the landmarks among these that nearly all submaps miss which look at their place,
+    ascending; none that an operator has judged. All are of the main island.
 
     A landmark of n < MOST submaps is missed where each landmark of MOST or more that any of these
     has beside it has been observed by MOST n, and at least half of these have one. (A running map
-    gives up what is not found since it was observed last: `memory`.) How many false landmarks two
-    submaps agree on grows with the number of submaps; the share of those that find them does not.
+    drops a landmark that is not found again: `memory`.) The number of false landmarks that two
+    submaps agree on grows with the number of submaps; the share of submaps that find them does not.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)
@@ -64,9 +64,9 @@ def missed(fold: Fold, ids: Collection[int]) -> list[int]:
     return [id_ for id_ in sorted({*ids} - judged) if graph.landmarks.get(id_) in gone]
 
 
-def lost(island: Island) -> dict[Stream, float]:
-    """The largest standard deviation [rad] of a heading of each stream where it exceeds
-    `alignment_heading_sigma`.
+def find_lost_streams(island: Island) -> dict[Stream, float]:
+    """Find the streams with a heading whose standard deviation exceeds `alignment_heading_sigma`;
+    returns the largest one [rad] of each.
     """
     worst = {
         stream: max(heading_sigma(island, node) for node in nodes)

@@ -39,7 +39,7 @@ from team.estimation.map_joining.gauss_newton import (
     is_solvable,
     iterated,
 )
-from team.estimation.map_joining.markers import unmarked, with_markers
+from team.estimation.map_joining.markers import add_markers, warn_of_unmarked
 from team.estimation.map_joining.merging import Merge, ages, merge, sighted
 from team.estimation.map_joining.minima import (
     Minimum,
@@ -322,7 +322,7 @@ def converged(fold: Fold, settings: JoinSettings) -> Fold:
 
 def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     searches = {
-        key: _search(with_markers(replace(island, settings=settings)))
+        key: _search(add_markers(replace(island, settings=settings)))
         for key, island in fold.islands.items()
     }
     main = searches[main_key]
@@ -344,7 +344,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         islands={**merged.islands, main_key: last.best.island},
         iterations=last.best.iterations,
         change=last.best.change,
-        warnings=(*warnings(last), *unmarked(last.best.island)),
+        warnings=(*warnings(last), *warn_of_unmarked(last.best.island)),
     )
 
 

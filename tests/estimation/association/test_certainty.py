@@ -5,12 +5,12 @@ from itertools import product
 
 import numpy as np
 import pytest
-from tests.estimation.association.test_clustering import pairs, window
 
 from team.config import AssociationSettings
 from team.estimation.association.certainty import estimate_view, marginals
 from team.estimation.association.clustering import associate_window
 from team.estimation.association.scans import UNASSIGNED
+from tests.estimation.association.test_clustering import pairs, window
 
 
 def exact(weights: np.ndarray) -> np.ndarray:

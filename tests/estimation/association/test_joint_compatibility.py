@@ -62,7 +62,6 @@ def test_of_two_equal_partners_none_is_taken_and_fragments_of_one_do_not_block_e
     waits = grow_pairs(rivals, (one, two), PROFILE)
     assert waits is not None
     assert not waits.pairs
-    assert waits.doubtful == 2
     fragments = grow_pairs(joint, (one, two), PROFILE)
     assert fragments is not None
     assert len(fragments.pairs) == 1

@@ -5,7 +5,7 @@ import numpy as np
 from team.config import UNNAMED, AssociationSettings, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.hybrid_slam.reduction import KeyframeScan
-from team.estimation.hybrid_slam.unnamed import settled
+from team.estimation.hybrid_slam.unnamed import associate_keyframes
 from team.estimation.models import Increment
 from team.estimation.scans import unclaimed
 
@@ -28,7 +28,7 @@ def keyframe(k: int, ranges: list[float]) -> Keyframe:
 
 def test_a_window_that_confirms_no_detection_has_none() -> None:
     window = [keyframe(0, [3.0]), keyframe(1, []), keyframe(2, [30.0])]
-    found = settled(window, AssociationSettings(least_seen=2), Sensor(), 100)
+    found = associate_keyframes(window, AssociationSettings(least_seen=2), Sensor(), 100)
     assert [len(each.ids) for each in found.keyframes] == [0, 0, 0]
     assert (found.gated, len(found.became.silent)) == (2, 2)
     assert len(found.unnamed.counts) == 0

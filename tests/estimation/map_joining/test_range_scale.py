@@ -16,7 +16,7 @@ from team.estimation.map_joining import marginals
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
-from team.estimation.map_joining.markers import with_markers
+from team.estimation.map_joining.markers import add_markers
 from team.estimation.map_joining.submap_graph import tied
 from team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.submap_world import local_truth
@@ -244,7 +244,7 @@ def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
     options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
     named = fold_of(submaps, starts, options).main
     fold, first = hidden(submaps, starts, options)
-    joined, *_ = settled(with_markers(fold.main))
+    joined, *_ = settled(add_markers(fold.main))
     graph = joined.graph
     assert sorted(graph.common) == sorted(graph.landmarks) == sorted(first.values())
     assert len(graph.priors) == len(named.graph.priors)
