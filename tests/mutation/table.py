@@ -13,6 +13,7 @@ CENTRE = (
 )
 JOIN = (
     "estimation/map_joining/test_joining.py",
+    "consistency/test_map.py",
     "estimation/map_joining/test_annealing.py",
     "estimation/map_joining/test_damping.py",
     "estimation/map_joining/test_landmark_weights.py",
@@ -174,14 +175,14 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "central/scheduler.py": (12, CENTRE),
     "central/submap_intake.py": (10, CENTRE),
     "central/sent_priors.py": (10, ("central/test_sent_priors.py",)),
-    "team/estimation/chi2_kernel.py": (8, ("estimation/test_consistency.py",)),
+    "team/estimation/chi2_kernel.py": (8, ("consistency/test_measures.py",)),
     "team/estimation/map_joining/join_kernel.py": (
         8,
         ("estimation/map_joining/test_whole_map.py", "estimation/map_joining/test_conditioning.py"),
     ),
     "team/estimation/consistency.py": (
         6,
-        ("estimation/test_consistency.py", "central/test_monitor.py"),
+        ("consistency/test_measures.py", "central/test_monitor.py"),
     ),
     "central/monitor.py": (12, ("central/test_monitor.py", "central/test_withdrawal.py")),
     "central/withdrawal.py": (8, ("central/test_withdrawal.py", "central/test_monitor.py")),

@@ -65,14 +65,6 @@ def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
     return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
 
 
-def path_of(motions: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-    """Chain the motions to poses, from the zero pose."""
-    headings = np.cumsum(motions[:, 2])
-    before = np.concatenate(([0.0], headings[:-1]))
-    steps = np.einsum("kij,kj->ki", rotations(before), motions[:, :2])
-    return np.column_stack((np.cumsum(steps, axis=0), headings))
-
-
 def relative_to(
     poses: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:

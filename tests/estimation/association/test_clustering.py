@@ -11,7 +11,6 @@ from team.estimation.association.clustering import WindowAssociation, associate_
 from team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
-    path_of,
     points_of,
     relative_to,
     rotations,
@@ -21,6 +20,14 @@ from team.estimation.association.smoothing import smooth_window
 SETTINGS = AssociationSettings()
 MOTION_NOISE = np.diag([0.02, 0.01, 0.01]) ** 2
 RANGE_M, VIEW_M = 0.05, 6.0
+
+
+def path_of(motions: np.ndarray) -> np.ndarray:
+    """Chain the motions to poses, from the zero pose."""
+    headings = np.cumsum(motions[:, 2])
+    before = np.concatenate(([0.0], headings[:-1]))
+    steps = np.einsum("kij,kj->ki", rotations(before), motions[:, :2])
+    return np.column_stack((np.cumsum(steps, axis=0), headings))
 
 
 def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):

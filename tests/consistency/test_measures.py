@@ -1,4 +1,4 @@
-"""The yardstick itself is measured: on errors that have the covariance that is claimed."""
+"""The statistics of consistency and their intervals, on errors of a given covariance."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_nees_is_the_squared_length_of_the_whitened_error():
     assert nees(error, L @ L.T) == pytest.approx(error @ np.linalg.solve(L @ L.T, error))
 
 
-def test_honest_errors_fall_inside_the_interval_and_others_outside_on_both_sides():
+def test_errors_of_the_given_covariance_are_inside_the_interval_and_others_outside_on_both_sides():
     low, high = chi2_interval(3, 0.999, 400)
     assert low < values(400).mean() / 3 < high
     assert values(400, scale=0.75).mean() / 3 > high
@@ -65,7 +65,7 @@ def test_the_error_of_a_heading_is_the_short_way_round():
     np.testing.assert_array_equal(estimate, [1.0, 2.0, 3.1, 7.0])
 
 
-def test_what_is_no_covariance_is_named():
+def test_a_matrix_that_is_no_covariance_is_rejected():
     with pytest.raises(NotACovarianceError, match="an estimation error"):
         nees(np.ones(2), np.diag([1.0, -1.0]))
 
