@@ -1,4 +1,4 @@
-"""How certain an association is: against all joint associations, one by one, and in windows."""
+"""The certainty of associations, against all joint associations one by one, and in windows."""
 
 from dataclasses import replace
 from itertools import product
@@ -34,13 +34,13 @@ def test_marginals_are_those_of_all_joint_associations(seed):
     assert np.allclose(marginals(weights), exact(weights), atol=0.1)
 
 
-def test_of_one_detection_or_one_landmark_the_marginals_are_exact():
+def test_the_marginals_of_one_detection_or_one_landmark_are_exact():
     for shape in ((1, 4), (4, 1)):
         weights = np.exp(np.random.default_rng(5).normal(0.0, 2.0, shape))
         assert np.allclose(marginals(weights), exact(weights))
 
 
-def test_a_view_is_as_dense_as_what_it_sees():
+def test_the_density_of_a_view_is_that_of_its_detections():
     scans, _ = window(0)
     view = estimate_view(scans)
     per_scan = len(scans.points) / len(np.unique(scans.keyframes))

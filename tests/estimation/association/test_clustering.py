@@ -1,4 +1,4 @@
-"""Association inside a window: simulated windows whose right answer is known."""
+"""Association inside a window, in simulated windows of known landmarks."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -86,7 +86,7 @@ def test_a_window_of_separate_landmarks_is_associated_without_an_error(seed):
     assert kept_clutter.sum() < 0.2 * (labels == UNASSIGNED).sum()
 
 
-def test_landmarks_nearer_than_the_noise_are_not_told_apart_which_the_score_notices():
+def test_landmarks_nearer_than_the_noise_lower_the_precision():
     scans, labels = window(0, spacing=0.1)
     assert pairs(associate_window(scans, SETTINGS).landmark_of, labels)[0] < 0.9
 
@@ -102,7 +102,7 @@ def test_one_scan_never_sees_a_landmark_twice():
     assert (result.counts >= SETTINGS.least_seen).all()
 
 
-def test_what_is_looked_at_again_in_vain_is_clutter_and_what_is_not_is_unconfirmed():
+def test_a_detection_whose_place_is_observed_again_in_vain_is_clutter():
     scans, labels = window(2, clutter=0.3)
     result = associate_window(scans, SETTINGS)
     out = result.landmark_of == UNASSIGNED
@@ -112,7 +112,7 @@ def test_what_is_looked_at_again_in_vain_is_clutter_and_what_is_not_is_unconfirm
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.8])
-def test_a_slip_of_the_odometry_is_named_and_costs_no_landmark(reach):
+def test_a_slip_of_the_odometry_is_reported_and_costs_no_landmark(reach):
     scans, labels = window(3, slip=(12, np.array([0.3, 0.25, 0.0])))
     result = associate_window(scans, AssociationSettings(slip_m=reach))
     recall = pairs(result.landmark_of, labels)[1]
@@ -125,7 +125,7 @@ def test_a_slip_of_the_odometry_is_named_and_costs_no_landmark(reach):
     assert np.allclose(slip.by[:2], [-0.3, -0.25], atol=0.1)
 
 
-def test_a_slip_among_as_many_new_landmarks_as_known_ones_is_found():
+def test_a_slip_among_as_many_new_landmarks_as_mapped_ones_is_found():
     known = np.array([[2.0, 0.5], [1.0, 2.0], [2.5, -2.0]])
     slip = np.array([0.15, 0.2])
     scans = [known] * 6 + [np.concatenate([known, known + np.array([0.0, 0.45])]) - slip] * 2
@@ -143,7 +143,7 @@ def test_a_slip_among_as_many_new_landmarks_as_known_ones_is_found():
     assert len(result.counts) == 6, "three before the slip, and three beside them since"
 
 
-def test_named_detections_are_believed_beside_those_without_a_name():
+def test_names_of_detections_are_kept_beside_detections_without_a_name():
     scans, labels = window(4)
     tags = np.where(labels % 3 == 0, labels + 7, UNASSIGNED)
     result = associate_window(replace(scans, names=tags), SETTINGS)
@@ -174,7 +174,7 @@ def test_points_carry_the_covariance_of_range_and_bearing():
     assert np.allclose(100.0 * np.cov(cloud.T), covariances[0], rtol=0.05, atol=1e-4)
 
 
-def test_the_smoothed_window_is_consistent_and_one_with_half_the_noise_claimed_is_not():
+def test_the_smoothed_window_is_consistent_and_one_with_a_quarter_of_the_covariance_is_not():
     ratios = []
     for claimed in (1.0, 0.25):
         squared = dof = 0.0

@@ -83,7 +83,7 @@ def test_a_loop_without_names_is_the_map_with_names(
     assert 0.7 < agreement.chi2 / agreement.dof < 1.3
 
 
-def test_the_fold_is_the_same_bits_again_and_submaps_with_names_cost_it_nothing(
+def test_the_fold_repeats_its_bits_and_submaps_with_names_add_no_set(
     loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
 ) -> None:
     submaps, _, fold = loop
@@ -94,7 +94,7 @@ def test_the_fold_is_the_same_bits_again_and_submaps_with_names_cost_it_nothing(
     assert _folded(named[:5]).landmarks == Landmarks() or not _folded(named[:5]).landmarks.sets
 
 
-def test_a_loop_that_is_nearly_known_closes_by_a_few_landmarks_that_agree() -> None:
+def test_a_loop_of_small_uncertainty_closes_by_a_few_landmarks_that_agree() -> None:
     rng, world = np.random.default_rng(3), np.zeros((0, 2))
     while len(world) < 34:
         angle, r = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(6.0, 10.0)
@@ -109,7 +109,7 @@ def test_a_loop_that_is_nearly_known_closes_by_a_few_landmarks_that_agree() -> N
     assert wrong(landmarks, truth) == duplicates(landmarks, truth) == 0
 
 
-def test_robots_with_unknown_initial_poses_become_one_map_by_what_they_see() -> None:
+def test_robots_with_unknown_initial_poses_are_merged_by_their_landmarks() -> None:
     world, rng = _world(5), np.random.default_rng(8)
     one, first = drive("r1", circle((0.0, 0.0), 20.0, 12, 0.6), world, rng)
     two, second = drive("r2", circle((0.0, 0.0), 20.0, 12, 0.6, phase=2.0), world, rng)
@@ -128,7 +128,7 @@ def test_robots_with_unknown_initial_poses_become_one_map_by_what_they_see() -> 
     assert not _not_joined(replace(fold, landmarks=stale))
 
 
-def test_in_a_grid_of_equal_rooms_robots_with_unknown_initial_poses_wait() -> None:
+def test_robots_with_unknown_initial_poses_are_not_merged_in_a_grid_of_equal_rooms() -> None:
     # Of 200 seeds the last one was merged while rivals were charged with what they left over.
     for seed, heading in ((0, 0.0), (1, 0.0), (80, np.pi)):
         rng = np.random.default_rng(seed)
@@ -187,7 +187,7 @@ def test_an_audit_looks_around_a_closure_as_far_as_landmarks_stand_apart(
     assert shares == [1.0, 1.0]
 
 
-def test_an_operator_says_that_two_are_one_or_two(
+def test_a_verdict_merges_two_landmarks_or_keeps_them_apart(
     loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
 ) -> None:
     submaps, _, fold = loop
@@ -204,7 +204,7 @@ def test_an_operator_says_that_two_are_one_or_two(
     assert joined.landmarks.identity(single[0]) == joined.landmarks.identity(other)
 
 
-def test_of_verdicts_that_contradict_each_other_over_a_third_landmark_the_two_stay_two(
+def test_verdicts_that_contradict_each_other_over_a_third_landmark_keep_the_two_apart(
     loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
 ) -> None:
     submaps, _, _ = loop

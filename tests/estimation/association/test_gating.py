@@ -1,9 +1,17 @@
-"""The gate of detections: distances, best pair first, and names."""
+"""The gates: distances, scans of detections, and pairs of landmarks."""
 
 import numpy as np
+import pytest
 
+from team.association import AssociationProfile
 from team.config import AssociationSettings
-from team.estimation.association.gating import compute_mahalanobis, match_best_first, match_scan
+from team.estimation.association.gating import (
+    Joint,
+    compute_mahalanobis,
+    evaluate_pairs,
+    match_best_first,
+    match_scan,
+)
 from team.estimation.association.scans import UNASSIGNED
 
 
@@ -29,3 +37,17 @@ def test_a_name_matches_at_any_distance_and_only_its_own_landmark():
     small = np.tile(0.01 * np.eye(2), (3, 1, 1))
     found = match_scan(points, small, names, (seen, small), mapped, AssociationSettings())
     assert found.tolist() == [1, UNASSIGNED, 2]
+
+
+def test_a_pairs_likelihood_is_that_of_its_difference_against_a_stray_landmark():
+    profile = AssociationProfile(slack=0.0)
+    points = np.array([(0.0, 0.0), (0.1, -0.05)])
+    joint = Joint(points, 0.01 * np.eye(4), np.zeros((2, 2), np.bool_))
+    at = evaluate_pairs(joint, np.array([0]), np.array([1]), profile)
+    S = 0.02 * np.eye(2)
+    d = np.array([-0.1, 0.05])
+    chi2 = d @ np.linalg.solve(S, d)
+    density = np.exp(-0.5 * chi2) / (2.0 * np.pi * np.sqrt(np.linalg.det(S)))
+    assert at.chi2[0] == pytest.approx(chi2)
+    assert at.llr[0] == pytest.approx(np.log(density / profile.density))
+    assert at.sd[0] == pytest.approx(np.sqrt(0.02))

@@ -1,4 +1,4 @@
-"""What one side has where the other looked and has nothing."""
+"""Landmarks of one side where the other side observed and has none."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def test_the_views_of_a_window_are_the_largest_sets_of_three_or_more() -> None:
     assert [each.tolist() for each in found] == [[0, 1, 2, 3]]
 
 
-def test_views_lose_the_landmarks_that_are_left_out_and_go_where_too_few_stay() -> None:
+def test_views_lose_landmarks_that_are_left_out_and_views_of_fewer_than_three_go() -> None:
     views = pad_views([np.array([0, 1, 2, 3]), np.array([1, 2, 4])])
     to = np.array([10, 11, 12, -1, -1])
     assert renumber_views(views, to).tolist() == [[10, 11, 12, -1]]

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from team.estimation.association import voting
 from team.estimation.association.voting import PointSet, apply_motion, propose_alignments
@@ -34,10 +35,14 @@ def test_two_maps_of_one_point_have_no_alignment():
     assert propose_alignments(_points(np.zeros((1, 2))), _points(np.zeros((5, 2))), 0.3, 15.0) == []
 
 
-def test_votes_are_counted_cell_by_cell_as_they_are_sorted() -> None:
-    codes = np.random.default_rng(0).integers(0, 900, 400)
-    counted, ordered = (
-        voting._rank_codes(codes, beyond) for beyond in (900, voting.MOST_COUNTED + 1)
-    )
+def test_votes_that_are_counted_cell_by_cell_and_sorted_votes_give_the_same_alignments(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points = np.random.default_rng(4).uniform(0.0, 9.0, (30, 2))
+    counted = propose_alignments(_points(points[:20]), _points(points), 0.3, 15.0)
+    monkeypatch.setattr(voting, "MOST_COUNTED", 0)
+    ordered = propose_alignments(_points(points[:20]), _points(points), 0.3, 15.0)
+    assert len(counted) == len(ordered) > 0
     for one, two in zip(counted, ordered, strict=True):
-        np.testing.assert_array_equal(one, two)
+        np.testing.assert_array_equal(one.motion, two.motion)
+        np.testing.assert_array_equal(one.second, two.second)

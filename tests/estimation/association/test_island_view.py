@@ -1,17 +1,24 @@
-"""One submap beside another one: what fragments of landmarks keep from being told apart."""
+"""The steps of a tick: which submaps are compared, and the sweep."""
 
 import numpy as np
+import pytest
 from jaxtyping import Bool, Float
 
 from team.association import AssociationProfile
+from team.config import UNNAMED
 from team.estimation.association.gating import Joint, list_pairs
 from team.estimation.association.island_view import (
     REEXAMINED,
+    IslandView,
     find_undecided,
     select_by_turns,
     select_comparisons,
 )
 from team.estimation.association.joint_compatibility import assign_jointly
+from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.fold_association import view_island
+from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, JoinSettings, Tick
+from team.estimation.submap import LocalMap, Unnamed
 
 OWN = 0.01
 PROFILE = AssociationProfile(slack=0.0, density=1.0)
@@ -45,7 +52,7 @@ def _pairs(joint: Joint, own: np.ndarray, candidates: np.ndarray) -> list[tuple[
     return sorted((pair.first, pair.second) for pair in found.pairs)
 
 
-def test_fragments_that_wait_do_not_keep_a_submap_from_being_told_apart():
+def test_unmerged_fragments_do_not_keep_a_submap_from_being_associated():
     joint, (own, *others) = _seen([[0, 1, 2, 3]] * 5, common=0.15)
     assert not _pairs(joint, own, np.concatenate(others))
     found = set()
@@ -54,7 +61,7 @@ def test_fragments_that_wait_do_not_keep_a_submap_from_being_told_apart():
     assert found == {(k, k) for k in range(4)}
 
 
-def test_what_the_other_submap_missed_is_a_rival_of_what_it_has():
+def test_a_landmark_that_the_other_submap_missed_is_a_rival_of_those_that_it_has():
     joint, (own, other, whole) = _seen([[1], [0], [0, 1]], common=0.04)
     fits = select_comparisons(joint, own, _rows([other], joint), PROFILE, 0.5)
     assert [each.tolist() for each in fits] == [other.tolist()]
@@ -70,7 +77,7 @@ def test_what_the_other_submap_missed_is_a_rival_of_what_it_has():
     assert [other[0], whole[1]] in [each.tolist() for each in both]
 
 
-def test_undecided_are_those_that_may_be_one():
+def test_landmarks_that_may_be_one_are_undecided():
     joint, (one, two) = _seen([[0, 1], [0, 2]], common=0.15)
     assert find_undecided(joint, np.arange(4), PROFILE).tolist() == [one[0], one[1], two[0]]
 
@@ -81,3 +88,44 @@ def test_every_older_submap_is_examined_again_by_turns():
     assert set().union(*seen) == set(submaps)
     assert all(len(each) == len(set(each)) <= REEXAMINED for each in seen)
     assert select_by_turns(submaps[:REEXAMINED], 3) == submaps[:REEXAMINED]
+
+
+KNOWN = np.array([[0.0, 0.0], [0.0, 0.3], [0.0, 0.52]])
+"""Three landmarks of the map; a robot sees the first two again."""
+AWAY = np.array([20.0, 0.0])
+LOCAL_SD, SHIFT_SD = 0.01, 0.06
+
+
+def view_of_a_group_shifted_by(shift: float) -> IslandView:
+    """A map of three landmarks and a group of two, whose place has a common error."""
+    places = np.concatenate([KNOWN, KNOWN[:2] + AWAY])
+    count = len(places)
+    local = LocalMap(
+        (UNNAMED + np.arange(count)).astype(np.uint32),
+        np.concatenate([np.zeros(3), places.ravel()]),
+        np.diag(np.full(3 + 2 * count, LOCAL_SD**2)),
+        unnamed=Unnamed(np.full(count, 5, np.uint32), np.zeros((count, 0), np.bool_)),
+    )
+    fold = taken(EMPTY_FOLD, Tick([Contribution("r1", 1, 0, 10**10, local)]), JoinSettings())
+    view = view_island(fold.main, fold.landmarks)
+    order = np.argsort(view.joint.mean[:, 0] * 10.0 + view.joint.mean[:, 1])
+    mean = view.joint.mean.copy()
+    mean[order[3:]] += [0.0, shift] - AWAY
+    covariance = LOCAL_SD**2 * np.eye(2 * count)
+    group = np.array([2 * k + axis for k in order[3:].tolist() for axis in (0, 1)])
+    covariance[np.ix_(group, group)] += SHIFT_SD**2 * np.kron(np.ones((2, 2)), np.eye(2))
+    view.joint = view.joint._replace(
+        mean=mean,
+        covariance=covariance,
+        apart=np.zeros((count, count), np.bool_),
+        apart_in_window=None,
+        density=None,
+    )
+    return view
+
+
+@pytest.mark.parametrize(("shift", "merged"), [(0.0, 2), (0.22, 0)])
+def test_a_group_that_fits_at_two_places_is_not_swept(shift: float, merged: int) -> None:
+    view = view_of_a_group_shifted_by(shift)
+    view.sweep()
+    assert len(view.ties) == merged

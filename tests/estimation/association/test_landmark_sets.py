@@ -20,7 +20,7 @@ def _tie(into: int) -> MergeRecord:
     return MergeRecord("track", into, 5.0, 0.0, 0.1, 0)
 
 
-def test_each_unnamed_landmark_founds_a_set_of_its_own_with_a_number_made_of_its_name():
+def test_each_unnamed_landmark_is_a_set_of_its_own_with_a_number_derived_from_its_name():
     (submap,), _ = drive("r1", circle((0.0, 0.0), 5.0, 1, 0.05), WORLD, np.random.default_rng(1))
     landmarks, numbers = add_landmarks(NO_LANDMARKS, [submap])
     assert numbers[submap.key] == [number_of(LocalLandmark("r1", 1, 0, k)) for k in range(3)]
@@ -30,7 +30,7 @@ def test_each_unnamed_landmark_founds_a_set_of_its_own_with_a_number_made_of_its
     ]
 
 
-def test_submaps_whose_landmarks_all_have_names_found_nothing():
+def test_submaps_whose_landmarks_all_have_names_add_no_set():
     path = circle((0.0, 0.0), 5.0, 1, 0.05)
     (submap,), _ = drive("r1", path, WORLD, np.random.default_rng(1), named=True)
     landmarks, numbers = add_landmarks(NO_LANDMARKS, [submap])
@@ -38,7 +38,7 @@ def test_submaps_whose_landmarks_all_have_names_found_nothing():
     assert not numbers
 
 
-def test_a_set_is_known_by_its_smallest_member_in_whichever_order_it_grew():
+def test_a_set_has_the_number_of_its_smallest_member_in_any_order_of_merges():
     path = circle((0.0, 0.0), 5.0, 1, 0.05)
     submaps = [drive(robot, path, WORLD, np.random.default_rng(1))[0][0] for robot in ("r1", "r2")]
     landmarks, numbers = add_landmarks(NO_LANDMARKS, submaps)
