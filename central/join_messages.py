@@ -204,7 +204,7 @@ def _repeated(shown: Shown) -> Iterator[str]:
     """Where the map repeats itself, in words: two causes that the set does not tell apart."""
     for each in shown.repeated:
         x, y = each.place
-        dx, dy, turn = each.moved
+        dx, dy, turn = each.displacement
         yield (
             f"two places look alike: from submap {each.first} on (t = {each.begin_ns * 1e-9:.0f} "
             f"to {each.end_ns * 1e-9:.0f} s) {named(each.stream)} maps {len(each.ids)} landmarks "

@@ -7,10 +7,11 @@ from itertools import groupby
 
 import numpy as np
 
-from team.estimation.association.landmark_sets import Landmarks, LocalLandmark, Verdict
+from team.estimation.association.landmark_sets import Landmarks, Verdict
 from team.estimation.association.member_log import (
     KINDS,
     LAST,
+    LocalLandmark,
     MemberRecord,
     record_of,
 )

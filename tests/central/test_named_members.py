@@ -7,10 +7,10 @@ from team.config import UNNAMED
 from team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     Landmarks,
-    MergeRecord,
     add_landmarks,
     merge_sets,
 )
+from team.estimation.association.member_log import MergeRecord
 from team.estimation.contribution import Contribution
 from team.estimation.submap import LocalMap
 from team.wire.arrays import ids

@@ -35,7 +35,8 @@ from team.estimation.association.joint_compatibility import (
     condition_on_pair,
     grow_pairs,
 )
-from team.estimation.association.landmark_sets import Landmarks, LocalLandmark, MergeRecord
+from team.estimation.association.landmark_sets import Landmarks
+from team.estimation.association.member_log import LocalLandmark, MergeRecord
 from team.estimation.association.visibility import miss_probabilities
 from team.estimation.contribution import Observation, Stream
 

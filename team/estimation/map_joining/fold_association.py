@@ -18,12 +18,11 @@ from team.estimation.association.landmark_sets import (
     OPEN,
     Decision,
     Landmarks,
-    LocalLandmark,
-    MergeRecord,
     Opened,
     merge_sets,
     name_sides,
 )
+from team.estimation.association.member_log import LocalLandmark, MergeRecord
 from team.estimation.association.verification import Closure
 from team.estimation.contribution import Contribution, Stream
 from team.estimation.geometry import inverse

@@ -48,8 +48,8 @@ class Repetition(NamedTuple):
 
     ids: all landmarks that only these submaps have. pairs: of them those that match another one.
     begin_ns, end_ns: the end of the last submap before the boundary, and of the stream's last one.
-    place: where the stream is at the boundary (x, y) [m]. moved: from there to where it would be
-    if the pairs were one landmark each (x, y) [m], and the turn [rad].
+    place: of the stream at the boundary (x, y) [m]. displacement: from there to its place if the
+    pairs were one landmark each (x, y) [m], and the turn [rad].
     """
 
     stream: Stream
@@ -59,7 +59,7 @@ class Repetition(NamedTuple):
     begin_ns: int
     end_ns: int
     place: tuple[float, float]
-    apply_motion: tuple[float, float, float]
+    displacement: tuple[float, float, float]
 
 
 def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
@@ -126,7 +126,7 @@ def _find_in_stream(
             begin_ns=before.end_ns,
             end_ns=island.graph.submaps[rows[-1]].contribution.end_ns,
             place=(float(place[0]), float(place[1])),
-            moved=(float(gone[0]), float(gone[1]), float(vote.motion[2])),
+            displacement=(float(gone[0]), float(gone[1]), float(vote.motion[2])),
         )
     return None
 

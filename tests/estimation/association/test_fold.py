@@ -7,13 +7,8 @@ import pytest
 
 from central.join_messages import Shown, reasons
 from team.association import AssociationProfile
-from team.estimation.association.landmark_sets import (
-    OPEN,
-    Landmarks,
-    LocalLandmark,
-    Opened,
-    Verdict,
-)
+from team.estimation.association.landmark_sets import OPEN, Landmarks, Opened, Verdict
+from team.estimation.association.member_log import LocalLandmark
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.auditing import share_now, taken
 from team.estimation.map_joining.joining import (

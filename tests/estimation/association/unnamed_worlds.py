@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from team.config import UNNAMED
-from team.estimation.association.landmark_sets import Landmarks, LocalLandmark
+from team.estimation.association.landmark_sets import Landmarks
+from team.estimation.association.member_log import LocalLandmark
 from team.estimation.contribution import Contribution
 from team.estimation.geometry import between, inverse, transformed
 from team.estimation.submap import LocalMap, Unnamed

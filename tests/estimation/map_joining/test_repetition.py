@@ -55,7 +55,9 @@ def test_a_robot_that_was_carried_off_is_named_with_the_time_and_the_way_and_no_
     (found,) = find_repetitions(fold.main, fold.main.graph.landmarks)
     assert found.first == ROUND
     one, two = circle((0.0, 0.0), 9.0, ROUND, 1.1)[-1], circle((1.0, -1.0), 8.0, ROUND, 1.1, 2.5)[0]
-    assert math.hypot(*found.moved[:2]) == pytest.approx(math.hypot(*(two - one)[:2]), abs=0.5)
+    assert math.hypot(*found.displacement[:2]) == pytest.approx(
+        math.hypot(*(two - one)[:2]), abs=0.5
+    )
     assert len(found.pairs) >= 12
     shown = shown_landmarks(fold, CentralConfig(), "final")
     assert not set(found.ids) & set(shown.ids)
@@ -75,7 +77,7 @@ def test_two_equal_rooms_are_told_as_that_and_as_nothing_else() -> None:
     fold = folded(first, way, second)
     (found,) = find_repetitions(fold.main, fold.main.graph.landmarks)
     assert len(found.pairs) >= 12
-    assert math.hypot(*found.moved[:2]) == pytest.approx(60.0, abs=5.0)
+    assert math.hypot(*found.displacement[:2]) == pytest.approx(60.0, abs=5.0)
     (text,) = said(fold)
     assert "either the building repeats itself, or the robot was carried off or slipped" in text
 
