@@ -84,7 +84,7 @@ class IslandView:
     ids: the identity of each landmark. place_of: its index, by identity.
     submaps: the submaps that are examined. seen_by: their landmarks.
     sees: which landmarks each submap has, updated as landmarks are merged.
-    gone: which landmarks are merged into another one. ties: the merges, with their figures.
+    merged: which landmarks are merged into another one. ties: the merges, with their figures.
     stamp_ns: the last end of a submap.
     """
 
@@ -109,7 +109,7 @@ class IslandView:
         self.place_of = {id_: at for at, id_ in enumerate(ids)}
         self.submaps = submaps
         self.seen_by = [each.known for each in submaps]
-        self.gone = np.zeros(count, np.bool_)
+        self.merged = np.zeros(count, np.bool_)
         self.sees = np.zeros((len(submaps), count), np.bool_)
         for row, places in zip(self.sees, self.seen_by, strict=True):
             row[places] = True
@@ -181,7 +181,7 @@ class IslandView:
                 kind, self.ids[pair.second], pair.llr, pair.rival, pair.sd, self.stamp_ns
             )
             self.ties.append((self.ids[pair.first], tie))
-            self.gone[pair.first] = True
+            self.merged[pair.first] = True
             self._merged_into[self._merged_into == pair.first] = pair.second
             self.sees[:, pair.second] |= self.sees[:, pair.first]
             self.sees[:, pair.first] = False
@@ -224,7 +224,7 @@ class IslandView:
 
     def grow(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
         """Merge pairs of two lists of landmarks, growing from the most certain pair onwards."""
-        first, second = first[~self.gone[first]], second[~self.gone[second]]
+        first, second = first[~self.merged[first]], second[~self.merged[second]]
         if not len(first) or not len(second):
             return
         found = grow_pairs(
@@ -246,7 +246,7 @@ class IslandView:
         others[k] = False
         near = self.profile.near
         for nearby in select_comparisons(self.joint, own, others, self.profile, near):
-            first, second = list_pairs(own[~self.gone[own]], self._resolve(nearby))
+            first, second = list_pairs(own[~self.merged[own]], self._resolve(nearby))
             found = assign_jointly(self.joint, first, second, self.profile, near)
             self.record_merges(found, "near")
 
@@ -261,7 +261,7 @@ class IslandView:
             return
         mean = self.joint.mean
         away = np.abs(mean[:, None] - mean[near][None]).max(axis=2).min(axis=1)
-        around = np.flatnonzero((away < REEXAMINED_WITHIN * self.profile.same) & ~self.gone)
+        around = np.flatnonzero((away < REEXAMINED_WITHIN * self.profile.same) & ~self.merged)
         undecided = np.zeros(len(self.ids), np.bool_)
         undecided[find_undecided(self.joint, around, self.profile)] = True
         found = np.setdiff1d(np.flatnonzero(self.sees[:, undecided].any(axis=1)), fresh)
@@ -275,7 +275,7 @@ class IslandView:
         Landmarks that were undecided when they were new are uncertain: one pair after the other,
         each by itself the likeliest, can turn a robot by a spacing.
         """
-        at = np.flatnonzero(~self.gone)
+        at = np.flatnonzero(~self.merged)
         mean = self.joint.mean[at]
         away = np.abs(mean[:, None] - mean[None]).max(axis=2)
         later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
@@ -287,7 +287,7 @@ class IslandView:
         )
         split = np.unique(one)
         for begin in range(0, len(split), MOST_ASSIGNED):
-            own = np.isin(one, split[begin : begin + MOST_ASSIGNED]) & ~self.gone[two]
+            own = np.isin(one, split[begin : begin + MOST_ASSIGNED]) & ~self.merged[two]
             found = assign_jointly(self.joint, one[own], two[own], self.profile, self.profile.tight)
             self.record_merges(found, "sweep")
 

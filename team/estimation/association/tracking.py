@@ -215,9 +215,7 @@ class Tracker:
         best = (max(least, len(known) + 1) - 1e-9, 0.0)
         slip = None
         for row, column in np.argwhere(near):
-            C = dense.product(
-                HpD[column], Hp.transpose(0, 2, 1)
-            )  # covariance of the proposing landmark with each
+            C = dense.product(HpD[column], Hp.transpose(0, 2, 1))  # proposing landmark with each
             gain = dense.product(
                 C.transpose(0, 2, 1), dense.inverse(C[column] + own[column] + covariances[row])
             )
@@ -247,10 +245,8 @@ def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Covariance of a motion with a slip of about this (forward, left, turn): the slip is its
     standard deviation, at least LEAST_SLIP.
     """
-    metres, turn = (
-        max(float(elementwise.hypot(*slip[:2])), LEAST_SLIP),
-        max(abs(float(slip[2])), LEAST_SLIP),
-    )
+    metres = max(float(elementwise.hypot(*slip[:2])), LEAST_SLIP)
+    turn = max(abs(float(slip[2])), LEAST_SLIP)
     return np.diag(
         [elementary.squared(metres), elementary.squared(metres), elementary.squared(turn)]
     )
