@@ -18,6 +18,7 @@ from team.estimation.geometry import wrapped
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²]: noise of motion may be of rank 2 or none."""
 ITERATIONS = 6
+"""Most Gauss-Newton steps."""
 SETTLED = 1e-4
 """The iteration ends at a step whose largest entry [m, rad] is smaller: it changes no
 association."""

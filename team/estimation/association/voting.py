@@ -16,7 +16,9 @@ from team.estimation import dense, elementary, elementwise
 MOST_BINS = 60
 """Number of motions, those with the most votes, that are refined."""
 ANGLE_BIN = np.radians(6.0)
+"""Width of a bin of rotations [rad]; bins of translations are three tolerances wide."""
 REFINEMENTS = 4
+"""Number of steps of nearest neighbours."""
 MOST_HYPOTHESES = 100_000
 """Number of pairs of baselines that vote: those of the longest baselines, which determine the
 heading best.
