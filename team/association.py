@@ -1,4 +1,4 @@
-"""Thresholds of data association between submaps: one profile for each kind of sensor."""
+"""Thresholds of data association between submaps, one profile for each kind of sensor."""
 
 from math import hypot
 from typing import Annotated
@@ -12,74 +12,68 @@ Few = Annotated[int, Meta(ge=1, le=1000)]
 
 
 class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Thresholds by which landmarks without identities are merged; lengths in metres.
+    """Thresholds for merging landmarks without identities; lengths in metres.
 
-    Pairs of landmarks:
-    gate: χ² (2 degrees of freedom) beyond which two are not one landmark: `GATE`.
-    slack: standard deviation beside the covariance by which two submaps' positions of one landmark
-        differ: SCALE_M.
-    density: λ, upper bound of the expected landmarks per square metre; the map's own density
-        replaces it where it is larger, or known.
-    llr_tight, llr_loose: log-likelihood ratio that a pair needs where the standard deviation of its
-        difference is below `tight`, and elsewhere.
-    odds: how much more it needs than its best rival [nat]; 4 are odds of 55 to 1.
-    near: up to this standard deviation old landmarks are candidates without a closure.
-    same: two landmarks nearer than this may be parts of one.
-    recent: number of a robot's last submaps that tracking follows, and that are the patch of a
-        closure.
-
-    Closures:
-    absent: cost of a landmark that one side has where the other side observed and has none,
-        −ln P(missed); 1.5 is P = 0.22.
-    closure_pairs, closure_llr: least number of pairs, and least evidence (the sum of their
-        log-likelihood ratios less the cost of absent landmarks).
-    margin, ratio: how much more evidence than the best other alignment, and how many times as much.
-    island_pairs, island_llr: as closure_*, between robots with unknown initial poses.
-    context: least number of landmarks of both sides outside the matched place, relative to the
-        pairs; with fewer nothing shows whether the place is unique.
-    share: least share of the landmarks near the matched places, of the side that has fewer, that
-        are matched.
-    undone_below, audited: a closure whose share falls below this within so many ticks is undone.
-
-    Thresholds without a derivation are empirical; their evidence is in
-    docs/decisions/29-association-in-the-fold.md. `tight`, `same` and `slack` are reduced where a
-    map's landmarks stand closer (`team.estimation.association.density`).
+    LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
+    empirical (docs/decisions/29-association-in-the-fold.md). `tight`, `same` and `slack` are reduced
+    where a map's landmarks stand closer (`team.estimation.association.density`).
     """
 
     gate: Positive = GATE
+    """χ² of 2 degrees of freedom beyond which two landmarks are not one."""
     slack: NonNegative = 0.03
+    """Difference between two submaps' positions of one landmark beside their covariance."""
     density: Positive = 0.5
+    """Expected landmarks per square metre, λ."""
     llr_tight: float = 1.0
+    """LLR required of a pair whose difference has a standard deviation below `tight`."""
     llr_loose: float = 8.0
+    """LLR required of any other pair."""
     odds: NonNegative = 4.0
+    """LLR required beyond that of the best rival."""
     tight: Positive = 0.15
     near: Positive = 0.35
+    """Largest standard deviation for which old landmarks are candidates without a closure."""
     same: Positive = 0.5
+    """Largest distance of two landmarks that may be one that was split."""
     recent: Few = 6
+    """Number of a robot's last submaps that are tracked and searched for closures."""
     absent: NonNegative = 1.5
+    """Cost of a landmark that the other side lacks although it observed the place: −ln of the
+    probability."""
     closure_pairs: Few = 10
+    """Fewest pairs of a closure."""
     closure_llr: float = 25.0
+    """Least evidence of a closure: the sum of the pairs' LLR less the cost of absent landmarks."""
     margin: NonNegative = 10.0
+    """Least evidence beyond that of the best other alignment."""
     ratio: Annotated[float, Meta(ge=1.0)] = 1.5
+    """Least evidence relative to that of the best other alignment."""
     island_pairs: Few = 8
+    """closure_pairs between robots with unknown initial poses."""
     island_llr: float = 15.0
+    """closure_llr between robots with unknown initial poses."""
     context: NonNegative = 2.0
+    """Fewest landmarks outside the matched place, relative to the pairs; with fewer the place may
+    not be unique."""
     share: Share = 0.7
+    """Least share of matched landmarks near the matched places, on the side with fewer."""
     undone_below: Share = 0.5
+    """A closure whose share falls below this within `audited` ticks is undone."""
     audited: Annotated[int, Meta(ge=0, le=1000)] = 12
 
 
 DEFAULT_PROFILE = AssociationProfile()
 
 SCALE_M = 0.03
-"""The sensor error [m] of the default profile at the far end of its view."""
+"""Sensor error [m] of the default profile at the far end of its view."""
 
 
 def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:
-    """Scale the lengths of the default profile with a sensor's error at the far end of its view.
+    """Scale the lengths of the default profile by a sensor's error at the far end of its view.
 
-    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m, and at least SCALE_M; in units of
-    it real and simulated sensors need the same thresholds.
+    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m. In units of it all sensors need the
+    same thresholds.
     """
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)

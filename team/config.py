@@ -200,25 +200,25 @@ GATE = 13.8
 
 
 class AssociationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Parameters of the association of detections without identities inside a window.
-
-    gate: the largest squared Mahalanobis distance of a detection from its landmark, χ² of two
-    degrees of freedom. variance_factor: factor on detections' covariances during association; below
-    1 where the noise for estimation includes systematic errors, with which neighbours would be
-    merged. least_seen: a landmark with fewer detections in the window is left out. slack_m: two
-    landmarks that no scan saw together are one if they are within the gate with this much slack.
-    slip_m: the largest slip of the odometry that is searched; 0: none. detection_probability: of a
-    landmark in view; detections too rare for it are clutter. certain: a detection whose association
-    has a smaller probability is left out (`team.estimation.association.certainty`).
-    """
+    """Data association of detections without identities inside a window."""
 
     gate: Positive = GATE
+    """Largest squared Mahalanobis distance of a detection from its landmark: χ² of two degrees of
+    freedom, exceeded by 1 in 1000 true ones."""
     variance_factor: Positive = 1.0
+    """Factor on the detections' covariances. Below 1 where the noise for estimation includes
+    systematic errors, which would merge neighbours."""
     least_seen: Annotated[int, Meta(ge=1, le=1000)] = 2
+    """Fewest detections of a landmark of the submap."""
     slack_m: NonNegative = 0.03
+    """Two landmarks that no scan has seen together are one if they are within the gate with this
+    slack."""
     slip_m: NonNegative = 0.0
+    """Largest jump of the odometry to search for; 0: none."""
     detection_probability: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.9
+    """Probability of detecting a landmark in view; one seen too rarely for it is clutter."""
     certain: Fraction = 0.9
+    """Least probability of an association; a less certain detection is not used."""
 
 
 class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
