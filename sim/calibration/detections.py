@@ -29,7 +29,7 @@ from team.estimation.association.certainty import estimate_view
 from team.estimation.association.clustering import Clusters, cluster_window
 from team.estimation.association.scans import UNASSIGNED, Scans, relative_to
 from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.unnamed import events_of, scans_of
+from team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 
 LEAST_TRIALS = 50
 """Least number of trials from which the rates are learnt."""

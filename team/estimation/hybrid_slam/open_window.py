@@ -16,7 +16,7 @@ from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
 from team.estimation.hybrid_slam.redrawing import redrawn
-from team.estimation.hybrid_slam.unnamed import AssociatedKeyframes, associate_keyframes
+from team.estimation.hybrid_slam.unnamed_detections import AssociatedKeyframes, associate_keyframes
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.models import Increment
 from team.estimation.mount import of_base

@@ -5,7 +5,7 @@ import pytest
 
 from team.config import UNNAMED, AssociationSettings, MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.hybrid_slam.unnamed import associate_keyframes, events_of
+from team.estimation.hybrid_slam.unnamed_detections import associate_keyframes, events_of
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import unclaimed
 

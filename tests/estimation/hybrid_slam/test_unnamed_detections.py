@@ -1,11 +1,11 @@
-"""What a window's detections without identities are at its end."""
+"""Association of a window's detections without identities when it closes."""
 
 import numpy as np
 
 from team.config import UNNAMED, AssociationSettings, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.hybrid_slam.reduction import KeyframeScan
-from team.estimation.hybrid_slam.unnamed import associate_keyframes
+from team.estimation.hybrid_slam.unnamed_detections import associate_keyframes
 from team.estimation.models import Increment
 from team.estimation.scans import unclaimed
 
