@@ -32,8 +32,8 @@ from central.scheduler import Scheduler
 from team import translate
 from team.association import profile_for
 from team.config import UNNAMED, AssociationSettings, Sensor
-from team.estimation.association.association import associated
-from team.estimation.association.scans import NOBODY, Scans
+from team.estimation.association.clustering import associate_window
+from team.estimation.association.scans import UNASSIGNED, Scans
 from team.estimation.submap import LocalMap, Unnamed
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, ids
@@ -134,7 +134,7 @@ class World:
             np.repeat(np.arange(WINDOW), len(seen)),
             points + SIGMAS[2] * rng.normal(size=(n, 2)),
             np.tile(SIGMAS[2] ** 2 * np.eye(2), (n, 1, 1)),
-            np.full(n, NOBODY),
+            np.full(n, UNASSIGNED),
         )
 
 
@@ -150,7 +150,7 @@ def window_ms(world: World) -> float:
     for _ in range(5):
         scans = world.window()
         before = time.process_time()
-        associated(scans, AssociationSettings())
+        associate_window(scans, AssociationSettings())
         spent.append(1e3 * (time.process_time() - before))
     return float(np.median(spent))
 

@@ -9,8 +9,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 from central.config import CentralConfig
 from central.members import Members
+from team.estimation.association.landmark_sets import Verdict
 from team.estimation.contribution import Contribution, Stream, named
-from team.estimation.map_joining.association.landmarks import Verdict
 from team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
 from team.estimation.map_joining.relinearising import relinearised
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond

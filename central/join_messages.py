@@ -15,16 +15,21 @@ from central.rule import Tail
 from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
+from team.estimation.association.verification import find_possible_duplicates
 from team.estimation.contribution import Stream, named
 from team.estimation.map_joining import landmark_view, marginals
 from team.estimation.map_joining.alignment import SharedPoints
-from team.estimation.map_joining.associating import IslandView
-from team.estimation.map_joining.distinctness import lost, maybe_the_same, missed, weakly_placed
+from team.estimation.map_joining.distinctness import (
+    find_lost_streams,
+    find_missed,
+    find_weakly_placed,
+)
+from team.estimation.map_joining.fold_association import view_island
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import BiasEstimate
 from team.estimation.map_joining.misfits import worst_landmark
 from team.estimation.map_joining.refusal import refusals
-from team.estimation.map_joining.repetition import Repetition, repetitions
+from team.estimation.map_joining.repetition import Repetition, find_repetitions
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -144,15 +149,15 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     unnamed = [id_ for id_ in ids if id_ >= UNNAMED]
     if not unnamed:
         return Shown(ids)
-    weak = weakly_placed(fold.main, unnamed)
-    seldom = missed(fold, {*unnamed} - {*weak})
-    out, view = {*weak, *seldom}, IslandView(fold.main, fold.landmarks)
-    undecided = maybe_the_same(view, {*unnamed} - out)
+    weak = find_weakly_placed(fold.main, unnamed)
+    seldom = find_missed(fold, {*unnamed} - {*weak})
+    out, view = {*weak, *seldom}, view_island(fold.main, fold.landmarks)
+    undecided = find_possible_duplicates(view, {*unnamed} - out)
     left = [id_ for id_ in ids if id_ not in out | {*undecided}]
-    repeated = repetitions(fold.main, left)
+    repeated = find_repetitions(fold.main, left)
     copies = {id_ for each in repeated for id_ in each.ids}
     left = [id_ for id_ in left if id_ not in copies]
-    return Shown(left, undecided, weak, seldom, lost(fold.main), repeated)
+    return Shown(left, undecided, weak, seldom, find_lost_streams(fold.main), repeated)
 
 
 def reasons(
@@ -199,7 +204,7 @@ def _repeated(shown: Shown) -> Iterator[str]:
     """Where the map repeats itself, in words: two causes that the set does not tell apart."""
     for each in shown.repeated:
         x, y = each.place
-        dx, dy, turn = each.moved
+        dx, dy, turn = each.displacement
         yield (
             f"two places look alike: from submap {each.first} on (t = {each.begin_ns * 1e-9:.0f} "
             f"to {each.end_ns * 1e-9:.0f} s) {named(each.stream)} maps {len(each.ids)} landmarks "

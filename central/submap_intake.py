@@ -9,8 +9,8 @@ from central.intake import Inputs, Instant, Intake
 from central.reach import Reach
 from central.submap_set import SubmapSet
 from central.unnamed_landmarks import verdict_of
+from team.estimation.association.landmark_sets import Verdict
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.association.landmarks import Verdict
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing

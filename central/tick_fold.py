@@ -39,10 +39,10 @@ from central.config import CentralConfig
 from central.fold_inputs import FoldInputs
 from central.withdrawal import LEAST_SUBMAPS, Trial, convicted, suspects
 from team.config import UNNAMED
+from team.estimation.association.landmark_sets import Verdict
 from team.estimation.contribution import Stream
 from team.estimation.hybrid_slam.sensitivity_kernel import BIASES
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.association.landmarks import Verdict
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.joining import Fold, InitialPoseFactor, JoinSettings, converged

@@ -1,5 +1,5 @@
-"""Converts the associations of landmarks without names, and an operator's verdicts, to messages and
-back.
+"""Conversion of associations of landmarks without names, and of an operator's verdicts, to messages
+and back.
 """
 
 from collections.abc import Iterator
@@ -7,10 +7,11 @@ from itertools import groupby
 
 import numpy as np
 
-from team.estimation.map_joining.association.landmarks import Landmarks, LocalLandmark, Verdict
-from team.estimation.map_joining.association.member_log import (
+from team.estimation.association.landmark_sets import Landmarks, Verdict
+from team.estimation.association.member_log import (
     KINDS,
     LAST,
+    LocalLandmark,
     MemberRecord,
     record_of,
 )
@@ -18,19 +19,21 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 
 STEPS = ("", *KINDS)
-"""The step that associated an unnamed landmark with a set, by its number on the wire."""
+"""The step that merged an unnamed landmark into a set, by its number on the wire."""
 DECISIONS = 100
-"""Most decisions in a map, and most that wait."""
+"""Most accepted decisions in a map, and most deferred ones."""
 LARGEST = 1e300
+"""Bound of the figures of a merge on the wire, which are finite there."""
 SHOWN = 1 + LAST
-"""Most members of a landmark in a running map; it may have as many as the run has submaps."""
+"""Most members of a landmark in a running map; all are in the final one."""
 
 
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
-    """The table of unnamed landmarks: member, identity, step; of each landmark all members, or its
-    first and its last ones.
+    """Tabulate the unnamed landmarks: member, identity, step.
+
+    every: all members of each landmark, or its first and its last ones only.
     """
-    entries = sorted(_all(landmarks) if every else _few(landmarks))
+    entries = sorted(_all_members(landmarks) if every else _summarised_members(landmarks))
     table = []
     for (robot, incarnation), group in groupby(entries, key=lambda entry: entry[0][:2]):
         of = list(group)
@@ -53,20 +56,23 @@ Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
 """A member, its identity, the index in STEPS of its step, and the figures of that."""
 
 
-def _few(landmarks: Landmarks) -> Iterator[Entry]:
+def _summarised_members(landmarks: Landmarks) -> Iterator[Entry]:
+    """Iterate over the first and the last members of each landmark."""
     for id_, members in landmarks.present.items():
         for member in (members.first, *members.last):
-            yield _entry(member, id_)
+            yield _make_entry(member, id_)
 
 
-def _all(landmarks: Landmarks) -> Iterator[Entry]:
+def _all_members(landmarks: Landmarks) -> Iterator[Entry]:
+    """Iterate over all members of all landmarks."""
     identities = landmarks.identities()
     for stream, sequence, rows in landmarks.log.all_rows():
         for row in rows.tolist():
-            yield _entry(record_of(stream, sequence, row), identities[row[1]])
+            yield _make_entry(record_of(stream, sequence, row), identities[row[1]])
 
 
-def _entry(member: MemberRecord, id_: int) -> Entry:
+def _make_entry(member: MemberRecord, id_: int) -> Entry:
+    """Make the entry of a member of the landmark with this identity."""
     name, tie = member
     if tie is None:
         return name, id_, 0, (0.0, 0.0, 0.0)
@@ -74,7 +80,7 @@ def _entry(member: MemberRecord, id_: int) -> Entry:
 
 
 def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
-    """The newest closures and merges, then those that wait, by their streams."""
+    """List the newest closures and merges, then the deferred ones, by their streams."""
     waits = [landmarks.waits[of] for of in sorted(landmarks.waits)][-DECISIONS:]
     return tuple(
         m.AssociationDecision(**each._asdict())
@@ -83,7 +89,7 @@ def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
 
 
 def verdict_of(judgement: m.Judgement) -> Verdict:
-    """An operator's judgement as the fold's verdict."""
+    """Convert an operator's judgement to the fold's verdict."""
     first, second = (
         LocalLandmark(each.robot, each.incarnation, each.sequence, each.local)
         for each in sorted(
@@ -95,6 +101,6 @@ def verdict_of(judgement: m.Judgement) -> Verdict:
 
 
 def judgement_of(verdict: Verdict) -> m.Judgement:
-    """The fold's verdict as maps name it."""
+    """Convert the fold's verdict to the judgement of a map."""
     first, second = (m.LocalLandmark(**each._asdict()) for each in verdict[:2])
     return m.Judgement(first=first, second=second, same=verdict.same)

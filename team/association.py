@@ -6,7 +6,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.config import NonNegative, Positive, Sensor, Share
+from team.config import GATE, NonNegative, Positive, Sensor, Share
 
 Few = Annotated[int, Meta(ge=1, le=1000)]
 
@@ -14,10 +14,12 @@ Few = Annotated[int, Meta(ge=1, le=1000)]
 class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Thresholds for merging landmarks without identities; lengths in metres.
 
-    LLR: log-likelihood ratio of one landmark against two.
+    LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
+    empirical (docs/decisions/29-association-in-the-fold.md). `tight`, `same` and `slack` are
+    reduced where a map's landmarks stand closer (`team.estimation.association.density`).
     """
 
-    gate: Positive = 13.8
+    gate: Positive = GATE
     """χ² of 2 degrees of freedom beyond which two landmarks are not one."""
     slack: NonNegative = 0.03
     """Difference between two submaps' positions of one landmark beside their covariance."""

@@ -200,10 +200,14 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.mount != (0.0, 0.0, 0.0)
 
 
+GATE = 13.8
+"""χ² of two degrees of freedom that one in a thousand correct pairs exceeds: −2 ln 10⁻³."""
+
+
 class AssociationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data association of detections without identities inside a window."""
 
-    gate: Positive = 13.8
+    gate: Positive = GATE
     """Largest squared Mahalanobis distance of a detection from its landmark: χ² of two degrees of
     freedom, exceeded by 1 in 1000 true ones."""
     variance_factor: Positive = 1.0

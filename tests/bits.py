@@ -81,6 +81,10 @@ CASES: Mapping[str, Callable[[], Scenario]] = {
     "waypoints 1": lambda: world("waypoints"),
     "unknown initial poses": lambda: world("thesis", unknown_starts=("*", "!r1")),
     "outliers": outliers,
+    "hidden identities": lambda: with_options(world("waypoints"), identities="hidden"),
+    "hidden identities and initial poses": lambda: with_options(
+        world("thesis-b", unknown_starts=("*", "!r1")), identities="hidden"
+    ),
     # The optimum of `batch` is GTSAM's, which promises no bits.
     **{f"pair {e} + {f}": lambda e=e, f=f: pair(e, f) for e, f in sorted(PAIRS) if f != "batch"},
     "utias 1": lambda: utias(1),

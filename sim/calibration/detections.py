@@ -25,11 +25,11 @@ from sim.calibration.data import interval_of, scan_of
 from sim.calibration.figures import Figure, left_out
 from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream
 from team.config import AssociationSettings, RobotConfig
-from team.estimation.association.association import Clusters, clustered
-from team.estimation.association.certainty import view_of
-from team.estimation.association.scans import NOBODY, Scans, seen_from
+from team.estimation.association.certainty import estimate_view
+from team.estimation.association.clustering import Clusters, cluster_window
+from team.estimation.association.scans import UNASSIGNED, Scans, relative_to
 from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.unnamed import events_of, scans_of
+from team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 
 LEAST_TRIALS = 50
 """Least number of trials from which the rates are learnt."""
@@ -103,15 +103,15 @@ def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
 
 def _looks(scans: Scans, settings: AssociationSettings) -> list[WindowLooks]:
     try:
-        return [looks_of(clustered(scans, settings))]
+        return [looks_of(cluster_window(scans, settings))]
     except np.linalg.LinAlgError:
         return []
 
 
 def looks_of(found: Clusters) -> WindowLooks:
     """The trials of each landmark of a window, and which of them found it."""
-    scans, landmarks = found.scans, found.now.landmarks
-    unnamed = found.names == NOBODY
+    scans, landmarks = found.scans, found.window.landmarks
+    unnamed = found.names == UNASSIGNED
     trials = np.zeros(len(landmarks), np.int64)
     again = np.zeros(len(landmarks), np.int64)
     known = np.zeros(len(landmarks), np.bool_)
@@ -120,12 +120,12 @@ def looks_of(found: Clusters) -> WindowLooks:
     counts = np.bincount(found.landmark_of, minlength=len(landmarks))
     real = counts >= LEAST_SEEN
     bounds = scans.bounds
-    for k, pose in enumerate(found.now.poses):
+    for k, pose in enumerate(found.window.poses):
         rows = slice(bounds[k], bounds[k + 1])
         own = found.landmark_of[rows]
         if not len(own):
             continue
-        at = seen_from(np.broadcast_to(pose, (len(landmarks), 3)), landmarks)
+        at = relative_to(np.broadcast_to(pose, (len(landmarks), 3)), landmarks)
         other = (own[None] != np.arange(len(landmarks))[:, None]) & real[own]
         in_view = known & other.any(axis=1)
         for measured, place in (
@@ -138,15 +138,15 @@ def looks_of(found: Clusters) -> WindowLooks:
         detected = np.isin(np.arange(len(landmarks)), own)
         again += in_view & detected
         known |= detected
-    view = view_of(scans)
+    view = estimate_view(scans)
     return WindowLooks(
         trials=trials[unnamed],
         again=again[unnamed],
         further=(counts - 1 - again)[unnamed],
         detections=int(np.count_nonzero(unnamed[found.landmark_of])),
         area=view.area * view.looks,
-        cost=found.now.squared,
-        dof=found.now.dof,
+        cost=found.window.squared,
+        dof=found.window.dof,
     )
 
 

@@ -17,7 +17,7 @@ from team.estimation.map_joining.relinearising import is_due
 from team.estimation.submap import LocalMap, Unnamed
 from team.wire.codec import encoded
 from team.wire.digest import digest_of
-from tests.estimation.map_joining.association.unnamed_worlds import circle, drive, wrong
+from tests.estimation.association.unnamed_worlds import circle, drive, wrong
 
 PROFILE = AssociationProfile(recent=3, near=0.1, closure_pairs=5, audited=3, llr_loose=30.0)
 CONFIG = CentralConfig(tick_s=10.0, association=PROFILE)

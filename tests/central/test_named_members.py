@@ -4,14 +4,14 @@ import numpy as np
 
 from central.unnamed_landmarks import SHOWN, memberships_of
 from team.config import UNNAMED
-from team.estimation.contribution import Contribution
-from team.estimation.map_joining.association.landmarks import (
+from team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     Landmarks,
-    MergeRecord,
-    founded,
-    united,
+    add_landmarks,
+    merge_sets,
 )
+from team.estimation.association.member_log import MergeRecord
+from team.estimation.contribution import Contribution
 from team.estimation.submap import LocalMap
 from team.wire.arrays import ids
 
@@ -23,12 +23,12 @@ def landmarks(submaps: int) -> Landmarks:
     found = NO_LANDMARKS
     for k in range(submaps):
         each = Contribution("r1", 1, k, k, local)
-        found, numbers = founded(found, [each])
+        found, numbers = add_landmarks(found, [each])
         if not k:
             first = numbers[each.key]
             continue
         pairs = zip(numbers[each.key], first, strict=True)
-        found, _ = united(
+        found, _ = merge_sets(
             found, [(own, MergeRecord("track", into, 5.0, k, 0.1, k)) for own, into in pairs]
         )
     return found

@@ -15,7 +15,7 @@ from team import translate
 from team.association import AssociationProfile
 from team.wire import messages as m
 from team.wire.codec import encoded
-from tests.estimation.map_joining.association.unnamed_worlds import circle, drive
+from tests.estimation.association.unnamed_worlds import circle, drive
 from tests.teams import broadcasts
 
 CONFIG = CentralConfig(association=AssociationProfile(recent=4), withdraw_above=None)

@@ -12,16 +12,13 @@ from jaxtyping import Float, Int64, UInt32
 
 from sim.studies.estimators import ekf_slam
 from sim.studies.estimators.ekf_slam import EkfSlam
-from team.config import UNNAMED, Sensor
+from team.config import GATE, UNNAMED, Sensor
 from team.estimation import dense, elementary, elementwise
-from team.estimation.association.matching import best_pairs_first, squared_distances
-from team.estimation.association.scans import NOBODY
+from team.estimation.association.gating import compute_mahalanobis, match_best_first
+from team.estimation.association.scans import UNASSIGNED
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.models import Increment
-
-GATE = 13.8
-"""χ² of two degrees of freedom that one in a thousand right pairs exceeds."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +103,11 @@ def _associated(
     R[:, 1, 1] = elementary.squared(sensor.bearing_sigma)
     off = np.column_stack((ranges, bearings))[:, None] - predicted[None]
     off[..., 1] = np.remainder(off[..., 1] + np.pi, 2.0 * np.pi) - np.pi
-    squared, logs = squared_distances(off, spread[None] + R[:, None])
-    found = best_pairs_first(squared, squared + logs, gate)
+    squared, determinants = compute_mahalanobis(off, spread[None] + R[:, None])
+    found = match_best_first(squared < gate, squared + elementwise.log(determinants))
     numbers = np.zeros(len(ranges), np.uint32)
-    numbers[found != NOBODY] = slam.ids[known[found[found != NOBODY]]]
-    new = np.flatnonzero(found == NOBODY)
+    numbers[found != UNASSIGNED] = slam.ids[known[found[found != UNASSIGNED]]]
+    new = np.flatnonzero(found == UNASSIGNED)
     numbers[new] = (UNNAMED + len(known) + np.arange(len(new))).astype(np.uint32)
     return numbers
 

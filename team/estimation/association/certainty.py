@@ -1,14 +1,15 @@
-"""The probability that a detection is of the landmark that it was associated with.
+"""Certainty: the probability that a detection is of the landmark that it is associated with.
 
-In one scan each landmark gives one detection at the most and each detection is of one landmark, of
-one that is not known, or clutter. Of a landmark that is in view with probability v and detected
-with P_D, the odds of "z is of landmark j" against "z is of something else and j was missed" are
+In one scan each landmark gives one detection at most, and each detection is of one landmark, of an
+unmapped one, or clutter. For a landmark j that is in view with probability v_j and detected with
+probability P_D, the odds of "z is of landmark j" against "z is of something else and j was missed"
+are
 
     ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)).
 
-ρ is how many detections of anything there are per square metre of a view, ρ_out how many of what
-is in no landmark, and V_j = π γ √|S_j| the volume of the gate γ: a landmark that lies in the gate
-of another may never have been told from it. The marginals over all joint associations of the scan
+ρ is the number of detections per square metre of a view, ρ_out that of the detections in no
+landmark, and V_j = π γ √|S_j| the volume of the gate γ: a landmark that lies in the gate of another
+one may be part of it. The marginals over all joint associations of the scan
 follow by belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
 """
 
@@ -19,18 +20,21 @@ from jaxtyping import Float, Int64
 
 from team.config import AssociationSettings
 from team.estimation import elementary, elementwise
-from team.estimation.association.matching import squared_distances
-from team.estimation.association.scans import NOBODY, Scans
-from team.estimation.association.smoothing import Smoothed, predicted_by
+from team.estimation.association.gating import compute_mahalanobis
+from team.estimation.association.scans import UNASSIGNED, Scans, predict_landmarks
+from team.estimation.association.smoothing import SmoothedWindow
 
 LEAST = 0.1
-"""Least probability that something which was detected is in view."""
+"""Least probability that a detected landmark is in view."""
 WIDER, FARTHER = 0.5, 1.25
 """The sector in view extends this far [rad] beyond the outermost bearing, and to this multiple
 of the median range at least: a robot that stands still sees a landmark at one place only, but
-more of its surroundings are in view."""
+more of its surroundings are in view.
+"""
 ROUNDS = 30
+"""Most rounds of belief propagation."""
 SETTLED = 1e-6
+"""Belief propagation ends when no message changes by more."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class FieldOfView:
     least: float
     most: float
 
-    def holds(
+    def probability_in_view(
         self, seen: Float[np.ndarray, "L 2"], spread: Float[np.ndarray, "L 2 2"]
     ) -> Float[np.ndarray, " L"]:
         """Probability that each place, given in the sensor's frame, is in view."""
@@ -65,9 +69,9 @@ class FieldOfView:
         return np.asarray(np.maximum(inside, LEAST))
 
 
-def view_of(scans: Scans) -> FieldOfView:
-    """The sector that the window's detections fill, without the widening by their noise, and the
-    density of detections in it.
+def estimate_view(scans: Scans) -> FieldOfView:
+    """Estimate the sector that the window's detections fill, without the widening by their noise,
+    and the density of detections in it.
     """
     ranges = elementwise.hypot(scans.points[:, 0], scans.points[:, 1])
     bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
@@ -80,29 +84,37 @@ def view_of(scans: Scans) -> FieldOfView:
     return FieldOfView(len(ranges) / (looks * area), area, looks, farthest, least, most)
 
 
-def certainties(
-    scans: Scans, landmark_of: Int64[np.ndarray, " N"], now: Smoothed, settings: AssociationSettings
+def association_probabilities(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    window: SmoothedWindow,
+    settings: AssociationSettings,
 ) -> Float[np.ndarray, " N"]:
-    """Of each detection, the probability that it is of the landmark that it was associated with;
-    0 for a detection without a landmark.
+    """Probability, for each detection, that it is of the landmark that it is associated with; 0 for
+    a detection without a landmark.
     """
-    view = view_of(scans)
-    counts = np.bincount(landmark_of[landmark_of != NOBODY], minlength=len(now.landmarks))
-    alone = landmark_of == NOBODY
+    view = estimate_view(scans)
+    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(window.landmarks))
+    alone = landmark_of == UNASSIGNED
     alone |= counts[landmark_of] < settings.least_seen
     out = (1.0 + np.count_nonzero(alone)) / (view.looks * view.area)
     bounds = scans.bounds
     found = np.zeros(len(landmark_of))
-    for k in range(len(now.poses)):
+    for k in range(len(window.poses)):
         of_scan = np.arange(bounds[k], bounds[k + 1])
-        of_scan = of_scan[landmark_of[of_scan] != NOBODY]
+        of_scan = of_scan[landmark_of[of_scan] != UNASSIGNED]
         if not len(of_scan):
             continue
-        seen, spread = predicted_by(now, k)
+        seen, spread = predict_landmarks(
+            window.poses[k], window.landmarks, window.covariance, 3 * k, 3 * len(window.poses)
+        )
         R = settings.variance_factor * scans.covariances[of_scan]
         S = spread[None] + R[:, None]
-        squared, logs = squared_distances(scans.points[of_scan][:, None] - seen[None], S)
-        detected = settings.detection_probability * view.holds(seen, spread + R.mean(axis=0))
+        squared, determinants = compute_mahalanobis(scans.points[of_scan][:, None] - seen[None], S)
+        logs = elementwise.log(determinants)
+        detected = settings.detection_probability * view.probability_in_view(
+            seen, spread + R.mean(axis=0)
+        )
         volume = np.pi * settings.gate * elementwise.exp(0.5 * logs)
         other = out - view.density * elementwise.expm1(-view.density * volume)
         with np.errstate(under="ignore"):
@@ -114,8 +126,8 @@ def certainties(
 
 
 def marginals(weights: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
-    """P(detection i is of landmark j), from the odds ψ_ij of the pairs, each detection and each
-    landmark used at most once.
+    """Compute P(detection i is of landmark j) from the odds ψ_ij of the pairs, with each detection
+    and each landmark in one pair at most.
     """
     messages = np.ones_like(weights)
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""A window's detections as arrays, and geometry on many poses and points at once."""
+"""A window's detections as arrays, and its geometry on many poses and points at once."""
 
 from dataclasses import dataclass
 
@@ -7,21 +7,21 @@ from jaxtyping import Float, Int64
 
 from team.estimation import dense, elementary, elementwise
 
-NOBODY = -1
-"""Stands for no identity and for no landmark."""
+UNASSIGNED = -1
+"""No identity, or no landmark."""
 
 
 @dataclass(frozen=True)
 class Scans:
-    """The motion of a window and what was detected at each of its K keyframes.
+    """The motion of a window and the detections of each of its K keyframes.
 
     motions:     the pose of keyframe k in the frame of keyframe k − 1; of the first, in that of the
                  window's start.
     motion_covariances: of (forward, left, turn), in the tangent space of the motion's end.
     keyframes:   the keyframe of each of the N detections, ascending.
-    points:      where they are in the robot's frame at their keyframe [m].
+    points:      their positions in the robot's frame at their keyframe [m].
     covariances: of the points [m²].
-    names:       the identity of those that have one, NOBODY of the others.
+    names:       the identity of each, UNASSIGNED where it has none.
     """
 
     motions: Float[np.ndarray, "K 3"]
@@ -65,18 +65,10 @@ def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
     return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
 
 
-def path_of(motions: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-    """The poses that the motions lead to, from the zero pose."""
-    headings = np.cumsum(motions[:, 2])
-    before = np.concatenate(([0.0], headings[:-1]))
-    steps = np.einsum("kij,kj->ki", rotations(before), motions[:, :2])
-    return np.column_stack((np.cumsum(steps, axis=0), headings))
-
-
-def seen_from(
+def relative_to(
     poses: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Each point in the frame of its pose: Rᵀ(p − t)."""
+    """Transform each point into the frame of its pose: Rᵀ(p − t)."""
     apart = points - poses[:, :2]
     return np.asarray(np.einsum("nji,nj->ni", rotations(poses[:, 2]), apart))
 
@@ -87,3 +79,50 @@ def pose_jacobians(seen: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 3"]
     J[:, 0, 0] = J[:, 1, 1] = -1.0
     J[:, 0, 2], J[:, 1, 2] = seen[:, 1], -seen[:, 0]
     return J
+
+
+def predict_landmarks(
+    pose: Float[np.ndarray, "3"],
+    landmarks: Float[np.ndarray, "L 2"],
+    P: Float[np.ndarray, "n n"],
+    at: int,
+    first: int,
+) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
+    """Predict each landmark's position relative to a pose, with its covariance.
+
+    P: joint covariance, in which the pose begins at `at` and the landmarks at `first`.
+    """
+    count, own_pose = len(landmarks), slice(at, at + 3)
+    turn = rotation(pose[2])
+    seen = dense.product(landmarks - pose[:2], turn)
+    Hp = pose_jacobians(seen)
+    rows = slice(first, first + 2 * count)
+    own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    cross = P[own_pose, rows].reshape(3, count, 2).transpose(1, 0, 2)
+    mixed = dense.product(dense.product(Hp, cross), turn)
+    S = dense.product(dense.product(Hp, P[own_pose, own_pose]), Hp.transpose(0, 2, 1))
+    S = S + dense.product(dense.product(turn.T, own), turn) + mixed + mixed.transpose(0, 2, 1)
+    return seen, S
+
+
+def initialise_landmark(
+    pose: Float[np.ndarray, "3"],
+    point: Float[np.ndarray, "2"],
+    covariance: Float[np.ndarray, "2 2"],
+    P: Float[np.ndarray, "n n"],
+    at: int,
+    end: int,
+) -> Float[np.ndarray, "2"]:
+    """Initialise a landmark from a detection: return its position, append its covariance to P.
+
+    P: joint covariance of `end` numbers, in which the pose begins at `at`; written in place.
+    """
+    own_pose, new = slice(at, at + 3), slice(end, end + 2)
+    turn = rotation(pose[2])
+    G = dense.product(turn, np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]]))
+    P[new, :end] = dense.product(G, P[own_pose, :end])
+    P[:end, new] = P[new, :end].T
+    P[new, new] = dense.product(dense.product(G, P[own_pose, own_pose]), G.T) + dense.product(
+        dense.product(turn, covariance), turn.T
+    )
+    return np.asarray(pose[:2] + dense.product(turn, point))

@@ -1,4 +1,4 @@
-"""Estimates a window's path and landmarks jointly by Gauss-Newton, for a given association."""
+"""Smoothing: estimates a window's path and landmarks by Gauss-Newton for a given association."""
 
 from dataclasses import dataclass
 
@@ -7,26 +7,26 @@ from jaxtyping import Float, Int64
 
 from team.estimation import dense
 from team.estimation.association.scans import (
-    NOBODY,
+    UNASSIGNED,
     Scans,
     pose_jacobians,
-    rotation,
+    relative_to,
     rotations,
-    seen_from,
 )
 from team.estimation.geometry import wrapped
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²]: noise of motion may be of rank 2 or none."""
 ITERATIONS = 6
+"""Most Gauss-Newton steps."""
 SETTLED = 1e-4
 """The iteration ends at a step whose largest entry [m, rad] is smaller: it changes no
 association."""
 
 
 @dataclass(frozen=True)
-class Smoothed:
-    """N(·) of K poses and L landmarks in the window's frame; the poses' errors on their right.
+class SmoothedWindow:
+    """Gaussian of K poses and L landmarks in the window's frame; the poses' errors on their right.
 
     covariance: of (ξ₁ … ξ_K, landmarks). squared: the cost at the minimum, with `dof` degrees.
     """
@@ -38,53 +38,19 @@ class Smoothed:
     dof: int
 
 
-def predicted_by(
-    now: Smoothed, k: int
-) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
-    """The position of each landmark relative to pose k, and its covariance."""
-    poses, count = len(now.poses), len(now.landmarks)
-    return seen_with(
-        now.poses[k], now.landmarks, now.covariance, slice(3 * k, 3 * k + 3), 3 * poses, count
-    )
-
-
-def seen_with(
-    pose: Float[np.ndarray, "3"],
-    landmarks: Float[np.ndarray, "L 2"],
-    P: Float[np.ndarray, "n n"],
-    at: slice,
-    first: int,
-    count: int,
-) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
-    """The same from a joint covariance in which the pose stands at `at` and `count` landmarks
-    from `first` on.
-    """
-    turn = rotation(pose[2])
-    seen = dense.product(landmarks - pose[:2], turn)
-    Hp = pose_jacobians(seen)
-    rows = slice(first, first + 2 * count)
-    own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
-    cross = P[at, rows].reshape(3, count, 2).transpose(1, 0, 2)
-    mixed = dense.product(dense.product(Hp, cross), turn)
-    spread = dense.product(dense.product(Hp, P[at, at]), Hp.transpose(0, 2, 1)) + dense.product(
-        dense.product(turn.T, own), turn
-    )
-    spread += mixed + mixed.transpose(0, 2, 1)
-    return seen, spread
-
-
-def smoothed(
+def smooth_window(
     scans: Scans,
     landmark_of: Int64[np.ndarray, " N"],
     poses: Float[np.ndarray, "K 3"],
     landmarks: Float[np.ndarray, "L 2"],
-) -> Smoothed:
-    """Minimise Σ ‖Log(motion⁻¹ ∘ pose₋₁⁻¹ ∘ pose)‖² + Σ ‖point − Rᵀ(landmark − t)‖².
+) -> SmoothedWindow:
+    """Minimise Σ ‖Log(motion⁻¹ ∘ before⁻¹ ∘ pose)‖² + Σ ‖point − Rᵀ(landmark − t)‖².
 
-    In the metrics of their covariances, the window's start at zero. landmark_of: of each detection
-    that counts; every landmark is seen at least once. Raises LinAlgError without a solution.
+    The norms are those of the covariances; the window starts at zero. landmark_of: by detection,
+    UNASSIGNED for one that is left out; every landmark has a detection. Raises LinAlgError without
+    a solution.
     """
-    used = np.nonzero(landmark_of != NOBODY)[0]
+    used = np.nonzero(landmark_of != UNASSIGNED)[0]
     seen_by, seen = scans.keyframes[used], landmark_of[used]
     weights = dense.inverse(scans.covariances[used])
     motion_weights = dense.inverse(scans.motion_covariances + JITTER)
@@ -93,8 +59,10 @@ def smoothed(
     of_landmark = 3 * k + 2 * seen[:, None] + np.arange(2)
     columns = np.concatenate((of_pose, of_landmark), axis=1)
     for iteration in range(ITERATIONS + 1):
-        information, gradient, squared = _of_motion(scans.motions, motion_weights, poses, size)
-        predicted = seen_from(poses[seen_by], landmarks[seen])
+        information, gradient, squared = _linearise_motions(
+            scans.motions, motion_weights, poses, size
+        )
+        predicted = relative_to(poses[seen_by], landmarks[seen])
         error = scans.points[used] - predicted
         turned = rotations(poses[seen_by, 2]).transpose(0, 2, 1)
         J = np.concatenate((pose_jacobians(predicted), turned), axis=2)
@@ -108,23 +76,29 @@ def smoothed(
             raise np.linalg.LinAlgError("the window has no solution")
         if iteration == ITERATIONS or np.abs(step).max(initial=0.0) < SETTLED:
             break
-        poses, landmarks = _moved(poses, step[: 3 * k]), landmarks + step[3 * k :].reshape(-1, 2)
+        poses, landmarks = (
+            _apply_step(poses, step[: 3 * k]),
+            landmarks + step[3 * k :].reshape(-1, 2),
+        )
     dof = 2 * len(used) - 2 * len(landmarks)
-    return Smoothed(poses, landmarks, dense.inverse_of_factored(factor), squared, dof)
+    return SmoothedWindow(poses, landmarks, dense.inverse_of_factored(factor), squared, dof)
 
 
-def _of_motion(
+def _linearise_motions(
     motions: Float[np.ndarray, "K 3"],
     weights: Float[np.ndarray, "K 3 3"],
     poses: Float[np.ndarray, "K 3"],
     size: int,
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], float]:
-    """Information, gradient and cost of the motions alone; residual ≈ error of the motion's end."""
+    """Linearise the motions: their information, gradient and cost.
+
+    The residual of a motion is the error of its end.
+    """
     k = len(poses)
     before = np.concatenate((np.zeros((1, 3)), poses[:-1]))
-    went = np.column_stack((seen_from(before, poses[:, :2]), poses[:, 2] - before[:, 2]))
-    error = np.column_stack((seen_from(motions, went[:, :2]), went[:, 2] - motions[:, 2]))
-    error[:, 2] = _directions(error[:, 2])
+    went = np.column_stack((relative_to(before, poses[:, :2]), poses[:, 2] - before[:, 2]))
+    error = np.column_stack((relative_to(motions, went[:, :2]), went[:, 2] - motions[:, 2]))
+    error[:, 2] = _wrap(error[:, 2])
     back = np.zeros((k, 3, 3))  # −Ad(went⁻¹): the earlier pose's error at the later one
     turned = rotations(went[:, 2]).transpose(0, 2, 1)
     shift = -np.einsum("kij,kj->ki", turned, went[:, :2])
@@ -146,14 +120,14 @@ def _of_motion(
     return information, gradient, float(np.einsum("ki,ki->", error, W_error))
 
 
-def _directions(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _wrap(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return np.array([wrapped(float(angle)) for angle in angles])
 
 
-def _moved(
+def _apply_step(
     poses: Float[np.ndarray, "K 3"], steps: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "K 3"]:
-    """The poses after a step (forward, left, turn) of each; Exp to first order."""
+    """Move each pose by a step (forward, left, turn); Exp to first order."""
     xi = steps.reshape(-1, 3)
     went = np.einsum("kij,kj->ki", rotations(poses[:, 2]), xi[:, :2])
-    return np.column_stack((poses[:, :2] + went, _directions(poses[:, 2] + xi[:, 2])))
+    return np.column_stack((poses[:, :2] + went, _wrap(poses[:, 2] + xi[:, 2])))

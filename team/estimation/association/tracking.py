@@ -1,9 +1,9 @@
-"""The first pass over a window: an extended Kalman filter with the best pair first.
+"""Tracking within a window: an extended Kalman filter that matches the best pair first.
 
-Smith, Self and Cheeseman 1990, with detections as points. A slip of the odometry is detected where
-few detections match although there are landmarks nearby, and nearly all match if the robot is
-assumed to have jumped (one-point RANSAC; Ortín and Montiel 2001). The covariance of that motion is
-then enlarged by the jump.
+EKF-SLAM (Smith, Self and Cheeseman 1990) with detections as points. A slip of the odometry is
+detected where few detections match although there are landmarks nearby, and nearly all match if the
+robot is assumed to have jumped (one-point RANSAC; Ortín and Montiel 2001). The covariance of that
+motion is then enlarged by the jump.
 """
 
 from typing import NamedTuple
@@ -13,21 +13,30 @@ from jaxtyping import Float, Int64
 
 from team.config import AssociationSettings
 from team.estimation import dense, elementary, elementwise
-from team.estimation.association.matching import best_pairs_first, squared_distances
-from team.estimation.association.scans import NOBODY, Scans, pose_jacobians, rotation
+from team.estimation.association.gating import compute_mahalanobis, match_best_first, match_scan
+from team.estimation.association.scans import (
+    UNASSIGNED,
+    Scans,
+    initialise_landmark,
+    pose_jacobians,
+    predict_landmarks,
+    rotation,
+)
 from team.estimation.consistency import chi2_limit
 from team.estimation.geometry import adjoint, compose, inverse
 
 FEW = 0.5
-"""A slip is suspected where a smaller share of a scan's detections matches …"""
+"""A slip is suspected where a smaller share of a scan's detections matches."""
 MOST = 0.7
-"""… and accepted where at least this share matches after one jump."""
+"""A slip is accepted where at least this share of the possible pairs matches after it."""
 RARE = 1e-3
 """Probability with which correct pairs exceed the limit of the joint distance."""
 SLIP_TURN = 0.1
 """Standard deviation of the rotation of a slip [rad]."""
+LEAST_SLIP = 0.02
+"""Least standard deviation of a slip [m, rad]."""
 SLIP_DETECTIONS = 3
-"""Least number of detections in a scan for a slip to be looked for."""
+"""Least number of detections in a scan, and of landmarks, in which a slip is searched."""
 
 
 class Slip(NamedTuple):
@@ -37,8 +46,8 @@ class Slip(NamedTuple):
     by: Float[np.ndarray, "3"]
 
 
-class Tracked(NamedTuple):
-    """The result of the first pass: the landmark of each detection, and the landmarks'
+class TrackedWindow(NamedTuple):
+    """The result of tracking: the landmark of each detection, and the landmarks' names and
     positions.
     """
 
@@ -68,7 +77,9 @@ class Tracker:
     def _size(self) -> int:
         return 3 + 2 * len(self.names)
 
-    def move(self, motion: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> None:
+    def predict_pose(
+        self, motion: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]
+    ) -> None:
         """Predict the pose over the motion up to the next keyframe."""
         n = self._size
         Ad = adjoint(inverse(motion))
@@ -77,22 +88,11 @@ class Tracker:
         self._P[:n, :3] = dense.product(self._P[:n, :3], Ad.T)
         self._P[:3, :3] += covariance
 
-    def predicted(self) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
-        """Each landmark's position relative to the robot, and its covariance."""
-        count = len(self.names)
-        turn = rotation(self.pose[2])
-        seen = dense.product(self.landmarks - self.pose[:2], turn)
-        Hp = pose_jacobians(seen)
-        n = self._size
-        own = self._P[3:n, 3:n].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
-        cross = self._P[:3, 3:n].reshape(3, count, 2).transpose(1, 0, 2)
-        mixed = dense.product(dense.product(Hp, cross), turn)
-        S = dense.product(dense.product(Hp, self._P[:3, :3]), Hp.transpose(0, 2, 1))
-        return seen, S + dense.product(dense.product(turn.T, own), turn) + mixed + mixed.transpose(
-            0, 2, 1
-        )
+    def predict_landmarks(self) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
+        """Predict each landmark's position relative to the robot, with its covariance."""
+        return predict_landmarks(self.pose, self.landmarks, self._P, 0, 3)
 
-    def shift(self, by: Float[np.ndarray, "3"]) -> None:
+    def apply_slip(self, by: Float[np.ndarray, "3"]) -> None:
         """Apply a slip of about this (forward, left, turn) to the pose, with its uncertainty."""
         self.pose = compose(self.pose, by)
         self._P[:3, :3] += slip_covariance(by)
@@ -107,7 +107,7 @@ class Tracker:
         m, n = len(landmarks), self._size
         if not m:
             return
-        H, seen = self._jacobian(landmarks)
+        H, seen = self._linearise(landmarks)
         P = self._P[:n, :n]
         HP = dense.product(H, P)
         S = dense.product(HP, H.T)
@@ -119,10 +119,10 @@ class Tracker:
         self.pose = compose(self.pose, step[:3])
         self._points[: len(self.names)] += step[3:].reshape(-1, 2)
 
-    def _jacobian(
+    def _linearise(
         self, landmarks: Int64[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "m 2"]]:
-        """∂h/∂state for these landmarks, and h."""
+        """Compute ∂h/∂state for these landmarks, and h."""
         m = len(landmarks)
         turn = rotation(self.pose[2])
         seen = dense.product(self.landmarks[landmarks] - self.pose[:2], turn)
@@ -132,68 +132,55 @@ class Tracker:
         H[np.arange(m)[:, None, None], np.arange(2)[:, None], columns[:, None, :]] = turn.T
         return H.reshape(2 * m, -1), seen
 
-    def found(
+    def add_landmark(
         self, point: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"], name: int
     ) -> int:
-        """Add a new landmark; returns its index."""
-        index, n = len(self.names), self._size
-        turn = rotation(self.pose[2])
-        G = dense.product(turn, np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]]))
-        new = slice(n, n + 2)
-        self._P[new, :n] = dense.product(G, self._P[:3, :n])
-        self._P[:n, new] = self._P[new, :n].T
-        self._P[new, new] = dense.product(dense.product(G, self._P[:3, :3]), G.T) + dense.product(
-            dense.product(turn, covariance), turn.T
-        )
-        self._points[index] = self.pose[:2] + dense.product(turn, point)
+        """Add a new landmark from a detection; returns its index."""
+        index = len(self.names)
+        at = initialise_landmark(self.pose, point, covariance, self._P, 0, self._size)
+        self._points[index] = at
         self.names.append(name)
         return index
 
-    def matched(
+    def match_scan(
         self,
         points: Float[np.ndarray, "n 2"],
         covariances: Float[np.ndarray, "n 2 2"],
         names: Int64[np.ndarray, " n"],
     ) -> Int64[np.ndarray, " n"]:
-        """The landmark of each detection of a scan; NOBODY for those that match none."""
+        """Match the detections of a scan; UNASSIGNED where no landmark matches."""
         if not len(points) or not self.names:
-            return np.full(len(points), NOBODY)
-        seen, spread = self.predicted()
-        S = spread[None] + self._settings.variance_factor * covariances[:, None]
-        squared, logs = squared_distances(points[:, None] - seen[None], S)
-        known = np.array(self.names)
-        squared = np.where(names[:, None] == known[None], squared, np.inf)
-        found = best_pairs_first(squared, squared + logs, self._settings.gate)
-        for row in np.nonzero(names != NOBODY)[0]:  # a name is believed, however far it is
-            same = np.nonzero(known == names[row])[0]
-            found[row] = same[0] if len(same) else NOBODY
-        return found
+            return np.full(len(points), UNASSIGNED)
+        predicted = self.predict_landmarks()
+        return match_scan(
+            points, covariances, names, predicted, np.array(self.names), self._settings
+        )
 
-    def surprise(
+    def joint_distance_ratio(
         self,
         landmarks: Int64[np.ndarray, " m"],
         points: Float[np.ndarray, "m 2"],
         covariances: Float[np.ndarray, "m 2 2"],
     ) -> float:
-        """The joint squared Mahalanobis distance of these pairs, divided by the largest
-        plausible one.
+        """Compute the joint squared Mahalanobis distance of these pairs over the limit that jointly
+        compatible pairs exceed with probability RARE.
         """
         m, n = len(landmarks), self._size
         if not m:
             return 0.0
-        H, seen = self._jacobian(landmarks)
+        H, seen = self._linearise(landmarks)
         S = dense.product(dense.product(H, self._P[:n, :n]), H.T)
         S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
         error = (points - seen).ravel()
         return float(dense.product(error, dense.solve(S, error)) / chi2_limit(2 * m, RARE))
 
-    def jump(
+    def find_slip(
         self,
         points: Float[np.ndarray, "n 2"],
         covariances: Float[np.ndarray, "n 2 2"],
         found: Int64[np.ndarray, " n"],
     ) -> Float[np.ndarray, "3"] | None:
-        """The slip (forward, left, turn) that explains most of a scan; None if none does.
+        """Find the slip (forward, left, turn) that explains most of a scan; None if none does.
 
         Each pair of a detection and a landmark near it proposes a slip, given that the pose may be
         wrong by slip_m; the other pairs are counted under that proposal. A slip must explain more
@@ -201,7 +188,7 @@ class Tracker:
         that does not fit.
         """
         gate, reach = self._settings.gate, self._settings.slip_m
-        seen, spread = self.predicted()
+        seen, spread = self.predict_landmarks()
         Hp = pose_jacobians(seen)
         loose = np.diag(
             [
@@ -220,23 +207,26 @@ class Tracker:
         near = elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach
         possible = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
         least = MOST * max(possible, SLIP_DETECTIONS)
-        known = np.nonzero(found != NOBODY)[0]
-        before, _ = squared_distances(
+        known = np.nonzero(found != UNASSIGNED)[0]
+        before, _ = compute_mahalanobis(
             offsets[known, found[known]], spread[found[known]] + covariances[known]
         )
         most = gate * (len(points) - len(known) - 1) + float(np.minimum(before, gate).sum())
         best = (max(least, len(known) + 1) - 1e-9, 0.0)
         slip = None
         for row, column in np.argwhere(near):
-            C = dense.product(HpD[column], Hp.transpose(0, 2, 1))  # of the proposing one with each
+            C = dense.product(HpD[column], Hp.transpose(0, 2, 1))  # proposing landmark with each
             gain = dense.product(
                 C.transpose(0, 2, 1), dense.inverse(C[column] + own[column] + covariances[row])
             )
             S = dense.product(HpD, Hp.transpose(0, 2, 1)) - dense.product(gain, C) + own
-            moved = offsets - np.einsum("lij,j->li", gain, offsets[row, column])
-            squared, logs = squared_distances(moved, S[None] + covariances[:, None])
-            pairs = best_pairs_first(squared, squared + logs, gate)
-            rows = np.nonzero(pairs != NOBODY)[0]
+            offsets_after = offsets - np.einsum("lij,j->li", gain, offsets[row, column])
+            squared, determinants = compute_mahalanobis(
+                offsets_after, S[None] + covariances[:, None]
+            )
+            costs = squared + elementwise.log(determinants)
+            pairs = match_best_first(squared < gate, costs)
+            rows = np.nonzero(pairs != UNASSIGNED)[0]
             figure = float(len(rows)), -float(squared[rows, pairs[rows]].sum())
             if figure > best and gate * (len(points) - len(rows)) - figure[1] < most:
                 best, slip = figure, (rows, pairs[rows])
@@ -252,44 +242,47 @@ class Tracker:
 
 
 def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The covariance of a motion with a slip of about this (forward, left, turn): the slip is
-    its standard deviation.
+    """Covariance of a motion with a slip of about this (forward, left, turn): the slip is its
+    standard deviation, at least LEAST_SLIP.
     """
-    metres, turn = max(float(elementwise.hypot(*slip[:2])), 0.02), max(abs(float(slip[2])), 0.02)
+    metres = max(float(elementwise.hypot(*slip[:2])), LEAST_SLIP)
+    turn = max(abs(float(slip[2])), LEAST_SLIP)
     return np.diag(
         [elementary.squared(metres), elementary.squared(metres), elementary.squared(turn)]
     )
 
 
-def tracked(scans: Scans, settings: AssociationSettings) -> Tracked:
+def track_window(scans: Scans, settings: AssociationSettings) -> TrackedWindow:
     """Associate a window's detections scan by scan."""
     tracker = Tracker(settings, len(scans.points))
-    landmark_of = np.full(len(scans.points), NOBODY)
+    landmark_of = np.full(len(scans.points), UNASSIGNED)
     bounds = scans.bounds
     poses = np.empty_like(scans.motions)
     slips: list[Slip] = []
     for k, motion in enumerate(scans.motions):
-        tracker.move(motion, scans.motion_covariances[k])
+        tracker.predict_pose(motion, scans.motion_covariances[k])
         of_scan = slice(bounds[k], bounds[k + 1])
         points, covariances = scans.points[of_scan], scans.covariances[of_scan]
         names = scans.names[of_scan]
-        found = tracker.matched(points, covariances, names)
-        if settings.slip_m and _looks_slipped(tracker, found, points, covariances, settings.slip_m):
-            by = tracker.jump(points, covariances, found)
+        found = tracker.match_scan(points, covariances, names)
+        if settings.slip_m and _is_slip_suspected(
+            tracker, found, points, covariances, settings.slip_m
+        ):
+            by = tracker.find_slip(points, covariances, found)
             if by is not None:
                 slips.append(Slip(k, by))
-                tracker.shift(by)
-                found = tracker.matched(points, covariances, names)
-        known = np.nonzero(found != NOBODY)[0]
+                tracker.apply_slip(by)
+                found = tracker.match_scan(points, covariances, names)
+        known = np.nonzero(found != UNASSIGNED)[0]
         tracker.update(found[known], points[known], covariances[known])
-        for row in np.nonzero(found == NOBODY)[0]:
-            found[row] = tracker.found(points[row], covariances[row], int(names[row]))
+        for row in np.nonzero(found == UNASSIGNED)[0]:
+            found[row] = tracker.add_landmark(points[row], covariances[row], int(names[row]))
         landmark_of[of_scan] = found
         poses[k] = tracker.pose
-    return Tracked(landmark_of, tracker.names, poses, tracker.landmarks.copy(), slips)
+    return TrackedWindow(landmark_of, tracker.names, poses, tracker.landmarks.copy(), slips)
 
 
-def _looks_slipped(
+def _is_slip_suspected(
     tracker: Tracker,
     found: Int64[np.ndarray, " n"],
     points: Float[np.ndarray, "n 2"],
@@ -299,25 +292,25 @@ def _looks_slipped(
     """Whether a slip is suspected: few detections match, some miss a landmark nearby, or the
     pairs do not fit together.
     """
-    known = np.nonzero(found != NOBODY)[0]
+    known = np.nonzero(found != UNASSIGNED)[0]
     if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
         return False
-    if len(known) < FEW * len(points) or _missed_nearby(tracker, found, points, reach):
+    if len(known) < FEW * len(points) or _is_match_missed(tracker, found, points, reach):
         return True
-    return tracker.surprise(found[known], points[known], covariances[known]) > 1.0
+    return tracker.joint_distance_ratio(found[known], points[known], covariances[known]) > 1.0
 
 
-def _missed_nearby(
+def _is_match_missed(
     tracker: Tracker,
     found: Int64[np.ndarray, " n"],
     points: Float[np.ndarray, "n 2"],
     reach: float,
 ) -> bool:
     """Whether an unmatched detection and an unmatched landmark lie within reach of each other."""
-    seen, _ = tracker.predicted()
+    seen, _ = tracker.predict_landmarks()
     free = np.ones(len(seen), np.bool_)
-    free[found[found != NOBODY]] = False
-    offsets = points[found == NOBODY][:, None] - seen[free][None]
+    free[found[found != UNASSIGNED]] = False
+    offsets = points[found == UNASSIGNED][:, None] - seen[free][None]
     return bool((elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())
 
 

@@ -16,7 +16,7 @@ from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from team.estimation.hybrid_slam.outliers import OutlierGate
 from team.estimation.hybrid_slam.redrawing import redrawn
-from team.estimation.hybrid_slam.unnamed import Settled, settled
+from team.estimation.hybrid_slam.unnamed_detections import AssociatedKeyframes, associate_keyframes
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.models import Increment
 from team.estimation.mount import of_base
@@ -46,7 +46,7 @@ class OpenWindow:
         self._motions: list[Increment] = []
         self.last_keyframe_ns: int | None = None
         self._keyframes: list[Keyframe] = []
-        self.settled = Settled(())
+        self.settled = AssociatedKeyframes(())
         self._begin()
 
     def _begin(self, times: int = 1) -> None:
@@ -137,7 +137,7 @@ class OpenWindow:
         has_unnamed = any(each.looks for each in self._keyframes)
         if has_unnamed:
             config = self._config
-            self.settled = settled(
+            self.settled = associate_keyframes(
                 keyframes,
                 config.front_end.association,
                 config.sensor,

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int64
 
 from team.estimation import dense, elementary, elementwise
 from team.estimation.association.scans import Scans, points_of
-from team.estimation.association.smoothing import JITTER, Smoothed, smoothed
+from team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
 from team.estimation.geometry import adjoint, between, inverse
 from team.estimation.hybrid_slam.fastslam import effective_sample_size, normalised
 from team.estimation.hybrid_slam.keyframes import Keyframe
@@ -55,7 +55,7 @@ def redrawn(
     landmarks = dense.product(weights, _rows(window.particles.means)).reshape(-1, 2)
     poses = mean_path(np.ascontiguousarray(window.paths), weights)
     try:
-        now = smoothed(scans, slots, poses, landmarks)
+        now = smooth_window(scans, slots, poses, landmarks)
         paths, log_weights = _drawn(now, scans, len(weights), generator)
     except np.linalg.LinAlgError:
         return window
@@ -110,7 +110,7 @@ def _scans(window: Window, keyframes: Sequence[Keyframe]) -> Scans:
 
 
 def _drawn(
-    now: Smoothed, scans: Scans, count: int, generator: np.random.Generator
+    now: SmoothedWindow, scans: Scans, count: int, generator: np.random.Generator
 ) -> tuple[Paths, Float[np.ndarray, " M"]]:
     """Paths from the smoothed window's Gaussian, and log p(path) − log q(path) but for a
     constant.

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from team.estimation.association.density import LandmarkDensity
+from team.estimation.association.landmark_sets import OPEN, Opened
+from team.estimation.association.verification import overlap_share
 from team.estimation.map_joining import refusal
-from team.estimation.map_joining.association.crowding import Crowd
-from team.estimation.map_joining.association.landmarks import OPEN, Opened
-from team.estimation.map_joining.association.shares import overlap_share
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings
 from team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
 
@@ -51,7 +51,7 @@ def _without(audit: Audit, after: Fold, share: float, settings: JoinSettings) ->
     undone = opened.decision._replace(
         stamp_ns=stamp_ns, kind="undone", share=share, why=f"{words} ticks"
     )
-    landmarks = audit.before.landmarks.decided(opened.decision, undone)
+    landmarks = audit.before.landmarks.add_decisions(opened.decision, undone)
     landmarks = replace(landmarks, undone=(*landmarks.undone, opened))
     again = replace(audit.before, landmarks=landmarks)
     for tick in audit.ticks:
@@ -83,8 +83,8 @@ def share_now(fold: Fold, opened: Opened) -> float | None:
     if not len(at):
         return None
     one, two = (_points(island, [node for node in known if side[node]]) for side in sides)
-    around = Crowd(each.observation.spacings for each in graph.observed)
-    return overlap_share(one, two, at, around.bounded(island.settings.association))
+    around = LandmarkDensity(each.observation.spacings for each in graph.observed)
+    return overlap_share(one, two, at, around.limit_lengths(island.settings.association))
 
 
 def _points(island: Island, nodes: list[int]) -> np.ndarray:

@@ -15,6 +15,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from team.estimation.association.landmark_sets import (
+    NO_LANDMARKS,
+    Landmarks,
+    Opened,
+    Verdict,
+    add_landmarks,
+)
 from team.estimation.contribution import (
     Contribution,
     InitialPoseFactor,
@@ -24,13 +31,6 @@ from team.estimation.contribution import (
     named,
 )
 from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.association.landmarks import (
-    NO_LANDMARKS,
-    Landmarks,
-    Opened,
-    Verdict,
-    founded,
-)
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -39,7 +39,7 @@ from team.estimation.map_joining.gauss_newton import (
     is_solvable,
     iterated,
 )
-from team.estimation.map_joining.markers import unmarked, with_markers
+from team.estimation.map_joining.markers import add_markers, warn_of_unmarked
 from team.estimation.map_joining.merging import Merge, ages, merge, sighted
 from team.estimation.map_joining.minima import (
     Minimum,
@@ -264,7 +264,7 @@ def folded(
             home[stream] = common[0] if common and stream in fold.starts else stream
         arrived.setdefault(home[stream], []).append(contribution)
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
-    landmarks, numbers = founded(fold.landmarks, contributions)
+    landmarks, numbers = add_landmarks(fold.landmarks, contributions)
     seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
     islands = {
         key: woken(replace(island, settings=settings), seen) for key, island in fold.islands.items()
@@ -322,7 +322,7 @@ def converged(fold: Fold, settings: JoinSettings) -> Fold:
 
 def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     searches = {
-        key: _search(with_markers(replace(island, settings=settings)))
+        key: _search(add_markers(replace(island, settings=settings)))
         for key, island in fold.islands.items()
     }
     main = searches[main_key]
@@ -344,7 +344,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         islands={**merged.islands, main_key: last.best.island},
         iterations=last.best.iterations,
         change=last.best.change,
-        warnings=(*warnings(last), *unmarked(last.best.island)),
+        warnings=(*warnings(last), *warn_of_unmarked(last.best.island)),
     )
 
 

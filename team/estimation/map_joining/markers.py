@@ -1,10 +1,10 @@
-"""The errors of the markers of landmarks without a name, as states of the full solution.
+"""Marker errors of landmarks without a name, as states of the full solution.
 
-A sensor that tells the distance from an object's size or height measures each landmark too far by a
-share of the range of its own, whoever observes it (`CommonBiasSigmas.marker`). The share belongs to
-the landmark, whether robots read a name on it or not. Which local landmarks are one is known when
-association has ended: before, the parts of one landmark would each have an error of their own, and
-would be told apart less well.
+A sensor that derives the distance from an object's size or height measures each landmark too far by
+a constant share of the range, the same for all robots (`CommonBiasSigmas.marker`). The share
+belongs to the landmark, with or without a name. The states are added when association has ended:
+before, each part of one landmark would have an error of its own, which would weaken the evidence
+that the parts are one landmark or two.
 """
 
 from collections.abc import Mapping
@@ -18,15 +18,15 @@ from team.estimation.map_joining.gauss_newton import Island
 from team.estimation.map_joining.submap_graph import RANGE_POWER, CommonError, Joined, Prior
 
 
-def with_markers(island: Island) -> Island:
-    """The island with a state for the marker of each landmark without a name that has none; an
-    island with condensed submaps as it is.
+def add_markers(island: Island) -> Island:
+    """Add a state for the marker of each landmark without a name that has none; an island with
+    condensed submaps is unchanged.
     """
-    graph, number = island.graph, _unmarked(island)
+    graph, number = island.graph, _find_unmarked(island)
     if not number or graph.condensed is not None:
         return island
     sigma = island.settings.common_bias_sigma["marker"]
-    marked = [_numbers(each, number) for each in graph.submaps]
+    marked = [_list_numbers(each, number) for each in graph.submaps]
     first = len(graph.fixed)
     errors = dict.fromkeys(error for each in marked for error in each)
     nodes: dict[CommonError, int] = {error: first + k for k, error in enumerate(errors)}
@@ -38,7 +38,7 @@ def with_markers(island: Island) -> Island:
         offset=np.append(graph.offset, graph.offset[-1] + 1 + np.arange(count)),
         fixed=np.append(graph.fixed, np.zeros(count, np.bool_)),
         submaps=tuple(
-            _marked(each, own, nodes, number)
+            _add_rows(each, own, nodes, number)
             for each, own in zip(graph.submaps, marked, strict=True)
         ),
         priors=(*graph.priors, *(Prior(node, np.zeros(1), certainty) for node in nodes.values())),
@@ -46,9 +46,9 @@ def with_markers(island: Island) -> Island:
     return replace(island, graph=graph, state=np.append(island.state, np.zeros(count)))
 
 
-def unmarked(island: Island) -> list[str]:
-    """Warns, in words, of landmarks whose marker's error the full solution does not have."""
-    graph, count = island.graph, len(_unmarked(island))
+def warn_of_unmarked(island: Island) -> list[str]:
+    """Warn, in words, of landmarks whose marker error is not a state of the full solution."""
+    graph, count = island.graph, len(_find_unmarked(island))
     if not count or not any(bias == "range_scale" for _, bias in graph.biases):
         return []
     return [
@@ -57,9 +57,9 @@ def unmarked(island: Island) -> list[str]:
     ]
 
 
-def _unmarked(island: Island) -> dict[int, int]:
-    """The number of each node of a landmark without a name that has no state for its marker; none
-    where the settings have none.
+def _find_unmarked(island: Island) -> dict[int, int]:
+    """Find the nodes of landmarks without a name that have no state for their marker, with their
+    numbers; none where the settings have no marker errors.
     """
     graph = island.graph
     if "marker" not in island.settings.common_bias_sigma:
@@ -71,17 +71,17 @@ def _unmarked(island: Island) -> dict[int, int]:
     }
 
 
-def _numbers(submap: Joined, number: dict[int, int]) -> list[int]:
-    """The numbers of a submap's landmarks with a new marker, in its order."""
+def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
+    """List the numbers of a submap's landmarks with a new marker, in its order."""
     if "range_scale" not in submap.contribution.local.biases:
         return []
     return [number[node] for node in submap.landmarks.tolist() if node in number]
 
 
-def _marked(
+def _add_rows(
     submap: Joined, errors: list[int], nodes: Mapping[CommonError, int], number: dict[int, int]
 ) -> Joined:
-    """The submap with a row of its sensitivity for each of these markers: that of the scale of the
+    """Add a row of sensitivity to a submap for each of these markers: that of the scale of the
     ranges, restricted to the landmark.
     """
     if not errors:

@@ -20,9 +20,9 @@ import numpy as np
 
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.map_joining.fold_association import associate_tick
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
 from team.estimation.map_joining.joining import Fold, Tick, folded, started
-from team.estimation.map_joining.map_matching import recognised
 
 T = TypeVar("T")
 
@@ -97,7 +97,7 @@ def _attempt(
         fold = started(fold, start)
     try:
         with np.errstate(all="ignore"):
-            after = recognised(folded(fold, members, settings, sightings), members)
+            after = associate_tick(folded(fold, members, settings, sightings), members)
     except UNSOLVABLE:
         return None
     changed = (

@@ -66,7 +66,7 @@ def relinearised(
         return fold
     island, landmarks, numbers = fold.islands[key], fold.landmarks, NO_NUMBERS
     if landmarks.are_there:
-        landmarks, numbers = landmarks.restored(contributions)
+        landmarks, numbers = landmarks.restore(contributions)
     try:
         with np.errstate(all="ignore"):
             raw = _raw(island, fold, contributions, old.departed.paths, numbers)

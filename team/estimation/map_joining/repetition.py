@@ -1,17 +1,17 @@
-"""Finds a part of a map that repeats another part: a second copy of the same landmarks, or a
-building that repeats.
+"""Repetitions: parts of a map that repeat another part, as a copy or in a building that repeats.
 
-A robot that is carried off, or whose odometry slips by metres, lays the known landmarks a second
+A robot that is carried off, or whose odometry slips by metres, maps the mapped landmarks a second
 time, elsewhere. Nothing in the set contradicts it: from there on its submaps share landmarks with
-each other alone, and hang by odometry on the rest. The shape of the copy remains. For each boundary
-between two submaps of a stream beyond which it meets hardly any landmark of the rest, the landmarks
-that it meets there for the first time are laid on all others by a rigid motion (`voting`). With n
-of them, N others in an area A, and points that match within r, chance lays m or more on others in
+each other alone, and only odometry connects them with the rest. The shape of the copy remains. For
+each boundary between two submaps of a stream beyond which it observes hardly any landmark of the
+rest, the landmarks that it observes there for the first time are aligned with all others by a rigid
+motion (`voting`). With n of them, N others in an area A, and points that match within r, the
+expected number of motions that match m or more by chance is
 
     E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
-motions: each pair laid on a pair defines one. Two places that look alike are no proof of an error:
-whether a robot was carried off or the building repeats itself, the set does not tell.
+since each pair on a pair defines one motion. Two places that look alike are no proof of an error:
+the set does not determine whether a robot was carried off or the building repeats itself.
 """
 
 import math
@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED
 from team.estimation import elementary, elementwise
+from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.association.voting import PointSet, Vote, moved, voted
 from team.estimation.map_joining.gauss_newton import Island
 
 LEAST_PAIRS = 6
@@ -38,18 +38,18 @@ BY_CHANCE = -14.0
 FARTHER = 4.0
 """Least distance of the two places, in distances of matched points."""
 MOST_POINTS = 400
-"""Larger maps are not searched: the votes would take seconds."""
+"""Larger maps are not searched: voting would take seconds."""
 TRIED = 4
 """Most boundaries of a stream that are examined, those with the smallest shared part first."""
 
 
 class Repetition(NamedTuple):
-    """Landmarks of a stream's submaps from `first` on that repeat others, laid by a motion.
+    """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
 
     ids: all landmarks that only these submaps have. pairs: of them those that match another one.
     begin_ns, end_ns: the end of the last submap before the boundary, and of the stream's last one.
-    place: where the stream is at the boundary (x, y) [m]. moved: from there to where it would be
-    if the pairs were one landmark each (x, y) [m], and the turn [rad].
+    place: of the stream at the boundary (x, y) [m]. displacement: from there to its place if the
+    pairs were one landmark each (x, y) [m], and the turn [rad].
     """
 
     stream: Stream
@@ -59,11 +59,11 @@ class Repetition(NamedTuple):
     begin_ns: int
     end_ns: int
     place: tuple[float, float]
-    moved: tuple[float, float, float]
+    displacement: tuple[float, float, float]
 
 
-def repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
-    """The repetitions among these landmarks of an island, at most one of each stream."""
+def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
+    """Find the repetitions among these landmarks of an island, at most one of each stream."""
     unnamed = sorted(id_ for id_ in ids if id_ >= UNNAMED)
     if not 2 * LEAST_PAIRS <= len(unnamed) <= MOST_POINTS:
         return []
@@ -79,12 +79,12 @@ def repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
     found = []
     for stream in sorted(island.graph.streams):
         own = np.array([each == stream for each in streams], np.bool_)
-        one = _of_stream(island, stream, sees, own, points, unnamed)
+        one = _find_in_stream(island, stream, sees, own, points, unnamed)
         found += [] if one is None else [one]
     return found
 
 
-def _of_stream(
+def _find_in_stream(
     island: Island,
     stream: Stream,
     sees: Bool[np.ndarray, "K n"],
@@ -92,6 +92,7 @@ def _of_stream(
     points: Float[np.ndarray, "n 2"],
     ids: list[int],
 ) -> Repetition | None:
+    """Find the repetition of a stream with the smallest shared part; None if there is none."""
     rows = np.flatnonzero(own)
     elsewhere = sees[~own].any(axis=0)
     candidates = []
@@ -105,13 +106,13 @@ def _of_stream(
     candidates.sort(key=lambda each: each[:2])
     for _, k, fresh in candidates[:TRIED]:
         others = np.setdiff1d(np.arange(len(ids)), fresh)
-        vote = _laid(points[fresh], points[others], island.settings.association.same)
+        vote = _align_beyond_chance(points[fresh], points[others], island.settings.association.same)
         if vote is None:
             continue
         submap = island.graph.submaps[rows[k]].contribution
         start = island.graph.submaps[rows[k]].nodes[0]
         place = island.state[island.graph.offset[start] :][:2]
-        there = moved(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
+        there = apply_motion(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
         gone = there - place
         if math.hypot(*gone.tolist()) < FARTHER * island.settings.association.same:
             continue
@@ -125,19 +126,21 @@ def _of_stream(
             begin_ns=before.end_ns,
             end_ns=island.graph.submaps[rows[-1]].contribution.end_ns,
             place=(float(place[0]), float(place[1])),
-            moved=(float(gone[0]), float(gone[1]), float(vote.motion[2])),
+            displacement=(float(gone[0]), float(gone[1]), float(vote.motion[2])),
         )
     return None
 
 
-def _laid(
+def _align_beyond_chance(
     own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
 ) -> Vote | None:
-    """The motion that lays most points on others, where chance does not explain it."""
+    """Find the motion that matches most points with others; None where chance explains it."""
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
-    votes = voted(a, b, same, float(np.ptp(np.concatenate((own, others)), axis=0).max()))
+    votes = propose_alignments(
+        a, b, same, float(np.ptp(np.concatenate((own, others)), axis=0).max())
+    )
     if not votes:
         return None
     matched = len(votes[0].first)
@@ -147,7 +150,7 @@ def _laid(
 
 
 def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius: float) -> float:
-    """Compute ln E of n points of which `matched` lie on others."""
+    """Compute ln E of n points of which `matched` match others."""
     count = len(others)
     area = max(float(np.ptp(others, axis=0).prod()), math.pi * elementary.squared(radius))
     p = min(math.pi * elementary.squared(radius) * count / area, 1.0 - 1e-9)
@@ -161,4 +164,5 @@ def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius
 
 
 def _log_choose(n: int, k: int) -> float:
+    """Compute ln of the binomial coefficient."""
     return elementary.log(float(math.comb(n, k)))

@@ -1,4 +1,4 @@
-"""How certain an association is: against all joint associations, one by one, and in windows."""
+"""The certainty of associations, against all joint associations one by one, and in windows."""
 
 from dataclasses import replace
 from itertools import product
@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from team.config import AssociationSettings
-from team.estimation.association.association import associated
-from team.estimation.association.certainty import marginals, view_of
-from team.estimation.association.scans import NOBODY
-from tests.estimation.association.test_association import pairs, window
+from team.estimation.association.certainty import estimate_view, marginals
+from team.estimation.association.clustering import associate_window
+from team.estimation.association.scans import UNASSIGNED
+from tests.estimation.association.test_clustering import pairs, window
 
 
 def exact(weights: np.ndarray) -> np.ndarray:
@@ -34,15 +34,15 @@ def test_marginals_are_those_of_all_joint_associations(seed):
     assert np.allclose(marginals(weights), exact(weights), atol=0.1)
 
 
-def test_of_one_detection_or_one_landmark_the_marginals_are_exact():
+def test_the_marginals_of_one_detection_or_one_landmark_are_exact():
     for shape in ((1, 4), (4, 1)):
         weights = np.exp(np.random.default_rng(5).normal(0.0, 2.0, shape))
         assert np.allclose(marginals(weights), exact(weights))
 
 
-def test_a_view_is_as_dense_as_what_it_sees():
+def test_the_density_of_a_view_is_that_of_its_detections():
     scans, _ = window(0)
-    view = view_of(scans)
+    view = estimate_view(scans)
     per_scan = len(scans.points) / len(np.unique(scans.keyframes))
     assert view.farthest == pytest.approx(6.0, rel=0.1)
     assert view.density == pytest.approx(per_scan / (np.pi * 36.0), rel=0.2)
@@ -57,9 +57,9 @@ def test_a_poor_sensor_gives_fewer_landmarks_and_not_wrong_ones():
             noise = np.random.default_rng(seed).normal(size=scans.points.shape) * 0.45
             poor = np.tile((0.45**2 + 0.05**2) * np.eye(2), (len(labels), 1, 1))
             scans = replace(scans, points=scans.points + noise, covariances=poor)
-            result = associated(scans, AssociationSettings(certain=certain))
+            result = associate_window(scans, AssociationSettings(certain=certain))
             precision.append(pairs(result.landmark_of, labels)[0])
-            kept.append((result.landmark_of != NOBODY).mean())
+            kept.append((result.landmark_of != UNASSIGNED).mean())
         wrong.append(1.0 - np.mean(precision))
         left.append(np.mean(kept))
     assert wrong[1] < 0.3 * wrong[0]

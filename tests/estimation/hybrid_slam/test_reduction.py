@@ -5,7 +5,7 @@ import pytest
 
 from team.config import UNNAMED, AssociationSettings, MotionModel, MotionNoise, Sensor
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.hybrid_slam.unnamed import events_of, settled
+from team.estimation.hybrid_slam.unnamed_detections import associate_keyframes, events_of
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import unclaimed
 
@@ -51,7 +51,7 @@ def test_detections_that_are_associated_rightly_give_the_numbers_that_names_give
 ) -> None:
     named = keyframes(keyframe_s, hidden=False)
     raw = keyframes(keyframe_s, hidden=True, tagged=tagged)
-    found = settled(raw, AssociationSettings(certain=0.0), SENSOR, 100)
+    found = associate_keyframes(raw, AssociationSettings(certain=0.0), SENSOR, 100)
     assert len(found.unnamed.counts) == 3 - tagged
     merged: dict[int, list[Keyframe]] = {}
     for each in found.keyframes:

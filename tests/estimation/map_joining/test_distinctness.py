@@ -8,7 +8,8 @@ import pytest
 from central.config import CentralConfig
 from central.join_messages import reasons, shown_landmarks
 from team.config import UNNAMED
-from team.estimation.map_joining.association.landmarks import LocalLandmark, Verdict
+from team.estimation.association.landmark_sets import Verdict
+from team.estimation.association.member_log import LocalLandmark
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, Fold, JoinSettings, Tick
 from team.estimation.map_joining.memory import MOST

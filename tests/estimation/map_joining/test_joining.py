@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
 from team.estimation.map_joining.joining import (
@@ -33,7 +32,7 @@ from team.estimation.map_joining.marginals import (
 )
 from team.estimation.map_joining.submap_factor import submap_normal
 from team.estimation.submap import LocalMap
-from tests.estimation.submap_world import local_truth, solved, team, wrap
+from tests.estimation.submap_world import local_truth, team, wrap
 
 EXACTLY = JoinSettings(step_tolerance=1e-11)
 
@@ -246,35 +245,7 @@ def test_the_kernels_gradient_is_the_slope_of_the_cost_that_is_minimised():
         assert (up - down) / 4e-6 == pytest.approx(gradient[k], rel=1e-4, abs=1e-4)
 
 
-# --- consistency ---
-
-RUNS = 200
-
-
-def consistency(options):
-    """Mean map NEES per degree of freedom and mean joint cost per degree of freedom."""
-    errors = cost = dof = joint = 0.0
-    for seed in range(RUNS):
-        world = team(seed, robots=2, submaps=5, landmarks=4)
-        fold = solved(joined(world.submaps, world.starts, options, tick=10), options)
-        found = landmark_map(fold)
-        truth = world.landmarks[found.ids]
-        errors += nees((found.means - truth).ravel(), found.covariance)
-        dof += found.means.size
-        agreement = joint_cost(fold)
-        cost += agreement.chi2
-        joint += agreement.dof
-    return errors / dof, round(dof), cost / joint, round(joint)
-
-
-def test_map_and_joint_cost_are_consistent_and_a_submap_counted_twice_is_not():
-    ratio, dof, cost, joint = consistency(JoinSettings())
-    low, high = chi2_interval(dof, 0.999, 1)
-    assert low < ratio < high
-    least, most = chi2_interval(joint, 0.999, 1)
-    assert least < cost < most
-    twice, _, _, _ = consistency(JoinSettings(covariance_factor=0.5))
-    assert twice > high
+# --- redundancy ---
 
 
 def test_the_redundancies_of_submaps_and_priors_add_up_to_the_joint_degrees_of_freedom():

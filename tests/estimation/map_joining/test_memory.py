@@ -12,7 +12,7 @@ from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, 
 from team.estimation.map_joining.memory import MOST, Memory, Observed
 from team.estimation.map_joining.relinearising import relinearised
 from team.estimation.map_joining.submap_graph import tied
-from tests.estimation.map_joining.association.unnamed_worlds import (
+from tests.estimation.association.unnamed_worlds import (
     circle,
     drive,
     duplicates,

@@ -7,7 +7,6 @@ import pytest
 
 from team.association import AssociationProfile
 from team.config import UNNAMED
-from team.estimation.consistency import chi2_interval, nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import packed, unpacked
 from team.estimation.geometry import compose, inverse, transformed
@@ -16,7 +15,7 @@ from team.estimation.map_joining import marginals
 from team.estimation.map_joining.condensing import condensed
 from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
-from team.estimation.map_joining.markers import with_markers
+from team.estimation.map_joining.markers import add_markers
 from team.estimation.map_joining.submap_graph import tied
 from team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.submap_world import local_truth
@@ -146,63 +145,7 @@ def test_an_outlier_does_not_grow_with_its_distance():
     assert xx * yy - xy**2 == pytest.approx(q2**2 * (own_xx * own_yy - own_xy**2))
 
 
-SEEDS = range(200)
-
-
-def scale_errors(seeds, *, joined_ranges, way=0.01):
-    """(estimate − truth)/sigma of each robot's scale."""
-    found = []
-    for seed in seeds:
-        submaps, starts, errors = carts(seed, robots=1, submaps=20, way=way)
-        options = JoinSettings(bias_sigma=SIGMA, joined_ranges=joined_ranges)
-        estimates = marginals.bias_estimates(fold_of(submaps, starts, options))
-        found += [(each.value - errors[each.stream[0]]) / each.sigma for each in estimates]
-    return np.array(found)
-
-
-def test_the_scale_of_ranges_is_unbiased_at_joined_ranges_and_at_the_measured_ones_it_is_not():
-    unbiased = scale_errors(SEEDS, joined_ranges=True)
-    low, high = chi2_interval(1, 0.999, len(unbiased))
-    assert low < np.mean(unbiased**2) < high
-    assert abs(np.mean(unbiased)) < 3.3 / np.sqrt(len(unbiased))
-    mutant = scale_errors(SEEDS[:50], joined_ranges=False)
-    assert abs(np.mean(mutant)) > 3.3 / np.sqrt(len(mutant))
-
-
-def test_what_only_its_prior_knows_the_noise_of_many_submaps_does_not_tell():
-    """No odometry says how large the map is; a column along the measured bearing would."""
-    errors = scale_errors(range(300, 330), joined_ranges=True, way=1.0)
-    assert abs(np.mean(errors)) < 3.3 / np.sqrt(len(errors))
-    assert np.mean(errors**2) < chi2_interval(1, 0.999, len(errors))[1]
-
-
 # --- what all robots have in common ---
-
-
-def nees_of_maps(seeds, common_bias_sigma):
-    options = JoinSettings(
-        bias_sigma={"range_scale": 0.1 * OWN},
-        common_bias_sigma=common_bias_sigma,
-        joined_ranges=True,
-    )
-    total = 0.0
-    for seed in seeds:
-        submaps, starts, _ = carts(
-            seed, submaps=3, own=0.1 * OWN, common=COMMON, way=0.05, marker=MARKER
-        )
-        found = marginals.landmark_map(fold_of(submaps, starts, options))
-        total += nees((found.means - LANDMARKS).ravel(), found.covariance)
-    return total / len(seeds)
-
-
-def test_a_map_is_as_sure_as_it_says_only_with_a_state_of_each_error_that_all_robots_share():
-    """Of the scale of all ranges, and of each landmark's marker, which reads too far for all."""
-    low, high = chi2_interval(10, 0.999, len(SEEDS))
-    states = {"range_scale": COMMON, "marker": MARKER}
-    assert low < nees_of_maps(SEEDS, states) / 10.0 < high
-    for missing in states:
-        less = {name: sigma for name, sigma in states.items() if name != missing}
-        assert nees_of_maps(SEEDS[:25], less) / 10.0 > 1.25
 
 
 def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():
@@ -244,7 +187,7 @@ def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
     options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
     named = fold_of(submaps, starts, options).main
     fold, first = hidden(submaps, starts, options)
-    joined, *_ = settled(with_markers(fold.main))
+    joined, *_ = settled(add_markers(fold.main))
     graph = joined.graph
     assert sorted(graph.common) == sorted(graph.landmarks) == sorted(first.values())
     assert len(graph.priors) == len(named.graph.priors)

@@ -11,8 +11,8 @@ from team.association import AssociationProfile
 from team.estimation.contribution import Contribution
 from team.estimation.map_joining.auditing import taken
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
-from team.estimation.map_joining.repetition import BY_CHANCE, log_by_chance, repetitions
-from tests.estimation.map_joining.association.unnamed_worlds import circle, drive
+from team.estimation.map_joining.repetition import BY_CHANCE, find_repetitions, log_by_chance
+from tests.estimation.association.unnamed_worlds import circle, drive
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
 ROUND = 14
@@ -52,10 +52,12 @@ def test_a_robot_that_was_carried_off_is_named_with_the_time_and_the_way_and_no_
     before, _ = drive("r1", circle((0.0, 0.0), 9.0, ROUND, 1.1), world, rng, reach=7.0)
     after, _ = drive("r1", circle((1.0, -1.0), 8.0, ROUND, 1.1, 2.5), world, rng, reach=7.0)
     fold = folded(before, after)
-    (found,) = repetitions(fold.main, fold.main.graph.landmarks)
+    (found,) = find_repetitions(fold.main, fold.main.graph.landmarks)
     assert found.first == ROUND
     one, two = circle((0.0, 0.0), 9.0, ROUND, 1.1)[-1], circle((1.0, -1.0), 8.0, ROUND, 1.1, 2.5)[0]
-    assert math.hypot(*found.moved[:2]) == pytest.approx(math.hypot(*(two - one)[:2]), abs=0.5)
+    assert math.hypot(*found.displacement[:2]) == pytest.approx(
+        math.hypot(*(two - one)[:2]), abs=0.5
+    )
     assert len(found.pairs) >= 12
     shown = shown_landmarks(fold, CentralConfig(), "final")
     assert not set(found.ids) & set(shown.ids)
@@ -73,9 +75,9 @@ def test_two_equal_rooms_are_told_as_that_and_as_nothing_else() -> None:
     way, _ = drive("r1", corridor, rooms, rng, reach=7.0)
     second, _ = drive("r1", circle((60.0, 0.0), 5.0, 8, 1.1), rooms, rng, reach=7.0)
     fold = folded(first, way, second)
-    (found,) = repetitions(fold.main, fold.main.graph.landmarks)
+    (found,) = find_repetitions(fold.main, fold.main.graph.landmarks)
     assert len(found.pairs) >= 12
-    assert math.hypot(*found.moved[:2]) == pytest.approx(60.0, abs=5.0)
+    assert math.hypot(*found.displacement[:2]) == pytest.approx(60.0, abs=5.0)
     (text,) = said(fold)
     assert "either the building repeats itself, or the robot was carried off or slipped" in text
 
@@ -86,7 +88,7 @@ def test_nothing_is_said_of_a_robot_that_explores_and_comes_back(seed: int) -> N
     path = circle((0.0, 0.0), 16.0, 30, 1.4)
     submaps, _ = drive("r1", path, world, rng, reach=7.0)
     fold = folded(submaps)
-    assert repetitions(fold.main, fold.main.graph.landmarks) == []
+    assert find_repetitions(fold.main, fold.main.graph.landmarks) == []
 
 
 def test_chance_lays_few_points_on_others_and_not_many() -> None:

@@ -18,7 +18,7 @@ from sim.scenarios.source import streams_of
 from sim.world.streams import NO_LABEL
 from team.association import AssociationProfile
 from team.config import AssociationSettings
-from tests.estimation.map_joining.association.unnamed_worlds import circle, drive
+from tests.estimation.association.unnamed_worlds import circle, drive
 
 REACH_M = 12.0
 

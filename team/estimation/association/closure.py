@@ -1,0 +1,494 @@
+"""Closures: a patch of landmarks found at a place of another part of the map, or of another map.
+
+The patch, the landmarks of a stream's last submaps, is compared with the rest of its island, or
+with another island, in which its place is unknown. Pair voting proposes alignments; each is grown
+from two of its pairs under the joint covariance. The evidence for it is the log-likelihood ratio of
+its pairs less a penalty for absent landmarks: those that one side has where the other side observed
+and has none. The best alignment is a closure only if it passes the tests of `verification`, among
+them a margin to every other alignment.
+
+Voting needs many pairs, since it searches everywhere. Where the place of a submap is uncertain by a
+few metres only, `assign_nearby` weighs all joint assignments to the landmarks there instead: three
+pairs on which they agree suffice, if together they have the evidence that a single uncertain pair
+needs.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.association import AssociationProfile
+from team.estimation import dense, elementary, elementwise
+from team.estimation.association.gating import Indices, Joint, evaluate_pairs, list_pairs
+from team.estimation.association.island_view import (
+    IslandView,
+    join_indices,
+    select_comparisons,
+)
+from team.estimation.association.joint_compatibility import (
+    SURE_AFTER,
+    MergedPairs,
+    assign_jointly,
+    grow_pairs,
+)
+from team.estimation.association.verification import (
+    Closure,
+    ClosureTests,
+    find_failed_test,
+    matched_share,
+    nearest_distance,
+)
+from team.estimation.association.visibility import (
+    Views,
+    mark_visible,
+    pad_views,
+    renumber_views,
+)
+from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
+from team.estimation.contribution import Stream
+from team.estimation.geometry import compose
+
+BEND = 8.0
+"""Largest distortion of two maps against each other within a patch, in radii of one object."""
+WEAK = 2
+"""An alignment with this many times fewer votes than the best one has pairs is no rival of it."""
+EXAMINED = 120
+"""Number of alignments that are examined: those with the most matched points."""
+TRIED = 8
+"""Number of them that are grown: those with the fewest absent landmarks for their matched ones."""
+WORTH = 3.0
+"""About what a matched point adds to the log-likelihood ratio; it decides which alignments are
+grown.
+"""
+SEEDS = 3
+"""Number of pairs of seeds that are tried for each."""
+PART = 15
+"""Number of neighbouring landmarks in a part of the patch that votes for an alignment of its
+own.
+"""
+TOLERANCE, REACH = 0.4, 30.0
+"""Largest distance of matched points in a proposal, and of two points that vote together, in radii
+of one object.
+"""
+NEARLY = 2.0
+"""Largest standard deviation of a pair's difference in `assign_nearby`, in radii of one object."""
+
+
+class Side(NamedTuple):
+    """Landmarks of one side: their indices in the joint Gaussian, their positions and spreads.
+
+    ids: their indices in the caller's map.
+    within: their indices in the whole side.
+    views: which landmarks of the whole side were observed together.
+    parts: groups of neighbours in the whole side.
+    """
+
+    at: Indices
+    points: PointSet
+    ids: Indices
+    within: Indices
+    views: Views
+    parts: tuple[Indices, ...] = ()
+
+
+class Placement(NamedTuple):
+    """A placement of the patch on the target: its pairs, and the part of the target that it was
+    grown on.
+
+    absent: number of landmarks that one side has where the other side observed and has none.
+    evidence: log-likelihood ratio of the pairs less the penalty for the absent landmarks.
+    as_rival: the same where a landmark is absent only if the other side has none at all beside it,
+        matched or not. Where maps are bent, few of the pairs of a place are found, and unmatched
+        landmarks beside others are no evidence against it.
+    """
+
+    merged: MergedPairs
+    target: Side
+    motion: Float[np.ndarray, "3"]
+    absent: int
+    evidence: float
+    as_rival: float
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """The pairs by their indices in the patch and in the map of the target."""
+        of = dict(zip(self.target.at.tolist(), self.target.ids.tolist(), strict=True))
+        return [(pair.first, of[pair.second]) for pair in self.merged.pairs]
+
+
+JointOf = Callable[[Vote], tuple[Joint, Side]]
+"""The joint Gaussian of both sides for a proposed alignment, and the target's part that is in
+it.
+"""
+
+
+def align(
+    patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile
+) -> list[Placement]:
+    """Find the alignments of a patch with a target, the one with the most evidence first."""
+    tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
+    votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
+    votes = votes[:EXAMINED]
+    votes.sort(key=lambda vote: -_estimate_evidence(vote, patch, target, profile))
+    found: list[Placement] = []
+    most = 0
+    for vote in votes[:TRIED]:
+        if WEAK * len(vote.first) < most:
+            continue
+        joint, part = joint_of(vote)
+        merged = _grow_alignment(patch, part, joint, vote, profile)
+        if merged is not None:
+            absent, surely = _count_absent(merged, patch, part, profile)
+            found.append(
+                Placement(
+                    merged=merged,
+                    target=part,
+                    motion=vote.motion,
+                    absent=absent,
+                    evidence=merged.llr - profile.absent * absent,
+                    as_rival=merged.llr - profile.absent * surely,
+                )
+            )
+            most = max(most, len(merged.pairs))
+    return sorted(found, key=lambda each: -each.evidence)
+
+
+def find_closure(
+    patch: Side,
+    target: Side,
+    joint_of: JointOf,
+    profile: AssociationProfile,
+    tests: ClosureTests,
+    aliases: Callable[[], Sequence[Placement]] = tuple,
+) -> Closure | None:
+    """Find the best alignment of a patch with a target and test it; None where no alignment has two
+    pairs.
+
+    aliases: returns alignments of the patch that are certainly wrong: evidence as strong as theirs
+        does not prove a place. Called only for an alignment that passes all other tests.
+    """
+    found = align(patch, target, joint_of, profile)
+    if not found:
+        return None
+    best = found[0]
+    pairs = best.pairs
+    mine = set(pairs)
+    others = [
+        each
+        for each in found[1:]
+        if 2 * len(mine.intersection(each.pairs)) < len(each.merged.pairs)
+    ]
+    mean = best.merged.joint.mean
+    places = mean[[pair.second for pair in best.merged.pairs]]
+    closure = Closure(
+        pairs=tuple(
+            pair._replace(first=one, second=two)
+            for pair, (one, two) in zip(best.merged.pairs, pairs, strict=True)
+        ),
+        llr=best.merged.llr,
+        absent=best.absent,
+        rival_pairs=0,
+        rival_llr=0.0,
+        share=matched_share(mean[patch.at], mean[best.target.at], places, profile),
+        sd=max(pair.sd for pair in best.merged.pairs),
+        motion=best.motion,
+        why="",
+    )
+    for rivals in (lambda: others, aliases):
+        closure = _compare_with_rivals(closure, rivals())
+        closure = closure._replace(why=find_failed_test(closure, profile, tests))
+        if closure.why:
+            break
+    return closure
+
+
+def _compare_with_rivals(closure: Closure, others: Sequence[Placement]) -> Closure:
+    """Return the closure with the figures of the best rival, if one of `others` is better than its
+    present one.
+    """
+    best = max(others, key=lambda each: each.as_rival, default=None)
+    if best is None or best.as_rival <= closure.rival_llr:
+        return closure
+    return closure._replace(rival_pairs=len(best.merged.pairs), rival_llr=best.as_rival)
+
+
+def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: AssociationProfile) -> float:
+    """Estimate the evidence for an alignment from the positions as voted."""
+    local = patch.points.mean - patch.points.mean.mean(axis=0)
+    sides = (apply_motion(vote.motion, local), vote.first), (target.points.mean, vote.second)
+    absent, _ = _count_missing(*sides, (patch.views, target.views), profile)
+    return WORTH * len(vote.first) - profile.absent * absent
+
+
+def _count_absent(
+    merged: MergedPairs, patch: Side, target: Side, profile: AssociationProfile
+) -> tuple[int, int]:
+    """Count the landmarks of either side that are not matched where the other side observed, and
+    those of them beside which it has none.
+    """
+    mean = merged.joint.mean
+    place = np.full(int(max(target.views.max(initial=-1), target.within.max())) + 1, -1)
+    place[target.within] = np.arange(len(target.within))
+    first, second = np.array([(pair.first, pair.second) for pair in merged.pairs]).T
+    return _count_missing(
+        (mean[patch.at], np.flatnonzero(np.isin(patch.at, first))),
+        (mean[target.at], np.flatnonzero(np.isin(target.at, second))),
+        (patch.views, renumber_views(target.views, place)),
+        profile,
+    )
+
+
+def _count_missing(
+    one: tuple[Float[np.ndarray, "n 2"], Indices],
+    two: tuple[Float[np.ndarray, "m 2"], Indices],
+    views: tuple[Views, Views],
+    profile: AssociationProfile,
+) -> tuple[int, int]:
+    """Count the unmatched points of two sides, given with the matched ones' indices, inside the
+    other side's views, and those of them that no point of the other side is close to.
+
+    A point close to a matched place may be a split-off part of that landmark, and is not counted.
+    """
+    count = surely = 0
+    for (points, matched), (own, theirs), seen in ((one, two, views[1]), (two, one, views[0])):
+        left = np.delete(points, matched, axis=0)
+        if len(left):
+            left = left[nearest_distance(left, own[theirs]) >= profile.same]
+        if len(left):
+            left = left[mark_visible(left, own, seen)]
+            count += len(left)
+        if len(left):
+            surely += int((nearest_distance(left, own) >= profile.same).sum())
+    return count, surely
+
+
+def combine_maps(
+    patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
+) -> tuple[Joint, Side]:
+    """Combine two maps in the target's frame, with the patch as voted and free to lie anywhere;
+    returns also the part of the target that is in it.
+
+    The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
+    map's extent. Only the target's landmarks near the patch as voted are included: no others can
+    be paired.
+    """
+    n = len(patch.mean)
+    extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
+    local = patch.mean - patch.mean.mean(axis=0)
+    placed = apply_motion(vote.motion, local)
+    away = elementwise.hypot(*(placed[:, None] - target.mean[None]).transpose(2, 0, 1))
+    near = away.min(axis=0) < BEND * profile.same
+    near[vote.second] = True
+    nearby = np.flatnonzero(near)
+    target = target.select(nearby)
+    m = len(nearby)
+    s, c = elementwise.sin_and_cos(vote.motion[2])
+    R = np.kron(np.eye(n), np.array([[c, -s], [s, c]]))
+    lever = placed - vote.motion[:2]
+    J = np.zeros((2 * n, 3))
+    J[0::2, 0] = J[1::2, 1] = 1.0
+    J[0::2, 2], J[1::2, 2] = -lever[:, 1], lever[:, 0]
+    covariance = np.zeros((2 * (n + m), 2 * (n + m)))
+    spread = np.array(
+        [elementary.squared(extent), elementary.squared(extent), elementary.squared(np.pi)]
+    )
+    covariance[: 2 * n, : 2 * n] = dense.product(
+        dense.product(R, patch.covariance), R.T
+    ) + dense.product(J * spread, J.T)
+    covariance[2 * n :, 2 * n :] = target.covariance
+    apart = np.zeros((n + m, n + m), np.bool_)
+    apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
+    both = Joint(np.concatenate([placed, target.mean]), covariance, apart, target.density)
+    return both, Side(n + np.arange(m), side.points, side.ids[nearby], nearby, side.views)
+
+
+def _grow_alignment(
+    patch: Side, target: Side, joint: Joint, vote: Vote, profile: AssociationProfile
+) -> MergedPairs | None:
+    """Grow the largest alignment from one of a few pairs of seeds; None where all seeds fail."""
+    place = dict(zip(target.within.tolist(), target.at.tolist(), strict=True))
+    first = patch.at[vote.first]
+    second = np.array([place[k] for k in vote.second.tolist()], np.int64)
+    candidates = list_pairs(patch.at, target.at)
+    points = patch.points.mean[vote.first]
+    i, j = np.triu_indices(len(points), 1)
+    far = np.argsort(-elementwise.hypot(*(points[i] - points[j]).T), kind="stable")
+    used: set[int] = set()
+    best: MergedPairs | None = None
+    for k in far:
+        if {int(i[k]), int(j[k])} & used:
+            continue
+        used |= {int(i[k]), int(j[k])}
+        seeds = [(int(first[at]), int(second[at])) for at in (i[k], j[k])]
+        found = grow_pairs(joint, candidates, profile, seeds=seeds, sure_sd=profile.near)
+        if found is not None and (best is None or found.llr > best.llr):
+            best = found
+        if len(used) >= 2 * SEEDS or (best is not None and len(best.pairs) >= len(first)):
+            break
+    return best
+
+
+def patch_step(profile: AssociationProfile) -> int:
+    """Number of submaps by which successive patches of a stream are shifted."""
+    return max(1, profile.recent // 2)
+
+
+def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None:
+    """Search an island for a closure of a stream's submaps up to `last`; its pairs are indices in
+    the view.
+    """
+    profile = view.profile
+    submaps = view.find_latest(stream, last)
+    patch = join_indices(view.seen_by[k] for k in submaps)
+    target = _find_reachable(view, patch)
+    if not len(target):
+        return None
+    found = assign_nearby(view, submaps[-patch_step(profile) :])
+    if found is not None or min(len(patch), len(target)) < profile.closure_pairs:
+        return found
+    others = sorted({*range(len(view.seen_by))}.difference(submaps))
+    side = _make_side(view, target, others)
+    return find_closure(
+        _make_patch(view, patch, submaps),
+        side,
+        lambda _: (view.joint, side),
+        profile,
+        ClosureTests(profile.closure_pairs, profile.closure_llr),
+    )
+
+
+def search_other_island(
+    mine: IslandView, theirs: IslandView, stream: Stream, last: int
+) -> Closure | None:
+    """Search another island for a stream's submaps up to `last`; the pairs are indices in the two
+    views, and the motion maps the first island's frame into the second's.
+    """
+    profile = mine.profile
+    submaps = mine.find_latest(stream, last)
+    patch = join_indices(mine.seen_by[k] for k in submaps)
+    if min(len(patch), len(theirs.ids)) < profile.island_pairs:
+        return None
+    own = mine.joint.select(patch)
+    of_patch = _make_patch(mine, patch, submaps)._replace(at=np.arange(len(patch)))
+
+    def target_of(view: IslandView) -> tuple[Side, JointOf]:
+        side = _make_side(view, np.arange(len(view.ids)), range(len(view.seen_by)))
+        return side, lambda vote: combine_maps(own, view.joint, side, vote, profile)
+
+    def aliases() -> list[Placement]:
+        found = align(of_patch, *target_of(mine), profile)
+        return [each for each in found if not _is_identity(each, patch)]
+
+    found = find_closure(
+        of_patch,
+        *target_of(theirs),
+        profile,
+        ClosureTests(
+            profile.island_pairs,
+            profile.island_llr,
+            profile.context,
+            len(mine.ids) + len(theirs.ids),
+        ),
+        aliases,
+    )
+    if found is None:
+        return None
+    centroid = own.mean.mean(axis=0)
+    return found._replace(
+        pairs=tuple(pair._replace(first=int(patch[pair.first])) for pair in found.pairs),
+        motion=compose(found.motion, np.array([*-centroid, 0.0])),
+    )
+
+
+def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
+    """Find the first of these submaps, the newest first, whose landmarks are assigned to those of
+    submaps elsewhere.
+
+    The assignment needs SURE_AFTER pairs or more, one of them with a standard deviation above
+    `near`, the joint evidence of `assign_jointly`, and the share of a closure.
+    """
+    profile = view.profile
+    most_sd = NEARLY * profile.same
+    others = view.sees.copy()
+    others[submaps] = False
+    patch = join_indices(view.seen_by[k] for k in submaps)
+    target = np.flatnonzero(others.any(axis=0))
+    for k in reversed(submaps):
+        own = view.submaps[k].unnamed
+        for candidates in select_comparisons(view.joint, own, others, profile, most_sd):
+            found = assign_jointly(view.joint, *list_pairs(own, candidates), profile, most_sd)
+            sd = max((pair.sd for pair in found.pairs), default=0.0)
+            if len(found.pairs) < SURE_AFTER or sd <= profile.near:
+                continue
+            mean = found.joint.mean
+            places = mean[[pair.second for pair in found.pairs]]
+            share = matched_share(mean[patch], mean[target], places, profile)
+            if share < profile.share:
+                continue
+            return Closure(
+                pairs=found.pairs,
+                llr=found.llr,
+                absent=0,
+                rival_pairs=0,
+                rival_llr=0.0,
+                share=share,
+                sd=sd,
+                motion=np.zeros(3),
+                why="",
+            )
+    return None
+
+
+def _find_reachable(view: IslandView, patch: Indices) -> Indices:
+    """Find the landmarks with which those of the patch may coincide by the joint covariance; none
+    where all are certain.
+
+    An alignment with any other landmark is no rival: `grow_pairs` would reject its seeds.
+    """
+    others = np.setdiff1d(np.arange(len(view.ids)), patch)
+    one, two = list_pairs(patch, others)
+    at = evaluate_pairs(view.joint, one, two, view.profile)
+    fits = at.chi2 < view.profile.gate
+    if not (fits & (at.sd > view.profile.near)).any():
+        return others[:0]
+    return np.unique(two[fits])
+
+
+def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
+    """Make a side of landmarks of an island, with their observations by keyframes of some of its
+    submaps.
+    """
+    n = len(view.ids)
+    own = view.joint.covariance.reshape(n, 2, n, 2)[at, :, at]
+    sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
+    points = PointSet(view.joint.mean[at], np.minimum(sd, view.profile.tight))
+    place = np.full(n, -1)
+    place[at] = np.arange(len(at))
+    seen = pad_views(each for k in submaps for each in view.submaps[k].views)
+    return Side(at, points, at, np.arange(len(at)), renumber_views(seen, place))
+
+
+def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:
+    """Make the side of a patch, with parts of at least PART landmarks where possible: those of its
+    submaps from the last one backwards.
+    """
+    parts = []
+    for first in range(len(submaps)):
+        part = join_indices([])
+        for k in submaps[first:]:
+            part = np.union1d(part, view.seen_by[k])
+            if len(part) >= PART:
+                parts.append(np.searchsorted(patch, part))
+                break
+    return _make_side(view, patch, submaps)._replace(parts=tuple(parts))
+
+
+def _is_identity(found: Placement, patch: Indices) -> bool:
+    """Whether an alignment of a patch with its own map places a third of its landmarks on
+    themselves.
+    """
+    pairs = found.pairs
+    same = sum(two == int(patch[one]) for one, two in pairs)
+    return bool(3 * same >= len(pairs))

@@ -1,0 +1,259 @@
+"""Clustering: the association of one closed window's detections to landmarks.
+
+Track, smooth, associate again, merge, drop. The association uses no map and no other window, so
+that submaps stay independent. A window has one association, which all its particles share.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.config import AssociationSettings
+from team.estimation import elementary, elementwise
+from team.estimation.association.certainty import association_probabilities
+from team.estimation.association.gating import compute_mahalanobis, match_scan
+from team.estimation.association.scans import (
+    UNASSIGNED,
+    Scans,
+    initialise_landmark,
+    predict_landmarks,
+    relative_to,
+)
+from team.estimation.association.smoothing import SmoothedWindow, smooth_window
+from team.estimation.association.tracking import Slip, slip_covariance, track_window
+
+RARE = 0.05
+"""Significance level of the test for clutter."""
+
+
+@dataclass(frozen=True)
+class WindowAssociation:
+    """The landmark of each detection of a window.
+
+    landmark_of: by detection, in [0, L); UNASSIGNED for a detection that is left out. names: the
+    identity of each landmark, UNASSIGNED where it has none; sorted by name, then in the order of
+    their first detections. counts: the number of detections of each landmark. seen: the keyframes
+    that saw it. slips: of the odometry. clutter: for each detection that is left out, whether its
+    place was observed again without finding it.
+    """
+
+    landmark_of: Int64[np.ndarray, " N"]
+    names: Int64[np.ndarray, " L"]
+    counts: Int64[np.ndarray, " L"]
+    seen: Bool[np.ndarray, "L K"]
+    slips: tuple[Slip, ...]
+    clutter: Bool[np.ndarray, " N"]
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """The detections of a window, each of one landmark, before doubtful ones are left out.
+
+    landmark_of: by detection. names: of each landmark, UNASSIGNED where it has none. window: the
+    window smoothed under this association. slips: of the odometry; `scans` has larger covariances
+    of the motions that slipped.
+    """
+
+    scans: Scans
+    landmark_of: Int64[np.ndarray, " N"]
+    names: Int64[np.ndarray, " L"]
+    window: SmoothedWindow
+    slips: tuple[Slip, ...]
+
+
+def cluster_window(scans: Scans, settings: AssociationSettings) -> Clusters:
+    """Track, smooth, associate again and merge. Raises LinAlgError where the window has no
+    solution.
+    """
+    first = track_window(scans, settings)
+    scans = _inflate_slips(scans, first.slips)
+    landmark_of, names = first.landmark_of, np.array(first.names, np.int64)
+    window = smooth_window(scans, landmark_of, first.poses, first.landmarks)
+    landmark_of, names, points = _associate_again(scans, names, window, settings)
+    window = smooth_window(scans, landmark_of, window.poses, points)
+    landmark_of, names, points = _merge_split(scans, landmark_of, names, window, settings)
+    window = smooth_window(scans, landmark_of, window.poses, points)
+    return Clusters(scans, landmark_of, names, window, tuple(first.slips))
+
+
+def associate_window(scans: Scans, settings: AssociationSettings) -> WindowAssociation:
+    """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
+    found = cluster_window(scans, settings)
+    scans, names, window = found.scans, found.names, found.window
+    landmark_of = _drop_uncertain(scans, found.landmark_of, window, settings)
+    confirmed = _mark_confirmed(landmark_of, names, settings)
+    clutter = _mark_clutter(scans, landmark_of, confirmed, window, settings)
+    remaining = np.where(np.append(confirmed, False)[landmark_of], landmark_of, UNASSIGNED)
+    landmark_of, names, _ = _renumber(remaining, names, window.landmarks)
+    seen = _mark_seen(scans, landmark_of, len(names))
+    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
+    return WindowAssociation(landmark_of, names, counts, seen, found.slips, clutter)
+
+
+def _inflate_slips(scans: Scans, slips: list[Slip]) -> Scans:
+    """Enlarge the covariances of the motions that slipped."""
+    covariances = scans.motion_covariances.copy()
+    for slip in slips:
+        covariances[slip.keyframe] += slip_covariance(slip.by)
+    return replace(scans, motion_covariances=covariances)
+
+
+def _mark_seen(
+    scans: Scans, landmark_of: Int64[np.ndarray, " N"], landmarks: int
+) -> Bool[np.ndarray, "L K"]:
+    """Mark the keyframes that saw each landmark."""
+    seen = np.zeros((landmarks, len(scans.motions)), np.bool_)
+    used = landmark_of != UNASSIGNED
+    seen[landmark_of[used], scans.keyframes[used]] = True
+    return seen
+
+
+def _renumber(
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " before"],
+    points: Float[np.ndarray, "before 2"],
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Renumber the landmarks that have a detection: by name, then by their first detection."""
+    remaining, first = np.unique(landmark_of, return_index=True)
+    remaining, first = remaining[remaining != UNASSIGNED], first[remaining != UNASSIGNED]
+    unnamed = names[remaining] == UNASSIGNED
+    remaining = remaining[np.lexsort((np.where(unnamed, first, names[remaining]), unnamed))]
+    number = np.full(len(names) + 1, UNASSIGNED)  # the last one is that of UNASSIGNED
+    number[remaining] = np.arange(len(remaining))
+    return number[landmark_of], names[remaining], points[remaining]
+
+
+def _associate_again(
+    scans: Scans,
+    names: Int64[np.ndarray, " before"],
+    window: SmoothedWindow,
+    settings: AssociationSettings,
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Associate every scan again, from the smoothed path against the landmarks of the whole window.
+
+    A detection that matches none becomes a new landmark, also for the scans that follow.
+    """
+    k, n = len(window.poses), len(window.covariance)
+    most = n + 2 * len(scans.points)
+    P = np.zeros((most, most))
+    P[:n, :n] = window.covariance
+    known = list(names)
+    points = np.concatenate((window.landmarks, np.empty((len(scans.points), 2))))
+    landmark_of, bounds = np.full(len(scans.points), UNASSIGNED), scans.bounds
+    for i in range(k):
+        of_scan = slice(bounds[i], bounds[i + 1])
+        at, R, named = scans.points[of_scan], scans.covariances[of_scan], scans.names[of_scan]
+        if not len(at):
+            continue
+        pose = window.poses[i]
+        predicted = predict_landmarks(pose, points[: len(known)], P, 3 * i, 3 * k)
+        found = match_scan(at, R, named, predicted, np.array(known), settings)
+        for row in np.nonzero(found == UNASSIGNED)[0]:
+            end = 3 * k + 2 * len(known)
+            points[len(known)] = initialise_landmark(pose, at[row], R[row], P, 3 * i, end)
+            found[row] = len(known)
+            known.append(named[row])
+        landmark_of[of_scan] = found
+    return _renumber(landmark_of, np.array(known, np.int64), points[: len(known)])
+
+
+def _merge_split(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " before"],
+    window: SmoothedWindow,
+    settings: AssociationSettings,
+) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
+    """Merge unnamed landmarks at one place that no scan saw together, the closest pair first."""
+    count, first = len(names), 3 * len(window.poses)
+    seen = _mark_seen(scans, landmark_of, count)
+    together = (seen.astype(np.int64) @ seen.T.astype(np.int64)) > 0
+    P = window.covariance[first:, first:].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
+    own = P[np.arange(count), np.arange(count)]
+    S = (
+        own[:, None]
+        + own[None]
+        - P
+        - P.transpose(0, 1, 3, 2)
+        + elementary.squared(settings.slack_m) * np.eye(2)
+    )
+    apart = window.landmarks[:, None] - window.landmarks[None]
+    squared, _ = compute_mahalanobis(apart, S)
+    unnamed = names == UNASSIGNED
+    may = (squared < settings.gate) & ~together & unnamed[:, None] & unnamed[None]
+    rows, columns = np.nonzero(np.triu(may, 1))
+    root = np.arange(count)
+    for index in np.argsort(squared[rows, columns], kind="stable"):
+        a, b = root[rows[index]], root[columns[index]]
+        if a != b and not (seen[a] & seen[b]).any():
+            keep, gone = (a, b) if seen[a].sum() >= seen[b].sum() else (b, a)
+            seen[keep] |= seen[gone]
+            root[root == gone] = keep
+    return _renumber(root[landmark_of], names, window.landmarks)
+
+
+def _drop_uncertain(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    window: SmoothedWindow,
+    settings: AssociationSettings,
+) -> Int64[np.ndarray, " N"]:
+    """Leave out detections whose association is uncertain (`certain`), unless they have a name."""
+    sure = association_probabilities(scans, landmark_of, window, settings) >= settings.certain
+    return np.where(sure | (scans.names != UNASSIGNED), landmark_of, UNASSIGNED)
+
+
+def _mark_confirmed(
+    landmark_of: Int64[np.ndarray, " N"],
+    names: Int64[np.ndarray, " L"],
+    settings: AssociationSettings,
+) -> Bool[np.ndarray, " L"]:
+    """Mark the landmarks that are accepted: with a name, or detected often enough."""
+    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
+    return np.asarray((counts >= settings.least_seen) | (names != UNASSIGNED))
+
+
+def _mark_clutter(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    confirmed: Bool[np.ndarray, " L"],
+    window: SmoothedWindow,
+    settings: AssociationSettings,
+) -> Bool[np.ndarray, " N"]:
+    """Mark the detections of unconfirmed landmarks that real landmarks would have more of.
+
+    A keyframe observes a place if it saw something at least as far off and the place lies between
+    the outermost bearings of what it saw. A landmark with detection probability p that was observed
+    v times is clutter if so few detections have a probability below RARE.
+    """
+    clutter = np.zeros(len(landmark_of), np.bool_)
+    scan_of = scans.keyframes
+    first = np.unique(scan_of, return_index=True)[1]
+    if not len(first):
+        return clutter
+    bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
+    farthest = np.maximum.reduceat(elementwise.hypot(scans.points[:, 0], scans.points[:, 1]), first)
+    least, most = np.minimum.reduceat(bearings, first), np.maximum.reduceat(bearings, first)
+    poses = window.poses[scan_of[first]]
+    for landmark in np.nonzero(~confirmed)[0]:
+        members = np.nonzero(landmark_of == landmark)[0]
+        places = relative_to(poses, np.broadcast_to(window.landmarks[landmark], (len(poses), 2)))
+        bearing = elementwise.atan2(places[:, 1], places[:, 0])
+        inside = (least <= bearing) & (bearing <= most)
+        looks = np.count_nonzero(
+            inside & (elementwise.hypot(places[:, 0], places[:, 1]) <= farthest)
+        )
+        clutter[members] = _is_rare(len(members), max(int(looks), len(members)), settings)
+    return clutter
+
+
+def _is_rare(seen: int, looks: int, settings: AssociationSettings) -> bool:
+    """Whether P(at most `seen` of `looks` detections) < RARE with the detection probability."""
+    p = settings.detection_probability
+    term, total = math.prod([1.0 - p] * looks), 0.0
+    for c in range(seen + 1):
+        total += term
+        term *= (looks - c) / (c + 1.0) * p / (1.0 - p)
+    return total < RARE

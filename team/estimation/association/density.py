@@ -1,0 +1,99 @@
+"""The local density λ of landmarks, and the lengths that follow from their spacing.
+
+Landmarks observed by one keyframe are different ones, whatever else is uncertain. Their distances
+give the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976,
+J. Appl. Prob. 13). Where landmarks stand in groups it is far above the mean density of the map: a
+pair whose difference is as uncertain as the spacing within a group may be either of its members.
+The observations of one keyframe do not contain neighbours that hide each other: these are counted
+in the map, among the landmarks that several submaps have observed.
+
+The distances also bound the lengths of a profile: two landmarks that are farther apart than their
+neighbours are not one landmark that was split.
+"""
+
+from collections.abc import Iterable
+from functools import cached_property
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from team.association import AssociationProfile
+from team.estimation import elementary, elementwise
+
+CLOSE = 0.1
+"""Quantile of the landmarks' spacing that is used as the spacing within groups."""
+FEWEST = 10
+"""With fewer landmarks that have a neighbour the smallest spacing is used."""
+SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
+"""Upper bounds of a profile's lengths, in multiples of this spacing."""
+
+
+Spacings = Float[np.ndarray, "U U"]
+
+
+class LandmarkDensity:
+    """The spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
+
+    spacings: of each submap (`LocalMap.spacings`).
+    confirmed: positions of the landmarks that several submaps have observed [m].
+    """
+
+    def __init__(
+        self, spacings: Iterable[Spacings], confirmed: Float[np.ndarray, "n 2"] | None = None
+    ) -> None:
+        each = list(spacings)
+        self.landmarks = sum(len(away) for away in each)
+        nearest = np.concatenate(
+            [np.zeros(0), *(away.min(axis=1, initial=np.inf) for away in each)]
+        )
+        self.nearest: Float[np.ndarray, " m"] = np.sort(nearest[np.isfinite(nearest)])
+        self._each = each
+        self.confirmed = np.zeros((0, 2)) if confirmed is None else confirmed
+
+    @cached_property
+    def _distances(self) -> Float[np.ndarray, " n"]:
+        found = np.concatenate([np.zeros(0), *(away.ravel() for away in self._each)])
+        return np.sort(found[np.isfinite(found)])
+
+    def around_landmarks(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Density [1/m²] of further landmarks within each radius [m] of a landmark, as single
+        keyframes observed them.
+
+        (ordered pairs within R + 1) / (n π R²): half a pair is assumed beside those observed.
+        """
+        within = np.searchsorted(self._distances, radius) + 1.0
+        found: Float[np.ndarray, " k"] = within / (
+            max(self.landmarks, 1) * np.pi * elementary.squared(radius)
+        )
+        return found
+
+    @cached_property
+    def _in_map(self) -> Float[np.ndarray, " p"]:
+        one, two = np.triu_indices(len(self.confirmed), 1)
+        return np.sort(elementwise.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
+
+    def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Density [1/m²] of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
+
+        Two landmarks that are one but not merged yet are counted as neighbours, so the density is
+        too large, never too small, while association is incomplete.
+        """
+        pairs = np.searchsorted(self._in_map, radius, side="right")
+        found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (
+            max(len(self.confirmed), 1) * np.pi * elementary.squared(radius)
+        )
+        return found
+
+    def limit_lengths(self, profile: AssociationProfile) -> AssociationProfile:
+        """Return the profile with lengths small enough to distinguish neighbours."""
+        if not len(self.nearest):
+            return profile
+        share = CLOSE if len(self.nearest) >= FEWEST else 0.0
+        spacing = float(np.quantile(self.nearest, share))
+        return msgspec.structs.replace(
+            profile,
+            same=min(profile.same, SAME * spacing),
+            tight=min(profile.tight, TIGHT * spacing),
+            slack=min(profile.slack, SLACK * spacing),
+        )

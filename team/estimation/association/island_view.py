@@ -1,0 +1,355 @@
+"""The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
+
+Every submap adds its unnamed landmarks to the map as landmarks of their own; here they are merged.
+The steps of a tick, in their order: *tracking* against the last submaps of the same robot; *near*,
+landmarks of older submaps where the standard deviation of the difference is small, one submap after
+the other; *sweep*, landmarks that were split. Closures and merges of islands follow (`closure`).
+
+The landmarks of one submap are different ones. Those of the whole map are not, while some of them
+are unmerged: fragments of one landmark are candidates for each other, and the assignments to all of
+them at once do not agree on any. So the landmarks of a submap are assigned to those of one other
+submap at a time, together with landmarks that are certainly different from these.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.association import AssociationProfile
+from team.config import UNNAMED
+from team.estimation import elementwise
+from team.estimation.association.density import LandmarkDensity
+from team.estimation.association.gating import (
+    Indices,
+    Joint,
+    Pair,
+    gate_pairs,
+    list_pairs,
+)
+from team.estimation.association.joint_compatibility import (
+    MOST_ASSIGNED,
+    MergedPairs,
+    assign_jointly,
+    condition_on_pair,
+    grow_pairs,
+)
+from team.estimation.association.landmark_sets import Landmarks
+from team.estimation.association.member_log import LocalLandmark, MergeRecord
+from team.estimation.association.visibility import miss_probabilities
+from team.estimation.contribution import Observation, Stream
+
+COMPARED = 6
+"""Number of submaps that one submap is compared with: those with the most candidates."""
+REEXAMINED = 8
+"""Number of older submaps with undecided landmarks that a tick examines again: the newest half of
+them, and the others by turns.
+"""
+REEXAMINED_WITHIN = 10.0
+"""An older submap is examined again if its undecided landmarks lie within this many object radii of
+a landmark of the tick.
+"""
+
+
+class ViewedSubmap(NamedTuple):
+    """A submap, and the index of each of its landmarks in the view; −1 for a dropped landmark."""
+
+    observation: Observation
+    landmarks: Indices
+
+    @property
+    def known(self) -> Indices:
+        """Indices of its landmarks without the dropped ones."""
+        return self.landmarks[self.landmarks >= 0]
+
+    @property
+    def unnamed(self) -> Indices:
+        """Indices of its unnamed landmarks, ascending."""
+        found = self.landmarks[self.observation.ids >= UNNAMED]
+        places: Indices = np.unique(found[found >= 0])
+        return places
+
+    @property
+    def views(self) -> list[Indices]:
+        """Indices of the unnamed landmarks that each of its keyframes observed together."""
+        found = self.landmarks[self.observation.ids >= UNNAMED]
+        views = (found[each] for each in self.observation.unnamed.views)
+        return [view[view >= 0] for view in views]
+
+
+class IslandView:
+    """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
+
+    ids: the identity of each landmark. place_of: its index, by identity.
+    submaps: the submaps that are examined. seen_by: their landmarks.
+    sees: which landmarks each submap has, updated as landmarks are merged.
+    merged: which landmarks are merged into another one. ties: the merges, with their figures.
+    stamp_ns: the last end of a submap.
+    """
+
+    def __init__(
+        self,
+        ids: Sequence[int],
+        mean: Float[np.ndarray, "n 2"],
+        covariance: Float[np.ndarray, "m m"],
+        submaps: Sequence[ViewedSubmap],
+        forgotten: tuple[Int64[np.ndarray, "P 2"], Bool[np.ndarray, " P"]],
+        landmarks: Landmarks,
+        profile: AssociationProfile,
+        stamp_ns: int,
+    ) -> None:
+        """View the landmarks with this mean [m] and covariance [m²].
+
+        forgotten: pairs of landmarks that one submap has that is not among `submaps`, and which of
+            these pairs one keyframe observed.
+        """
+        count = len(ids)
+        self.ids = ids
+        self.place_of = {id_: at for at, id_ in enumerate(ids)}
+        self.submaps = submaps
+        self.seen_by = [each.known for each in submaps]
+        self.merged = np.zeros(count, np.bool_)
+        self.sees = np.zeros((len(submaps), count), np.bool_)
+        for row, places in zip(self.sees, self.seen_by, strict=True):
+            row[places] = True
+        self._merged_into = np.arange(count)
+        self._landmarks = landmarks
+        self.ties: list[tuple[int, MergeRecord]] = []
+        self.stamp_ns = stamp_ns
+        confirmed = mean[self.sees.sum(axis=0) > 1]
+        density = LandmarkDensity((each.observation.spacings for each in submaps), confirmed)
+        self.profile = density.limit_lengths(profile)
+        pairs, distinct = forgotten
+        self.joint = Joint(
+            mean,
+            covariance,
+            self._mark_apart(pairs[distinct]),
+            density,
+            miss_probabilities(mean, self.seen_by, self.profile.same),
+            self._mark_apart_in_window(pairs),
+        )
+
+    def _mark_apart(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
+        """Mark pairs of landmarks that can not be one: observed by one keyframe, named differently,
+        or declared to be two by an operator.
+        """
+        named = np.array(self.ids) < UNNAMED
+        apart = named[:, None] & named[None, :]
+        for submap in self.submaps:
+            known = submap.landmarks >= 0
+            places = submap.landmarks[known]
+            one, two = np.nonzero(submap.observation.distinct[known][:, known])
+            apart[places[one], places[two]] = True
+        for first, second, same in self._landmarks.verdicts:
+            here, there = self._find_place(first), self._find_place(second)
+            if not same and here is not None and there is not None:
+                apart[here, there] = apart[there, here] = True
+        np.fill_diagonal(apart, False)
+        one, two = forgotten.T
+        apart[one, two] = apart[two, one] = True
+        return apart
+
+    def _mark_apart_in_window(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
+        """Mark pairs of landmarks that one submap has."""
+        of = self.sees.astype(np.float32)
+        apart = np.asarray(of.T @ of > 0.0)  # exact: sums of ones
+        first, second = forgotten.T
+        apart[first, second] = apart[second, first] = True
+        np.fill_diagonal(apart, False)
+        return apart
+
+    def _find_place(self, member: LocalLandmark) -> int | None:
+        """Find the index of a member's landmark; None where the island does not have it."""
+        identity = self._landmarks.identity(member)
+        return None if identity is None else self.place_of.get(identity)
+
+    def find_latest(self, stream: Stream, last: int) -> list[int]:
+        """Find the stream's last `recent` submaps up to the sequence number `last`."""
+        first = last - self.profile.recent
+        return [
+            k
+            for k, each in enumerate(self.submaps)
+            if each.observation.stream == stream and first < each.observation.sequence <= last
+        ]
+
+    def record_merges(self, found: MergedPairs, kind: str) -> None:
+        """Record the pairs that a step (`kind`) merged, and the joint Gaussian given them."""
+        self.joint = found.joint
+        for pair in found.pairs:
+            tie = MergeRecord(
+                kind, self.ids[pair.second], pair.llr, pair.rival, pair.sd, self.stamp_ns
+            )
+            self.ties.append((self.ids[pair.first], tie))
+            self.merged[pair.first] = True
+            self._merged_into[self._merged_into == pair.first] = pair.second
+            self.sees[:, pair.second] |= self.sees[:, pair.first]
+            self.sees[:, pair.first] = False
+
+    def _resolve(self, places: Indices) -> Indices:
+        """Replace merged landmarks by those that they are merged into."""
+        return np.unique(self._merged_into[places])
+
+    def apply_verdicts(self) -> None:
+        """Merge the landmarks that an operator has declared to be one, verdict by verdict in their
+        order; one that would merge two landmarks that were declared to be two has no effect.
+        """
+        declared = [
+            (here, there, each.same)
+            for each in self._landmarks.verdicts
+            if (here := self._find_place(each.first)) is not None
+            and (there := self._find_place(each.second)) is not None
+        ]
+        into = self._merged_into
+        for first, second, same in declared:
+            one, two = int(into[first]), int(into[second])
+            apart = ({int(into[a]), int(into[b])} for a, b, one_ in declared if not one_)
+            if not same or one == two or {one, two} in apart:
+                continue
+            joint = condition_on_pair(self.joint, one, two, self.profile)
+            pair = Pair(one, two, np.inf, 0.0, -np.inf)
+            self.record_merges(MergedPairs((pair,), joint), "verdict")
+
+    def track(self, k: int) -> None:
+        """Merge landmarks of submap k with those of the same robot's submaps before it, then with
+        nearby ones of all other submaps.
+        """
+        of = self.submaps[k].observation
+        fresh = self.submaps[k].unnamed
+        before = self.find_latest(of.stream, of.sequence - 1)
+        self.grow("track", fresh, join_indices(self.seen_by[at] for at in before), np.inf)
+        others = np.setdiff1d(np.arange(len(self.ids)), self.seen_by[k])
+        self.compare(k)
+        self.grow("near", fresh, others, self.profile.near)
+
+    def grow(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
+        """Merge pairs of two lists of landmarks, growing from the most certain pair onwards."""
+        first, second = first[~self.merged[first]], second[~self.merged[second]]
+        if not len(first) or not len(second):
+            return
+        found = grow_pairs(
+            self.joint,
+            list_pairs(first, second),
+            self.profile,
+            most_sd=most_sd,
+            sure_sd=self.profile.near,
+        )
+        if found is not None and found.pairs:
+            self.record_merges(found, kind)
+
+    def compare(self, k: int) -> None:
+        """Merge pairs of submap k and one other submap after the other on which all likely joint
+        assignments of the two agree.
+        """
+        own = self._resolve(self.submaps[k].unnamed)
+        others = self.sees.copy()
+        others[k] = False
+        near = self.profile.near
+        for nearby in select_comparisons(self.joint, own, others, self.profile, near):
+            first, second = list_pairs(own[~self.merged[own]], self._resolve(nearby))
+            found = assign_jointly(self.joint, first, second, self.profile, near)
+            self.record_merges(found, "near")
+
+    def compare_again(self, fresh: Sequence[int], turn: int) -> None:
+        """Compare older submaps near the tick's ones (`fresh`) whose landmarks may be one with
+        others: a pair that was undecided may be decidable now.
+
+        turn: selects among many such submaps, other ones at each turn.
+        """
+        near = np.flatnonzero(self.sees[fresh].any(axis=0))
+        if not len(near):
+            return
+        mean = self.joint.mean
+        away = np.abs(mean[:, None] - mean[near][None]).max(axis=2).min(axis=1)
+        around = np.flatnonzero((away < REEXAMINED_WITHIN * self.profile.same) & ~self.merged)
+        undecided = np.zeros(len(self.ids), np.bool_)
+        undecided[find_undecided(self.joint, around, self.profile)] = True
+        found = np.setdiff1d(np.flatnonzero(self.sees[:, undecided].any(axis=1)), fresh)
+        for k in select_by_turns(found.tolist(), turn):
+            self.compare(k)
+
+    def sweep(self) -> None:
+        """Merge landmarks at one place, certain relative to each other and never seen together,
+        where all likely joint assignments of them agree.
+
+        Landmarks that were undecided when they were new are uncertain: one pair after the other,
+        each by itself the likeliest, can turn a robot by a spacing.
+        """
+        at = np.flatnonzero(~self.merged)
+        mean = self.joint.mean[at]
+        away = np.abs(mean[:, None] - mean[None]).max(axis=2)
+        later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
+        one, two = at[later], at[earlier]
+        x, y = (self.joint.mean[one] - self.joint.mean[two]).T
+        close = elementwise.hypot(x, y) < self.profile.same
+        one, two, _ = gate_pairs(
+            self.joint, one[close], two[close], self.profile, self.profile.tight
+        )
+        split = np.unique(one)
+        for begin in range(0, len(split), MOST_ASSIGNED):
+            own = np.isin(one, split[begin : begin + MOST_ASSIGNED]) & ~self.merged[two]
+            found = assign_jointly(self.joint, one[own], two[own], self.profile, self.profile.tight)
+            self.record_merges(found, "sweep")
+
+
+def join_indices(of: Iterable[Indices]) -> Int64[np.ndarray, " _"]:
+    """Join lists of indices to one, ascending."""
+    places: Int64[np.ndarray, " _"] = np.unique(np.concatenate([np.zeros(0, np.int64), *of]))
+    return places
+
+
+def select_comparisons(
+    joint: Joint,
+    own: Indices,
+    sees: Bool[np.ndarray, "K n"],
+    profile: AssociationProfile,
+    most_sd: float,
+) -> list[Indices]:
+    """Select, for each submap that is worth a comparison, the landmarks that `own` may be.
+
+    Beside the submap's landmarks these are the rivals that it lacks: landmarks that one of `own`
+    may be, and that are known to be none of those of the submap that it may be. Without them a
+    landmark that the submap missed would be associated with its neighbour.
+
+    sees: which landmarks each submap has. most_sd: pairs with a larger standard deviation of the
+        difference are left out.
+    """
+    others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
+    one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)
+    if not len(one):
+        return []
+    fits = np.zeros((len(own), len(joint.mean)), np.bool_)
+    fits[np.searchsorted(own, one), two] = True
+    common = fits.astype(np.float32) @ sees.T.astype(np.float32)  # exact: sums of ones
+    candidates = (common > 0.0).sum(axis=0)
+    best = sorted(np.flatnonzero(candidates).tolist(), key=lambda k: (-int(candidates[k]), -k))
+    found = []
+    for k in best[:COMPARED]:
+        theirs = np.flatnonzero(sees[k])
+        rivals = np.zeros(len(joint.mean), np.bool_)
+        for row in fits:
+            mine = theirs[row[theirs]]
+            if len(mine):
+                rivals |= row & joint.apart[:, mine].all(axis=1)
+        found.append(np.union1d(np.setdiff1d(theirs, own), np.flatnonzero(rivals)))
+    return found
+
+
+def find_undecided(joint: Joint, around: Indices, profile: AssociationProfile) -> Indices:
+    """Find those of some landmarks that may be one with another one of them."""
+    one, two = (around[each] for each in np.triu_indices(len(around), 1))
+    one, two, _ = gate_pairs(joint, one, two, profile, profile.near)
+    return np.unique(np.concatenate([one, two]))
+
+
+def select_by_turns(submaps: Sequence[int], turn: int) -> list[int]:
+    """Select the newest REEXAMINED / 2 of these submaps, and as many of the older ones, other ones
+    at each turn.
+    """
+    half = REEXAMINED // 2
+    if len(submaps) <= REEXAMINED:
+        return list(submaps)
+    older = submaps[:-half]
+    step = len(older) // half
+    chosen = {older[(turn + k * step) % len(older)] for k in range(half)}
+    return [*sorted(chosen), *submaps[-half:]]

@@ -1,0 +1,327 @@
+"""Joint compatibility: which pairs of landmarks of a joint Gaussian are merged together.
+
+A pair that is merged conditions the joint Gaussian, and the pairs after it are evaluated given it,
+so the sum of the log-likelihood ratios (`gating`) is the ratio of all of them together.
+
+`grow_pairs` merges the likeliest pair first, as long as it has no rival. `assign_jointly` is for
+pairs that have rivals: two neighbouring landmarks, each of which may be either of two mapped ones,
+are distinguished by each other, since their relative position is far more certain than their
+absolute ones. Landmarks are assigned one after the other, each to one of the mapped landmarks given
+the pairs before it, or to a new one. An assignment has the weight exp(Σ LLR) of its pairs, and a
+pair is accepted when the assignments that contain it outweigh all others. Joint compatibility
+branch and bound (Neira and Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with the most
+pairs; here it also has to be the only likely one.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from team.association import AssociationProfile
+from team.estimation import dense, elementary, elementwise
+from team.estimation.association.gating import (
+    Indices,
+    Joint,
+    Likelihoods,
+    Pair,
+    evaluate_pairs,
+    gate_pairs,
+    required_llr,
+)
+
+PREGATE = 4.0
+"""Multiple of the gate beyond which a pair is excluded for good."""
+SURE_AFTER = 3
+"""Number of pairs after which an alignment grows only by pairs of small standard deviation: others
+connect landmarks to neighbours that are one spacing off.
+"""
+MOST_ASSIGNED = 10
+"""Number of landmarks that are assigned together: those with the most certain candidates."""
+BEAM = 100
+"""Number of assignments that are continued from landmark to landmark."""
+HOPELESS = 12.0
+"""An assignment is dropped whose log weight is below the best one's by more than this [nat]."""
+
+
+class MergedPairs(NamedTuple):
+    """Pairs in the order in which they were merged, and the joint Gaussian given them."""
+
+    pairs: tuple[Pair, ...]
+    joint: Joint
+
+    @property
+    def llr(self) -> float:
+        """Log-likelihood ratio of all pairs together."""
+        return sum(pair.llr for pair in self.pairs)
+
+
+def condition_on_pair(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
+    """Condition the joint Gaussian on two landmarks being one; the second inherits the relations
+    of the first.
+
+    With H the difference of the two and S = HPHᵀ + s₀²I, mean −= PHᵀS⁻¹(Hm), P −= PHᵀS⁻¹HP.
+    """
+    n = len(joint.mean)
+    P = joint.covariance
+    one, two = slice(2 * first, 2 * first + 2), slice(2 * second, 2 * second + 2)
+    gain = P[:, one] - P[:, two]
+    S = gain[one] - gain[two] + elementary.squared(profile.slack) * np.eye(2)
+    weighted = dense.solve(S, gain.T)
+    difference = joint.mean[first] - joint.mean[second]
+    mean = joint.mean - (dense.product(weighted.T, difference)).reshape(n, 2)
+    in_window = joint.apart_in_window
+    return joint._replace(
+        mean=mean,
+        covariance=P - dense.product(gain, weighted),
+        apart=_inherit(joint.apart, first, second),
+        apart_in_window=in_window if in_window is None else _inherit(in_window, first, second),
+    )
+
+
+def _inherit(relation: Bool[np.ndarray, "n n"], first: int, second: int) -> Bool[np.ndarray, "n n"]:
+    """Give the second the entries of both in a symmetric relation."""
+    out = relation.copy()
+    out[second] = out[:, second] = relation[first] | relation[second]
+    return out
+
+
+def merge_in_order(
+    joint: Joint, pairs: Iterable[tuple[int, int]], profile: AssociationProfile
+) -> MergedPairs | None:
+    """Merge pairs in this order, each evaluated given those before it; None where one fails its
+    gate or is apart.
+    """
+    merged: list[Pair] = []
+    for one, two in pairs:
+        if joint.apart[one, two]:
+            return None
+        at = evaluate_pairs(joint, np.array([one]), np.array([two]), profile)
+        if at.chi2[0] > profile.gate:
+            return None
+        merged.append(Pair(one, two, float(at.llr[0]), float(at.sd[0]), -np.inf))
+        joint = condition_on_pair(joint, one, two, profile)
+    return MergedPairs(tuple(merged), joint)
+
+
+def grow_pairs(
+    joint: Joint,
+    candidates: tuple[Indices, Indices],
+    profile: AssociationProfile,
+    *,
+    seeds: Sequence[tuple[int, int]] = (),
+    most_sd: float = np.inf,
+    sure_sd: float = np.inf,
+) -> MergedPairs | None:
+    """Merge pairs one after the other, the likeliest first; None where a seed fails its gate.
+
+    candidates: two lists of landmarks, pair by pair; when a landmark is merged, its other pairs are
+        dropped.
+    seeds: pairs to begin with, whatever their rivals.
+    most_sd: pairs with a larger standard deviation are not merged; sure_sd: the same, once
+        SURE_AFTER pairs are merged.
+    """
+    begun = merge_in_order(joint, seeds, profile)
+    if begun is None:
+        return None
+    merged, joint = list(begun.pairs), begun.joint
+    first, second = candidates
+    gone = np.isin(first, [pair.first for pair in merged])
+    open_ = ~joint.apart[first, second] & ~gone
+    first, second = first[open_], second[open_]
+    near = evaluate_pairs(joint, first, second, profile).chi2 < PREGATE * profile.gate
+    first, second = first[near], second[near]
+    while len(first):
+        at = evaluate_pairs(joint, first, second, profile)
+        least = required_llr(joint, first, second, at.sd, profile)
+        limit = min(most_sd, sure_sd) if len(merged) >= SURE_AFTER else most_sd
+        fits = (at.chi2 < profile.gate) & (at.llr >= least) & (at.sd <= limit)
+        if not fits.any():
+            break
+        rival = _find_rivals(joint, first, second, at, profile)
+        clear = fits & (at.llr - rival >= profile.odds)
+        if not clear.any():
+            break
+        best = int(np.argmax(np.where(clear, at.llr, -np.inf)))
+        one, two = int(first[best]), int(second[best])
+        merged.append(Pair(one, two, float(at.llr[best]), float(at.sd[best]), float(rival[best])))
+        joint = condition_on_pair(joint, one, two, profile)
+        open_ = (first != one) & (second != one) & ~joint.apart[first, second]
+        first, second = first[open_], second[open_]
+    return MergedPairs(tuple(merged), joint)
+
+
+def _find_rivals(
+    joint: Joint, first: Indices, second: Indices, at: Likelihoods, profile: AssociationProfile
+) -> Float[np.ndarray, " k"]:
+    """Find the best LLR of each pair's rivals: another partner of its first or of its second
+    landmark.
+
+    A partner that may be the same object as this one (split in two, close to it, never observed
+    with it) is no rival: fragments of one landmark would block each other.
+    """
+    rival = np.full(len(first), -np.inf)
+    for mine, other in ((first, second), (second, first)):
+        each, against = _list_common(mine)
+        p, q = other[each], other[against]
+        x, y = (joint.mean[p] - joint.mean[q]).T
+        differ = (x * x + y * y >= elementary.squared(profile.same)) | joint.apart[p, q]
+        np.maximum.at(rival, each[differ], at.llr[against[differ]])
+    return rival
+
+
+def _list_common(landmarks: Indices) -> tuple[Indices, Indices]:
+    """List every two pairs that have a landmark in common, in both orders."""
+    order = np.argsort(landmarks, kind="stable")
+    ordered = landmarks[order]
+    begin = np.searchsorted(ordered, ordered, side="left")
+    count = np.searchsorted(ordered, ordered, side="right") - begin
+    each = np.repeat(np.arange(len(order)), count)
+    against = np.arange(len(each)) - np.repeat(np.cumsum(count) - count - begin, count)
+    two = each != against
+    return order[each[two]], order[against[two]]
+
+
+class _Assignment(NamedTuple):
+    """The pairs so far, their log weight, and the joint Gaussian given them."""
+
+    weight: float
+    pairs: tuple[Pair, ...]
+    joint: Joint
+
+
+def assign_jointly(
+    joint: Joint, first: Indices, second: Indices, profile: AssociationProfile, most_sd: float
+) -> MergedPairs:
+    """Merge the pairs on which nearly all of the weight of joint assignments agrees.
+
+    A pair needs log odds of `odds` against all assignments without it. Where the standard deviation
+    of one of these pairs exceeds `tight`, all of them together need a log-likelihood ratio of
+    `llr_loose`, as a single such pair does (`gating.required_llr`): a few uncertain landmarks fit
+    others by chance. Where it exceeds `tight` but for pairs of the assignment that are not
+    accepted, the assignment as a whole needs it.
+    most_sd: pairs with a larger standard deviation are left out.
+    """
+    first, second, sd = gate_pairs(joint, first, second, profile, most_sd)
+    if not len(first):
+        return MergedPairs((), joint)
+    order = _order_landmarks(first, sd)
+    assigned = np.isin(first, order)
+    involved = np.unique(np.concatenate((first[assigned], second[assigned])))
+    part = joint.select(involved)
+    place = {int(each): k for k, each in enumerate(involved)}
+    beam, lost = [_Assignment(0.0, (), part)], 0.0
+    for each in order:
+        own = place[each]
+        partners = [place[int(k)] for k in second[first == each]]
+        others = _select_partners(part, own, partners, profile)
+        longer = [more for one in beam for more in _extend(one, own, others, profile, most_sd)]
+        longer.sort(key=lambda one: -one.weight)
+        best = longer[0].weight
+        lost += sum(float(elementwise.exp(one.weight - best)) for one in longer[BEAM:])
+        beam = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
+    pairs = []
+    for pair in _accept_agreed(part, beam, profile, lost):
+        own_pair = pair._replace(first=int(involved[pair.first]), second=int(involved[pair.second]))
+        joint = condition_on_pair(joint, own_pair.first, own_pair.second, profile)
+        pairs.append(own_pair)
+    return MergedPairs(tuple(pairs), joint)
+
+
+def _order_landmarks(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
+    """Order the landmarks for assignment: the one with the most certain pair first."""
+    surest: dict[int, float] = {}
+    for each, own in zip(first.tolist(), sd.tolist(), strict=True):
+        surest[each] = min(own, surest.get(each, np.inf))
+    return sorted(surest, key=lambda each: (surest[each], each))[:MOST_ASSIGNED]
+
+
+def _select_partners(
+    joint: Joint, first: int, others: list[int], profile: AssociationProfile
+) -> Indices:
+    """Select the partners of a landmark; of likely fragments of one landmark only the likeliest."""
+    at = evaluate_pairs(joint, np.full(len(others), first), np.array(others), profile)
+    distinct: list[int] = []
+    for k in np.argsort(-at.llr, kind="stable").tolist():
+        if not _find_fragments(joint, others[k], profile).intersection(distinct):
+            distinct.append(others[k])
+    return np.array(distinct, np.int64)
+
+
+def _extend(
+    one: _Assignment, first: int, others: Indices, profile: AssociationProfile, most_sd: float
+) -> list[_Assignment]:
+    """Extend an assignment by one landmark: as a new one, and as each partner that fits."""
+    found = [one]
+    others = others[~one.joint.apart[first, others]]
+    if not len(others):
+        return found
+    at = evaluate_pairs(one.joint, np.full(len(others), first), others, profile)
+    for k in np.flatnonzero((at.chi2 < profile.gate) & (at.sd <= most_sd)).tolist():
+        other, llr = int(others[k]), float(at.llr[k])
+        joint = condition_on_pair(one.joint, first, other, profile)
+        pair = Pair(first, other, llr, float(at.sd[k]), -np.inf)
+        found.append(_Assignment(one.weight + llr, (*one.pairs, pair), joint))
+    return found
+
+
+def _find_fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
+    """Find a landmark's likely fragments, itself included: two parts of one landmark are no
+    rivals.
+    """
+    n = len(joint.mean)
+    at = evaluate_pairs(joint, np.full(n, landmark), np.arange(n), profile)
+    near = elementwise.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
+    least = required_llr(joint, np.full(n, landmark), np.arange(n), np.zeros(n), profile)
+    one = (at.llr >= least) & near & ~joint.apart[landmark]
+    return {landmark, *np.flatnonzero(one).tolist()}
+
+
+def _accept_agreed(
+    part: Joint, beam: list[_Assignment], profile: AssociationProfile, lost: float
+) -> list[Pair]:
+    """Accept the pairs of the best assignment that the others contain as well, by weight.
+
+    part: the landmarks involved, before any pair is merged. lost: the weight of the dropped
+    assignments, relative to the best one's.
+    """
+    best = beam[0]
+    weights = elementwise.exp(np.array([one.weight - best.weight for one in beam]))
+    others = [{pair.first: pair.second for pair in one.pairs} for one in beam]
+    sure = []
+    for pair in best.pairs:
+        same = _find_fragments(best.joint, pair.second, profile)
+        having = np.array([each.get(pair.first, -1) in same for each in others])
+        against = float(weights[~having].sum()) + lost
+        odds = (
+            float(elementwise.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
+        )
+        if odds >= profile.odds:
+            sure.append(pair._replace(rival=pair.llr - odds))
+    alone = sure if len(sure) == len(best.pairs) else _evaluate_alone(part, sure, profile)
+    if _is_loose(sure, profile) and sum(pair.llr for pair in sure) < profile.llr_loose:
+        return []
+    if _is_loose(alone, profile) and best.weight < profile.llr_loose:
+        return []
+    return alone
+
+
+def _is_loose(pairs: list[Pair], profile: AssociationProfile) -> bool:
+    """Whether the difference of one of these pairs is uncertain."""
+    return any(pair.sd > profile.tight for pair in pairs)
+
+
+def _evaluate_alone(part: Joint, sure: list[Pair], profile: AssociationProfile) -> list[Pair]:
+    """Evaluate the sure pairs given each other alone; none where one fails its gate then.
+
+    In its assignment each was evaluated given all pairs before it, and its standard deviation may
+    be small only because of a pair that is not accepted.
+    """
+    found = merge_in_order(part, [(pair.first, pair.second) for pair in sure], profile)
+    if found is None:
+        return []
+    return [
+        alone._replace(rival=alone.llr - pair.llr + pair.rival)
+        for alone, pair in zip(found.pairs, sure, strict=True)
+    ]

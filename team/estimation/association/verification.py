@@ -1,0 +1,181 @@
+"""The tests of a closure, when it is proposed and while it is audited, and of a map's landmarks.
+
+A closure is accepted only if it passes every test of `find_failed_test`; else the first failed test
+is the reason for which it is deferred. An accepted closure is audited for some ticks by
+`overlap_share`, and undone where that falls below the bound of the profile.
+"""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from team.association import AssociationProfile
+from team.estimation import elementwise
+from team.estimation.association.gating import Indices, Pair, evaluate_pairs
+from team.estimation.association.island_view import IslandView
+
+WIDE = 3.0
+"""Radius around a closure's places that an audit considers, in spacings."""
+
+
+class Closure(NamedTuple):
+    """The best alignment of a patch with its figures.
+
+    why: the test that failed; empty: it is accepted.
+    llr: log-likelihood ratio of its pairs.
+    absent: number of landmarks that one side has where the other side observed and has none.
+    rival_pairs, rival_llr: pairs and evidence of the best other alignment.
+    share: share of the landmarks near the matched places that are matched, of the side with fewer.
+    sd: largest standard deviation [m] of a pair's difference when the pair was accepted.
+    motion: (x, y, θ) that maps the patch onto the target; of a patch of the same map zero.
+    """
+
+    pairs: tuple[Pair, ...]
+    llr: float
+    absent: int
+    rival_pairs: int
+    rival_llr: float
+    share: float
+    sd: float
+    motion: Float[np.ndarray, "3"]
+    why: str
+
+
+class ClosureTests(NamedTuple):
+    """Requirements of a closure.
+
+    pairs, llr: least number of pairs and least evidence. context: least number of landmarks outside
+    the matched place, relative to the pairs, of the `known` ones of both sides (islands only).
+    """
+
+    pairs: int
+    llr: float
+    context: float = 0.0
+    known: int = 0
+
+
+def find_failed_test(closure: Closure, profile: AssociationProfile, tests: ClosureTests) -> str:
+    """Find the first test that a closure fails, in words; empty if it passes all."""
+    pairs = len(closure.pairs)
+    evidence = closure.llr - profile.absent * closure.absent
+    if pairs < tests.pairs:
+        return f"pairs {pairs} < {tests.pairs}"
+    if evidence < tests.llr:
+        absent = f" ({closure.absent} landmarks are absent)" if closure.absent else ""
+        return f"evidence {evidence:.0f} < {tests.llr:g}{absent}"
+    if evidence - closure.rival_llr < profile.margin:
+        margin = evidence - closure.rival_llr
+        return f"margin {margin:.0f} < {profile.margin:g} to another alignment"
+    if evidence < profile.ratio * closure.rival_llr:
+        return (
+            f"ratio {evidence / closure.rival_llr:.2f} < {profile.ratio:g}: "
+            f"another alignment has {closure.rival_pairs} pairs"
+        )
+    if closure.share < profile.share:
+        return f"share {closure.share:.2f} < {profile.share:g} of what lies there is matched"
+    outside = tests.known - 2 * pairs
+    if tests.context and outside < tests.context * pairs:
+        return f"context {outside} < {tests.context * pairs:.0f} landmarks: nothing to tell it from"
+    return ""
+
+
+def matched_share(
+    one: Float[np.ndarray, "n 2"],
+    two: Float[np.ndarray, "m 2"],
+    places: Float[np.ndarray, "k 2"],
+    profile: AssociationProfile,
+) -> float:
+    """Matched places over the number of points near them, of the side with fewer.
+
+    A point is near if it is no farther from a matched place than the median distance between
+    neighbouring places.
+    """
+    if len(places) < 2:
+        return 0.0
+    radius = 0.5 * spacing(places, profile)
+    counts = [int((nearest_distance(side, places) <= radius).sum()) for side in (one, two)]
+    return len(places) / max(min(counts), 1)
+
+
+def overlap_share(
+    one: Float[np.ndarray, "n 2"],
+    two: Float[np.ndarray, "m 2"],
+    places: Float[np.ndarray, "k 2"],
+    profile: AssociationProfile,
+) -> float:
+    """Matched places over the number of points of the side with fewer, where both sides observed
+    the area.
+
+    one, two: all points of either side, the matched ones among them. The area is within WIDE
+        spacings of a matched place and within one spacing of a point of the other side: where two
+        robots have been at different places their maps differ in extent.
+    """
+    if len(places) < 2 or not len(one) or not len(two):
+        return 0.0
+    radius = spacing(places, profile)
+    counts = [
+        int(
+            (
+                (nearest_distance(a, places) <= WIDE * radius) & (nearest_distance(a, b) <= radius)
+            ).sum()
+        )
+        for a, b in ((one, two), (two, one))
+    ]
+    return len(places) / max(min(counts), 1)
+
+
+def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
+    """Twice the median distance [m] between neighbouring places, and at least twice `same`."""
+    away = elementwise.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    np.fill_diagonal(away, np.inf)
+    return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
+
+
+def nearest_distance(
+    points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, " n"]:
+    """Distance [m] from each point to the nearest one of `others`."""
+    away: Float[np.ndarray, " n"] = elementwise.hypot(
+        *(points[:, None] - others[None]).transpose(2, 0, 1)
+    ).min(axis=1)
+    return away
+
+
+def find_possible_duplicates(view: IslandView, ids: Collection[int]) -> dict[int, int]:
+    """Find the landmarks among these that may be one with another one of them; maps each to the
+    likeliest other one, which stays.
+
+    Two landmarks may be one where they are within the gate, and have the log-likelihood ratio
+    (`gating`) with which a pair without a rival is merged, or would not have it even at one place:
+    there the density of landmarks in the gate exceeds the evidence. The landmark with the most
+    certain position stays, by the area of its covariance's ellipse.
+    """
+    profile, joint = view.profile, view.joint
+    own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)
+    one, two = (own[each] for each in np.triu_indices(len(own), 1))
+    at = evaluate_pairs(joint, one, two, profile)
+    decidable = at.llr + 0.5 * at.chi2 >= profile.llr_tight
+    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~decidable)
+    maybe &= ~joint.apart[one, two]
+    llr: dict[int, dict[int, float]] = {}
+    for a, b, ratio in zip(
+        one[maybe].tolist(), two[maybe].tolist(), at.llr[maybe].tolist(), strict=True
+    ):
+        llr.setdefault(a, {})[b] = llr.setdefault(b, {})[a] = ratio
+    n = len(joint.mean)
+    xx, xy, _, yy = (
+        joint.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].reshape(n, 4).T
+    )
+    area = xx * yy - xy * xy
+    stays: set[int] = set()
+    out: dict[int, int] = {}
+    for each in sorted(llr, key=lambda k: (float(area[k]), view.ids[k])):
+        others = [other for other in llr[each] if other in stays]
+        if others:
+            likeliest = max(others, key=lambda other: (llr[each][other], -view.ids[other]))
+            out[view.ids[each]] = view.ids[likeliest]
+        else:
+            stays.add(each)
+    return out

@@ -1,0 +1,86 @@
+"""Negative evidence: landmarks of one side that the other side should have observed, and did not.
+
+The landmarks that one keyframe observed together span a polygon inside its field of view, since a
+field of view is convex. A landmark of the other side that lies in this polygon and is not matched
+should have been observed.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation import elementary, elementwise
+
+OVERLOOKED = 0.4
+"""Upper bound of the probability that a window which observes a landmark misses one beside it."""
+LEAST_OVERLOOKED = 0.1
+"""Lower bound of the same probability: some landmarks are visible from one side only."""
+
+Views = Int64[np.ndarray, "_ _"]
+"""For each keyframe the landmarks that it observed together; rows are padded with −1."""
+
+
+def pad_views(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
+    """Arrange lists of landmarks as the rows of one array."""
+    each = list(views)
+    out = np.full((len(each), max(map(len, each), default=0)), -1)
+    for row, view in zip(out, each, strict=True):
+        row[: len(view)] = view
+    return out
+
+
+def renumber_views(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
+    """Renumber the landmarks of the views; −1 leaves a landmark out, and a view with fewer than
+    three.
+    """
+    if not views.size:
+        return views
+    numbered = np.where(views >= 0, to[views], -1)
+    polygons: Views = numbered[(numbered >= 0).sum(axis=1) >= 3]
+    return polygons
+
+
+def mark_visible(
+    points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: Views
+) -> Bool[np.ndarray, " n"]:
+    """Mark the points in the convex hull of the landmarks of any one view, at their positions
+    `own`.
+
+    A point lies in a hull when the directions from it to the hull's points leave no gap of half a
+    turn.
+    """
+    inside = np.zeros(len(points), np.bool_)
+    if not len(points) or not views.size:
+        return inside
+    at = np.where((views >= 0)[..., None], own[views], np.nan)
+    low, high = np.fmin.reduce(at, axis=1), np.fmax.reduce(at, axis=1)
+    near = (points[:, None] >= low) & (points[:, None] <= high)
+    point, view = np.nonzero(near.all(axis=2))
+    if not len(point):
+        return inside
+    x, y = (at[view] - points[point, None]).transpose(2, 0, 1)
+    angle = np.sort(elementwise.atan2(y, x), axis=1)  # NaN, the padding, is last
+    last = np.fmax.reduce(angle, axis=1)
+    widest = np.fmax.reduce(angle[:, 1:] - angle[:, :-1], axis=1)
+    gap = np.fmax(widest, angle[:, 0] + 2.0 * np.pi - last)
+    inside[point[gap < np.pi]] = True
+    return inside
+
+
+def miss_probabilities(
+    points: Float[np.ndarray, "n 2"], seen_by: Sequence[Int64[np.ndarray, " _"]], radius: float
+) -> Float[np.ndarray, " n"]:
+    """Probability, for each landmark, that all windows that saw it missed another one beside it.
+
+    seen_by: the landmarks of each window. radius: windows saw the place that have a landmark within
+        it [m].
+    """
+    x, y = points.T
+    near = elementwise.hypot(x[:, None] - x, y[:, None] - y) < radius
+    seen = np.zeros((len(seen_by), len(points)), np.float32)
+    for row, places in zip(seen, seen_by, strict=True):
+        row[places] = 1.0
+    counts = (seen @ near.astype(np.float32) > 0.0).sum(axis=0)  # exact: sums of ones
+    chance = elementwise.exp(elementary.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
+    return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))

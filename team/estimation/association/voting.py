@@ -1,0 +1,276 @@
+"""Alignments of two sets of points from their shapes alone, by votes of pairs of points.
+
+Two points of one side at the distance of two points of the other propose a rigid motion (a Hough
+transform over SE(2)); motions that many pairs propose are refined by nearest neighbours. All places
+are searched: an alignment that is not proposed could not be counted as a rival.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from team.estimation import dense, elementary, elementwise
+
+MOST_BINS = 60
+"""Number of motions, those with the most votes, that are refined."""
+ANGLE_BIN = np.radians(6.0)
+"""Width of a bin of rotations [rad]; bins of translations are three tolerances wide."""
+REFINEMENTS = 4
+"""Number of steps of nearest neighbours."""
+MOST_HYPOTHESES = 100_000
+"""Number of pairs of baselines that vote: those of the longest baselines, which determine the
+heading best.
+"""
+MOST_OF_PART = 16
+"""Number of a part's motions that are refined on all points."""
+MOST_COUNTED = 4_000_000
+"""Number of cells up to which votes are counted cell by cell."""
+MOST_DISTANCES = 2_000_000
+"""Number of distances between points that are in memory at once."""
+
+
+class PointSet(NamedTuple):
+    """Points of one side [m], and the standard deviation [m] of each relative to its neighbours."""
+
+    mean: Float[np.ndarray, "n 2"]
+    sd: Float[np.ndarray, " n"]
+
+
+class Vote(NamedTuple):
+    """The motion b_from_a (x, y, θ) about the centroid of a's points, and the pairs it matches."""
+
+    motion: Float[np.ndarray, "3"]
+    first: Int64[np.ndarray, " k"]
+    second: Int64[np.ndarray, " k"]
+
+
+def propose_alignments(
+    a: PointSet,
+    b: PointSet,
+    tolerance: float,
+    longest: float,
+    parts: Sequence[Int64[np.ndarray, " _"]] = (),
+) -> list[Vote]:
+    """Propose distinct rigid motions of a onto b, in descending number of matched points.
+
+    tolerance: largest distance of matched points [m].
+    longest: largest distance [m] of two points that vote together, since maps are not rigid over
+        any distance.
+    parts: subsets of a that vote by themselves as well: where two maps share a small place far from
+        the centroid of a, the votes of all points scatter.
+    """
+    if len(a.mean) < 2 or len(b.mean) < 2:
+        return []
+    centre = a.mean.mean(axis=0)
+    motions = [_propose_motions(a.mean - centre, b.mean, tolerance, longest)]
+    for part in parts:
+        if not 2 <= len(part) < len(a.mean):
+            continue
+        own = PointSet(a.mean[part], a.sd[part])
+        middle = own.mean.mean(axis=0)
+        proposed = _propose_motions(own.mean - middle, b.mean, tolerance, longest)
+        found = _keep_distinct(_refine(own, b, middle, proposed, tolerance), len(part))[
+            :MOST_OF_PART
+        ]
+        if found:
+            moving = np.array([vote.motion for vote in found])
+            s, c = elementwise.sin_and_cos(moving[:, 2])
+            x, y = centre - middle
+            moving[:, :2] += np.column_stack([c * x - s * y, s * x + c * y])
+            motions.append(moving)
+    return _keep_distinct(_refine(a, b, centre, np.concatenate(motions), tolerance), len(a.mean))
+
+
+def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
+    """Drop the votes that are variants of one with more matched points; sort by that number,
+    descending.
+    """
+    found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
+    distinct: list[Vote] = []
+    paired = np.full((len(found), points), -1)
+    for vote in found:
+        same = (paired[: len(distinct), vote.first] == vote.second).sum(axis=1)
+        if (2 * same < len(vote.first)).all():
+            paired[len(distinct), vote.first] = vote.second
+            distinct.append(vote)
+    return distinct
+
+
+def _propose_motions(
+    a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"], tolerance: float, longest: float
+) -> Float[np.ndarray, "_ 3"]:
+    """Propose the motions of a's origin, its centroid, in the bins with the most votes."""
+    shortest = 4.0 * tolerance
+    i, j, length_a = _list_baselines(a, shortest, longest)
+    k, last, length_b = _list_baselines(b, shortest - 2.0 * tolerance, longest + 2.0 * tolerance)
+    order = np.argsort(length_b, kind="stable")
+    k, last, length_b = k[order], last[order], length_b[order]
+    begin = np.searchsorted(length_b, length_a - 1.4 * tolerance)
+    count = np.searchsorted(length_b, length_a + 1.4 * tolerance) - begin
+    if count.sum() > MOST_HYPOTHESES:
+        keep = np.argsort(-length_a, kind="stable")
+        keep = keep[np.cumsum(count[keep]) <= MOST_HYPOTHESES]
+        i, j, begin, count = i[keep], j[keep], begin[keep], count[keep]
+    of_a = np.repeat(np.arange(len(i)), count)
+    of_b = np.repeat(begin - np.concatenate([[0], np.cumsum(count)[:-1]]), count)
+    of_b = of_b + np.arange(len(of_a))
+    one, two = a[i[of_a]], a[j[of_a]]
+    span = two - one
+    heading = elementwise.atan2(span[:, 1], span[:, 0])
+    motions = []
+    for p, q in ((k[of_b], last[of_b]), (last[of_b], k[of_b])):
+        across = b[q] - b[p]
+        turn = elementwise.atan2(across[:, 1], across[:, 0]) - heading
+        s, c = elementwise.sin_and_cos(turn)
+        middle = 0.5 * (one + two)
+        rotated = np.column_stack(
+            [c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]]
+        )
+        motions.append(np.column_stack([0.5 * (b[p] + b[q]) - rotated, turn]))
+    return np.array(_find_peaks(np.concatenate(motions), 3.0 * tolerance)).reshape(-1, 3)
+
+
+def _list_baselines(
+    points: Float[np.ndarray, "n 2"], shortest: float, longest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """List the pairs of points with a distance in this interval, and their distances."""
+    i, j = np.triu_indices(len(points), 1)
+    length = elementwise.hypot(*(points[i] - points[j]).T)
+    chosen = (length >= shortest) & (length <= longest)
+    return i[chosen], j[chosen], length[chosen]
+
+
+def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndarray, "3"]]:
+    """Find the mean motion of each of the fullest cells, in two grids half a cell apart."""
+    peaks = []
+    turns = round(2.0 * np.pi / ANGLE_BIN)
+    for shift in (0.0, 0.5):
+        cells = np.floor(motions[:, :2] / cell + shift).astype(np.int64)
+        angle = np.floor(motions[:, 2] / ANGLE_BIN + shift).astype(np.int64) % turns
+        low = cells.min(axis=0, initial=0)
+        size = cells.max(axis=0, initial=0) - low + 1
+        code = ((cells[:, 0] - low[0]) * size[1] + cells[:, 1] - low[1]) * turns + angle
+        of, counts = _rank_codes(code, int(size[0] * size[1]) * turns)
+        fullest = np.argsort(-counts, kind="stable")[:MOST_BINS]
+        rank = np.full(len(counts), -1)
+        rank[fullest] = np.arange(len(fullest))
+        inside = rank[of] >= 0
+        at, some = rank[of[inside]], motions[inside]
+        weight = np.bincount(at, minlength=len(fullest))
+        x = np.bincount(at, some[:, 0], len(fullest)) / weight
+        y = np.bincount(at, some[:, 1], len(fullest)) / weight
+        cosine = np.bincount(at, elementwise.cos(some[:, 2]), len(fullest))
+        sine = np.bincount(at, elementwise.sin(some[:, 2]), len(fullest))
+        peaks += list(np.column_stack([x, y, elementwise.atan2(sine, cosine)]))
+    return peaks
+
+
+def _rank_codes(
+    codes: Int64[np.ndarray, " v"], beyond: int
+) -> tuple[Int64[np.ndarray, " v"], Int64[np.ndarray, " _"]]:
+    """Rank each code among the distinct ones, and count how often each of these occurs.
+
+    beyond: all codes are smaller. Codes of a small range are counted, which is faster than sorting.
+    """
+    if beyond > MOST_COUNTED:
+        _, of, counts = np.unique(codes, return_inverse=True, return_counts=True)
+        return of, counts
+    counts = np.bincount(codes, minlength=1)
+    rank = np.cumsum(counts > 0) - 1
+    return rank[codes], counts[counts > 0]
+
+
+def _refine(
+    a: PointSet,
+    b: PointSet,
+    centre: Float[np.ndarray, "2"],
+    motions: Float[np.ndarray, "B 3"],
+    tolerance: float,
+) -> list[Vote]:
+    """Refine the motions by nearest neighbours, with a tolerance that narrows to `tolerance`.
+
+    Motions that no two points confirm are left out.
+    """
+    most = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
+    return [
+        vote
+        for k in range(0, len(motions), most)
+        for vote in _refine_batch(a, b, centre, motions[k : k + most], tolerance)
+    ]
+
+
+def _refine_batch(
+    a: PointSet,
+    b: PointSet,
+    centre: Float[np.ndarray, "2"],
+    motions: Float[np.ndarray, "B 3"],
+    tolerance: float,
+) -> list[Vote]:
+    """Refine as `_refine` does, with all distances in memory at once."""
+    local = a.mean - centre
+    for step in range(REFINEMENTS):
+        reach = tolerance * (1.5 if step < 2 else 1.0)
+        to, agree = _find_neighbours(motions, local, b.mean, reach)
+        lasting = agree.sum(axis=1) >= 2
+        motions, to, agree = motions[lasting], to[lasting], agree[lasting]
+        if step < REFINEMENTS - 1 and len(motions):
+            weights = agree / (
+                elementary.squared(a.sd)
+                + elementary.squared(b.sd[to])
+                + elementary.squared(tolerance)
+            )
+            motions = _fit_motions(local, b.mean[to], weights)
+    return [
+        Vote(motion, np.flatnonzero(own), of[own])
+        for motion, of, own in zip(motions, to, agree, strict=True)
+    ]
+
+
+def _find_neighbours(
+    motions: Float[np.ndarray, "B 3"],
+    a: Float[np.ndarray, "n 2"],
+    b: Float[np.ndarray, "m 2"],
+    reach: float,
+) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
+    """Find for each point the nearest one of b, and whether the two are mutually nearest and within
+    reach.
+    """
+    s, c = elementwise.sin_and_cos(motions[:, 2:])
+    x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
+    y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
+    away = elementary.squared(x[:, :, None] - b[:, 0]) + elementary.squared(y[:, :, None] - b[:, 1])
+    to_b, to_a = away.argmin(axis=2), away.argmin(axis=1)
+    nearest = np.take_along_axis(away, to_b[:, :, None], axis=2)[:, :, 0]
+    mutual = np.take_along_axis(to_a, to_b, axis=1) == np.arange(len(a))
+    return to_b, mutual & (nearest < elementary.squared(reach))
+
+
+def _fit_motions(
+    a: Float[np.ndarray, "n 2"],
+    to: Float[np.ndarray, "B n 2"],
+    weights: Float[np.ndarray, "B n"],
+) -> Float[np.ndarray, "B 3"]:
+    """Minimise Σ w ‖to − R(θ) a − (x, y)‖² over (x, y, θ), for each of B sets of weights."""
+    share = weights / weights.sum(axis=1, keepdims=True)
+    from_, onto = dense.product(share, a), (share[:, :, None] * to).sum(axis=1)
+    p, q = a - from_[:, None], to - onto[:, None]
+    along = (share[:, :, None] * p * q).sum(axis=(1, 2))
+    across = (share * (p[:, :, 0] * q[:, :, 1] - p[:, :, 1] * q[:, :, 0])).sum(axis=1)
+    angle = elementwise.atan2(across, along)
+    s, c = elementwise.sin_and_cos(angle)
+    x = onto[:, 0] - c * from_[:, 0] + s * from_[:, 1]
+    y = onto[:, 1] - s * from_[:, 0] - c * from_[:, 1]
+    return np.column_stack([x, y, angle])
+
+
+def apply_motion(
+    motion: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Map points, given about the centroid, into the other side's frame."""
+    s, c = elementwise.sin_and_cos(motion[2])
+    placed: Float[np.ndarray, "n 2"] = (
+        dense.product(points, np.array([[c, s], [-s, c]])) + motion[:2]
+    )
+    return placed

@@ -1,1 +1,0 @@
-"""Which local landmarks of which submaps are one landmark: pure functions on arrays."""

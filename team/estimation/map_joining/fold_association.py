@@ -1,0 +1,283 @@
+"""Data association applied to the fold: merges landmarks, closures and islands in its graph.
+
+The decisions are those of `team.estimation.association`; here they are applied. Each step is a
+function of the fold alone, and the fold is a function of the set of submaps in its canonical order;
+so are the decisions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from team.estimation.association.closure import patch_step, search_island, search_other_island
+from team.estimation.association.island_view import IslandView, ViewedSubmap
+from team.estimation.association.joint_compatibility import MergedPairs
+from team.estimation.association.landmark_sets import (
+    OPEN,
+    Decision,
+    Landmarks,
+    Opened,
+    merge_sets,
+    name_sides,
+)
+from team.estimation.association.member_log import LocalLandmark, MergeRecord
+from team.estimation.association.verification import Closure
+from team.estimation.contribution import Contribution, Stream
+from team.estimation.geometry import inverse
+from team.estimation.map_joining.gauss_newton import (
+    UNSOLVABLE,
+    Island,
+    is_solvable,
+    iterated,
+    joint_marginal,
+    settled,
+)
+from team.estimation.map_joining.joining import Fold, merged_islands
+from team.estimation.map_joining.merging import Merge, placed
+from team.estimation.map_joining.minima import minimum
+from team.estimation.map_joining.submap_graph import tied
+
+
+def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
+    """Associate the landmarks of a tick's submaps; the fold is unchanged where none is unnamed."""
+    if not fold.landmarks.are_there:
+        return fold
+    fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
+    arrived: dict[Stream, list[Contribution]] = {}
+    for contribution in contributions:
+        arrived.setdefault(fold.home[contribution.stream], []).append(contribution)
+    for key in sorted(arrived):
+        fold = _track_island(fold, key, arrived[key])
+    last: dict[Stream, int] = {}
+    for each in contributions:
+        if len(each.local.unnamed.counts):
+            last[each.stream] = each.sequence
+    views = _IslandViews()
+    for stream in sorted(last):
+        fold = _close_loop(fold, stream, last[stream], views)
+    for stream in sorted(last):
+        for key in sorted(fold.islands):
+            if key in fold.islands and key != fold.home[stream]:
+                fold = _join_island(fold, stream, last[stream], key, views)
+    return fold
+
+
+def view_island(island: Island, landmarks: Landmarks) -> IslandView:
+    """View an island's landmarks as a joint Gaussian, in the order of their nodes."""
+    graph = island.graph
+    ordered = sorted(graph.landmarks.items(), key=lambda each: each[1])
+    nodes = np.array([node for _, node in ordered], np.int64)
+    place = np.full(len(graph.fixed) + 1, -1, np.int64)  # the last is that of a dropped landmark
+    place[nodes] = np.arange(len(nodes))
+    mean, covariance = joint_marginal(island, nodes.tolist())
+    return IslandView(
+        ids=[id_ for id_, _ in ordered],
+        mean=mean.reshape(-1, 2),
+        covariance=covariance,
+        submaps=[ViewedSubmap(each.observation, place[each.landmarks]) for each in graph.observed],
+        forgotten=(place[graph.memory.pairs], graph.memory.distinct),
+        landmarks=landmarks,
+        profile=island.settings.association,
+        stamp_ns=max((each.contribution.end_ns for each in graph.submaps), default=0),
+    )
+
+
+class _IslandViews:
+    """The views of the islands, each computed once while its island does not change."""
+
+    def __init__(self) -> None:
+        self._of: dict[Stream, tuple[Island, IslandView]] = {}
+
+    def view(self, fold: Fold, key: Stream) -> IslandView:
+        """View the island with this key."""
+        island = fold.islands[key]
+        known = self._of.get(key)
+        if known is None or known[0] is not island:
+            known = self._of[key] = island, view_island(island, fold.landmarks)
+        return known[1]
+
+
+def _track_island(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
+    """Track, compare and sweep the landmarks of the new submaps of one island."""
+    view = view_island(fold.islands[key], fold.landmarks)
+    order = {each.observation[:2]: k for k, each in enumerate(view.submaps)}
+    present = [
+        (k, each) for each in arrived if (k := order.get((each.stream, each.sequence))) is not None
+    ]
+    view.apply_verdicts()
+    for k, contribution in present:
+        if len(contribution.local.unnamed.counts):
+            view.track(k)
+    view.compare_again([k for k, _ in present], turn=fold.islands[key].graph.size)
+    view.sweep()
+    return _apply_merges(fold, key, view)
+
+
+def _apply_merges(fold: Fold, key: Stream, view: IslandView) -> Fold:
+    """Merge the nodes of the landmarks that a view has merged, and iterate once."""
+    if not view.ties:
+        return fold
+    landmarks, becomes = merge_sets(fold.landmarks, view.ties)
+    islands = dict(fold.islands)
+    for at, island in fold.islands.items():
+        if at != key and not any(id_ in becomes for id_ in island.graph.landmarks):
+            continue
+        graph, state = tied(island.graph, island.state, becomes)
+        islands[at] = iterated(replace(island, graph=graph, state=state))
+    return replace(fold, islands=islands, landmarks=landmarks)
+
+
+def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> Fold:
+    """Close a loop of the stream's last submaps inside their island, if there is one."""
+    key = fold.home[stream]
+    view = views.view(fold, key)
+    found = search_island(view, stream, last)
+    if found is None:
+        return fold
+    pairs = [(view.ids[pair.first], view.ids[pair.second]) for pair in found.pairs]
+    end = OPEN if last == fold.next_sequence(stream) - 1 else last
+    newer = ((stream, last - view.profile.recent + 1, end),)
+    decision = _decide(fold, view, found, pairs, "closure", (stream, stream))
+    fold = _record(fold, decision, pairs, newer, (stream, stream))
+    if decision.why:
+        return fold
+    view.record_merges(MergedPairs(found.pairs, view.joint), "closure")
+    fold = _apply_merges(fold, key, view)
+    fold = replace(fold, landmarks=fold.landmarks.add_decisions(decision))
+    island, iterations, change = settled(fold.islands[key])
+    islands = {**fold.islands, key: island}
+    fold = replace(fold, islands=islands, iterations=iterations, change=change)
+    return _merge_near(fold, key)
+
+
+def _join_island(
+    fold: Fold, stream: Stream, last: int, other_key: Stream, views: _IslandViews
+) -> Fold:
+    """Merge the stream's island with another one, if the stream's last submaps are found there."""
+    key = fold.home[stream]
+    mine, theirs = views.view(fold, key), views.view(fold, other_key)
+    found = search_other_island(mine, theirs, stream, last)
+    if found is None:
+        return fold
+    streams = sorted(fold.islands[key].graph.streams)
+    sides = streams[0], min(fold.islands[other_key].graph.streams)
+    pairs = [(mine.ids[pair.first], theirs.ids[pair.second]) for pair in found.pairs]
+    newer = tuple((each, 0, OPEN) for each in streams)
+    decision = _decide(fold, mine, found, pairs, "merge", sides)
+    fold = _record(fold, decision, pairs, newer, (stream, other_key))
+    if decision.why:
+        return fold
+    ties = [
+        (one, MergeRecord("merge", two, pair.llr, pair.rival, pair.sd, mine.stamp_ns))
+        for pair, (one, two) in zip(found.pairs, pairs, strict=True)
+    ]
+    return _merge_islands(fold, (key, other_key), ties, found.motion, decision)
+
+
+def _decide(
+    fold: Fold,
+    view: IslandView,
+    found: Closure,
+    pairs: Sequence[tuple[int, int]],
+    kind: str,
+    sides: tuple[Stream, Stream],
+) -> Decision:
+    """Decide on a closure: one that failed a test, or was undone before, is deferred ("waits")."""
+    why = found.why
+    if not why and fold.landmarks.was_undone(pairs):
+        why = "it was undone before"
+    return Decision(
+        stamp_ns=view.stamp_ns,
+        kind="waits" if why else kind,
+        about=name_sides(*sides),
+        pairs=len(found.pairs),
+        llr=found.llr,
+        rival_pairs=found.rival_pairs,
+        rival_llr=found.rival_llr,
+        share=found.share,
+        sd=found.sd,
+        why=why,
+        absent=found.absent,
+    )
+
+
+def _record(
+    fold: Fold,
+    decision: Decision,
+    pairs: Sequence[tuple[int, int]],
+    newer: tuple[tuple[Stream, int, int], ...],
+    between: tuple[Stream, Stream],
+) -> Fold:
+    """Record a deferred decision, or open an accepted one for audit and remove its deferred ones.
+
+    The pairs are recorded by their smallest members; pairs with a named landmark are left out.
+    """
+    waits = fold.landmarks.waits
+    if decision.why:
+        landmarks = replace(fold.landmarks, waits={**waits, between: decision})
+        return replace(fold, landmarks=landmarks)
+    of = fold.landmarks.present
+    members: tuple[tuple[LocalLandmark, LocalLandmark], ...] = tuple(
+        (of[one].first.name, of[two].first.name) for one, two in pairs if one in of and two in of
+    )
+    landmarks = replace(
+        fold.landmarks,
+        waits={at: each for at, each in waits.items() if each.about != decision.about},
+        opened=(*fold.landmarks.opened, Opened(decision, members, newer)),
+    )
+    return replace(fold, landmarks=landmarks)
+
+
+def _merge_near(fold: Fold, key: Stream) -> Fold:
+    """Merge the landmarks that a closure has brought close to each other: all against all."""
+    view = view_island(fold.islands[key], fold.landmarks)
+    everything = np.arange(len(view.ids))
+    view.grow("near", everything, everything, view.profile.near)
+    view.sweep()
+    return _apply_merges(fold, key, view)
+
+
+def _merge_islands(
+    fold: Fold,
+    keys: tuple[Stream, Stream],
+    ties: Sequence[tuple[int, MergeRecord]],
+    second_from_first: Float[np.ndarray, "3"],
+    decision: Decision,
+) -> Fold:
+    """Merge two islands to one, in the team's frame if one of them has it, else in that of the
+    smallest stream; search the streams that change their frame for closures.
+
+    The fold is unchanged where the merged island has no solution.
+    """
+    landmarks, becomes = merge_sets(fold.landmarks, ties)
+    renamed = {}
+    for key in keys:
+        island = fold.islands[key]
+        graph, state = tied(island.graph, island.state, becomes)
+        renamed[key] = replace(island, graph=graph, state=state)
+    stays, goes = sorted(keys, key=lambda at: (at != fold.main_key, min(renamed[at].graph.streams)))
+    place = second_from_first if stays == keys[1] else inverse(second_from_first)
+    both, waiting = placed(renamed[stays], renamed[goes], place, fold.waiting)
+    try:
+        best = minimum(both)
+    except UNSOLVABLE:
+        return fold
+    if not is_solvable(best.island):
+        return fold
+    words = (
+        f"{decision.pairs} landmarks that both show, log-likelihood ratio "
+        f"{decision.llr:.0f} against {decision.rival_llr:.0f}, share "
+        f"{decision.share:.2f}, {decision.absent} absent"
+    )
+    fold = replace(fold, landmarks=landmarks.add_decisions(decision))
+    streams = sorted(renamed[goes].graph.streams)
+    fold = merged_islands(fold, stays, goes, Merge(best, waiting, words))
+    fold = _merge_near(fold, stays)
+    views = _IslandViews()
+    step = patch_step(fold.islands[stays].settings.association)
+    for stream in streams:
+        for last in range(fold.next_sequence(stream) - 1, -1, -step):
+            fold = _close_loop(fold, stream, last, views)
+    return fold

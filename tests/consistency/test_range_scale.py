@@ -1,0 +1,76 @@
+"""The NEES of maps of sensors with a common scale error of their ranges, and of the scale.
+
+The mutants lack the state of an error, or evaluate the scale at measured ranges.
+"""
+
+import numpy as np
+
+from team.estimation.consistency import chi2_interval, nees
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.joining import JoinSettings
+from tests.estimation.map_joining.test_range_scale import (
+    COMMON,
+    LANDMARKS,
+    MARKER,
+    OWN,
+    SIGMA,
+    carts,
+    fold_of,
+)
+
+SEEDS = range(200)
+
+
+def scale_errors(seeds, *, joined_ranges, way=0.01):
+    """(estimate − truth)/sigma of each robot's scale."""
+    found = []
+    for seed in seeds:
+        submaps, starts, errors = carts(seed, robots=1, submaps=20, way=way)
+        options = JoinSettings(bias_sigma=SIGMA, joined_ranges=joined_ranges)
+        estimates = marginals.bias_estimates(fold_of(submaps, starts, options))
+        found += [(each.value - errors[each.stream[0]]) / each.sigma for each in estimates]
+    return np.array(found)
+
+
+def test_the_scale_of_ranges_is_unbiased_at_joined_ranges_and_at_the_measured_ones_it_is_not():
+    unbiased = scale_errors(SEEDS, joined_ranges=True)
+    low, high = chi2_interval(1, 0.999, len(unbiased))
+    assert low < np.mean(unbiased**2) < high
+    assert abs(np.mean(unbiased)) < 3.3 / np.sqrt(len(unbiased))
+    mutant = scale_errors(SEEDS[:50], joined_ranges=False)
+    assert abs(np.mean(mutant)) > 3.3 / np.sqrt(len(mutant))
+
+
+def test_a_scale_that_only_its_prior_determines_is_not_overconfident():
+    """Without odometry the scale of the map is undetermined; a sensitivity along the measured
+    bearings would determine it.
+    """
+    errors = scale_errors(range(300, 330), joined_ranges=True, way=1.0)
+    assert abs(np.mean(errors)) < 3.3 / np.sqrt(len(errors))
+    assert np.mean(errors**2) < chi2_interval(1, 0.999, len(errors))[1]
+
+
+def nees_of_maps(seeds, common_bias_sigma):
+    options = JoinSettings(
+        bias_sigma={"range_scale": 0.1 * OWN},
+        common_bias_sigma=common_bias_sigma,
+        joined_ranges=True,
+    )
+    total = 0.0
+    for seed in seeds:
+        submaps, starts, _ = carts(
+            seed, submaps=3, own=0.1 * OWN, common=COMMON, way=0.05, marker=MARKER
+        )
+        found = marginals.landmark_map(fold_of(submaps, starts, options))
+        total += nees((found.means - LANDMARKS).ravel(), found.covariance)
+    return total / len(seeds)
+
+
+def test_a_map_is_consistent_only_with_a_state_of_each_error_that_all_robots_share():
+    """Of the scale of all ranges, and of each landmark's marker, which reads too far for all."""
+    low, high = chi2_interval(10, 0.999, len(SEEDS))
+    states = {"range_scale": COMMON, "marker": MARKER}
+    assert low < nees_of_maps(SEEDS, states) / 10.0 < high
+    for missing in states:
+        less = {name: sigma for name, sigma in states.items() if name != missing}
+        assert nees_of_maps(SEEDS[:25], less) / 10.0 > 1.25

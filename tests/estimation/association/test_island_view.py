@@ -1,0 +1,131 @@
+"""The steps of a tick: which submaps are compared, and the sweep."""
+
+import numpy as np
+import pytest
+from jaxtyping import Bool, Float
+
+from team.association import AssociationProfile
+from team.config import UNNAMED
+from team.estimation.association.gating import Joint, list_pairs
+from team.estimation.association.island_view import (
+    REEXAMINED,
+    IslandView,
+    find_undecided,
+    select_by_turns,
+    select_comparisons,
+)
+from team.estimation.association.joint_compatibility import assign_jointly
+from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.fold_association import view_island
+from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, JoinSettings, Tick
+from team.estimation.submap import LocalMap, Unnamed
+
+OWN = 0.01
+PROFILE = AssociationProfile(slack=0.0, density=1.0)
+TWINS = np.array([(0.0, 0.0), (0.2, 0.0), (3.0, 1.0), (3.0, 1.2)])
+
+
+def _seen(submaps: list[list[int]], common: float) -> tuple[Joint, list[np.ndarray]]:
+    """The same twins as several submaps saw them, each with an error that its landmarks share and
+    each landmark with one of its own, of these standard deviations.
+    """
+    rng = np.random.default_rng(1)
+    owner = np.repeat(np.arange(len(submaps)), [len(each) for each in submaps])
+    together: Bool[np.ndarray, "n n"] = owner[:, None] == owner[None]
+    shared = common**2 * np.kron(together, np.eye(2))
+    covariance: Float[np.ndarray, "m m"] = OWN**2 * np.eye(2 * len(owner)) + shared
+    apart = together & ~np.eye(len(owner), dtype=np.bool_)
+    points = TWINS[[k for each in submaps for k in each]]
+    points = points + common * rng.normal(size=(len(submaps), 2))[owner]
+    points = points + OWN * rng.normal(size=points.shape)
+    return Joint(points, covariance, apart), [
+        np.flatnonzero(owner == k) for k in range(len(submaps))
+    ]
+
+
+def _rows(submaps: list[np.ndarray], joint: Joint) -> Bool[np.ndarray, "K n"]:
+    return np.array([np.isin(np.arange(len(joint.mean)), each) for each in submaps])
+
+
+def _pairs(joint: Joint, own: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int]]:
+    found = assign_jointly(joint, *list_pairs(own, candidates), PROFILE, 0.5)
+    return sorted((pair.first, pair.second) for pair in found.pairs)
+
+
+def test_unmerged_fragments_do_not_keep_a_submap_from_being_associated():
+    joint, (own, *others) = _seen([[0, 1, 2, 3]] * 5, common=0.15)
+    assert not _pairs(joint, own, np.concatenate(others))
+    found = set()
+    for candidates in select_comparisons(joint, own, _rows(others, joint), PROFILE, 0.5):
+        found |= {(one, two % 4) for one, two in _pairs(joint, own, candidates)}
+    assert found == {(k, k) for k in range(4)}
+
+
+def test_a_landmark_that_the_other_submap_missed_is_a_rival_of_those_that_it_has():
+    joint, (own, other, whole) = _seen([[1], [0], [0, 1]], common=0.04)
+    fits = select_comparisons(joint, own, _rows([other], joint), PROFILE, 0.5)
+    assert [each.tolist() for each in fits] == [other.tolist()]
+    apart = joint.apart.copy()
+    apart[other, whole[1]] = apart[whole[1], other] = True  # one keyframe saw the two together
+    with_rival = select_comparisons(
+        joint._replace(apart=apart), own, _rows([other], joint), PROFILE, 0.5
+    )
+    assert [each.tolist() for each in with_rival] == [other.tolist()]
+    both = select_comparisons(
+        joint._replace(apart=apart), own, _rows([other, whole], joint), PROFILE, 0.5
+    )
+    assert [other[0], whole[1]] in [each.tolist() for each in both]
+
+
+def test_landmarks_that_may_be_one_are_undecided():
+    joint, (one, two) = _seen([[0, 1], [0, 2]], common=0.15)
+    assert find_undecided(joint, np.arange(4), PROFILE).tolist() == [one[0], one[1], two[0]]
+
+
+def test_every_older_submap_is_examined_again_by_turns():
+    submaps = list(range(100, 130))
+    seen = [select_by_turns(submaps, turn) for turn in range(len(submaps))]
+    assert set().union(*seen) == set(submaps)
+    assert all(len(each) == len(set(each)) <= REEXAMINED for each in seen)
+    assert select_by_turns(submaps[:REEXAMINED], 3) == submaps[:REEXAMINED]
+
+
+KNOWN = np.array([[0.0, 0.0], [0.0, 0.3], [0.0, 0.52]])
+"""Three landmarks of the map; a robot sees the first two again."""
+AWAY = np.array([20.0, 0.0])
+LOCAL_SD, SHIFT_SD = 0.01, 0.06
+
+
+def view_of_a_group_shifted_by(shift: float) -> IslandView:
+    """A map of three landmarks and a group of two, whose place has a common error."""
+    places = np.concatenate([KNOWN, KNOWN[:2] + AWAY])
+    count = len(places)
+    local = LocalMap(
+        (UNNAMED + np.arange(count)).astype(np.uint32),
+        np.concatenate([np.zeros(3), places.ravel()]),
+        np.diag(np.full(3 + 2 * count, LOCAL_SD**2)),
+        unnamed=Unnamed(np.full(count, 5, np.uint32), np.zeros((count, 0), np.bool_)),
+    )
+    fold = taken(EMPTY_FOLD, Tick([Contribution("r1", 1, 0, 10**10, local)]), JoinSettings())
+    view = view_island(fold.main, fold.landmarks)
+    order = np.argsort(view.joint.mean[:, 0] * 10.0 + view.joint.mean[:, 1])
+    mean = view.joint.mean.copy()
+    mean[order[3:]] += [0.0, shift] - AWAY
+    covariance = LOCAL_SD**2 * np.eye(2 * count)
+    group = np.array([2 * k + axis for k in order[3:].tolist() for axis in (0, 1)])
+    covariance[np.ix_(group, group)] += SHIFT_SD**2 * np.kron(np.ones((2, 2)), np.eye(2))
+    view.joint = view.joint._replace(
+        mean=mean,
+        covariance=covariance,
+        apart=np.zeros((count, count), np.bool_),
+        apart_in_window=None,
+        density=None,
+    )
+    return view
+
+
+@pytest.mark.parametrize(("shift", "merged"), [(0.0, 2), (0.22, 0)])
+def test_a_group_that_fits_at_two_places_is_not_swept(shift: float, merged: int) -> None:
+    view = view_of_a_group_shifted_by(shift)
+    view.sweep()
+    assert len(view.ties) == merged
