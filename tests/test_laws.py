@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sim.publisher.node
-import team.robot.pace
+import team.robot.node
 from central.config import CentralConfig
 from central.node import CentralNode
 from sim.datasets.utias_writer import write_utias
@@ -49,8 +49,8 @@ def scarce(monkeypatch):
     """Little credit and small portions, so that everybody waits for somebody."""
     monkeypatch.setattr(sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
     monkeypatch.setattr(sim.publisher.node, "BATCH", 5)
-    monkeypatch.setattr(team.robot.pace, "PROGRESS_MEASUREMENTS", 4)
-    monkeypatch.setattr(team.robot.pace, "CREDIT_SUBMAPS", 1)
+    monkeypatch.setattr(team.robot.node, "PROGRESS_MEASUREMENTS", 4)
+    monkeypatch.setattr(team.robot.node, "CREDIT_SUBMAPS", 1)
 
 
 # Law 1.

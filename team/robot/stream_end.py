@@ -1,6 +1,7 @@
 """Where a robot's stream ends, as its world, its driver or an operator says."""
 
 from team.stream.inbox import Inbox
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.newer import later_end, later_head
 
@@ -62,6 +63,17 @@ class EndOfStream:
             return f"how far {message.robot} is"
         ended = message.state == "ended"
         return self._inbox.contradicts(_end_at(message), self._robot) if ended else None
+
+    def receive(self, message: m.Liveliness | m.End | m.TeamEnd) -> None:
+        """Take the driver's presence, a world's end or an order to end."""
+        match message:
+            case m.Liveliness():
+                if message.node == ch.source_node(self._robot):
+                    self.driver_is_there = message.alive
+            case m.End():
+                self.take(message)
+            case m.TeamEnd():
+                self.is_ordered = True
 
     def take(self, end: m.End) -> None:
         """Take a world's end; one that does not name this robot ends its stream where it is."""

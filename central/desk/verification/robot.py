@@ -8,11 +8,9 @@ from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.robot.front_end import BoundedEstimator
 from team.robot.ledger import OnDisposition, no_listener
-from team.robot.node import RobotNode
-from team.robot.poses import RunningPoses, outside_team_frame
-from team.robot.statements import MessageWriter
+from team.robot.node import robot_node
+from team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -38,13 +36,14 @@ class RecordedPoses(RunningPoses):
         self._recorded = recorded
         self._withdrawn = withdrawn
 
-    def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
+    def at(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
         """The poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
-        for prior in self._recorded.get((writer.incarnation, stamp_ns), ()):
-            here = prior if prior is not None and prior.incarnation == writer.incarnation else None
-            out += self.posed(stamp_ns, here, front, writer)
-        if out and (writer.incarnation, stamp_ns) in self._withdrawn:
+        incarnation = estimator.writer.incarnation
+        for prior in self._recorded.get((incarnation, stamp_ns), ()):
+            here = prior if prior is not None and prior.incarnation == incarnation else None
+            out += self.posed(stamp_ns, here, estimator)
+        if out and (incarnation, stamp_ns) in self._withdrawn:
             out.append(outside_team_frame(out[0]))
         return out
 
@@ -63,7 +62,7 @@ class RecomputedRobot:
         withdrawn: WithdrawnAt = (),
         on_disposition: OnDisposition = no_listener,
     ) -> None:
-        self.node = RobotNode(
+        self.node = robot_node(
             config,
             announced=digest,
             poses=RecordedPoses(config, recorded, withdrawn),
@@ -86,7 +85,7 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
     def new() -> RecomputedRobot:
         robot = RecomputedRobot(config, digest, named, withdrawn)
-        if log.known_map is not None:
+        if log.known_map is not None and ch.KNOWN_MAP in robot.node.listens:
             robot.given(log.known_map)
         return robot
 
@@ -230,7 +229,7 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     config, digest = log.robot_config(robot)
     disposition_of: dict[int, str] = {}
     node = RecomputedRobot(config, digest, {}, on_disposition=disposition_of.__setitem__)
-    if log.known_map is not None:
+    if log.known_map is not None and ch.KNOWN_MAP in node.node.listens:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = log.measurements.get((robot, incarnation))

@@ -34,7 +34,8 @@ LONGEST_NS = 2**62
 class HybridSlam:
     """One incarnation of a robot's stream, from its beginning or from its last submap.
 
-    sequence: of the open window.
+    sequence: of the open window. last_measurement: the newest measurement that belongs to it, even
+    if it was rejected; the caller sets it.
     """
 
     def __init__(self, config: RobotConfig, incarnation: int) -> None:
@@ -52,17 +53,13 @@ class HybridSlam:
         self._start_ns: int | None = None
         self._begin_window(0, 0)
 
-    def resume(self, closed: ClosedWindow) -> None:
-        """Continue behind an earlier submap: the next window begins where that one ended."""
-        self._start_ns = closed.end_ns
-        self._segmenter.begin(closed.end_ns)
-        self._begin_window(closed.sequence + 1, closed.last_measurement + 1)
+    def resume(self, sequence: int, last_measurement: int, end_ns: int) -> None:
+        """Continue after an earlier submap: the next window begins where that one ended."""
+        self._start_ns = end_ns
+        self._segmenter.begin(end_ns)
+        self._begin_window(sequence + 1, last_measurement + 1)
 
     # A measurement comes in.
-
-    def consumed(self, measurement: int) -> None:
-        """Note that the measurement belongs to the open window, even if it was rejected."""
-        self._last_measurement = measurement
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""
@@ -134,7 +131,7 @@ class HybridSlam:
         closed = ClosedWindow(
             sequence=self.sequence,
             first_measurement=self._first_measurement,
-            last_measurement=self._last_measurement,
+            last_measurement=self.last_measurement,
             start_ns=start_ns,
             end_ns=end_ns,
             local=submap if is_sensible and submap is not None else self._moved_alone(),
@@ -157,12 +154,12 @@ class HybridSlam:
         self._innovation = self._innovation.plus(closed.innovation)
         self._start_ns = end_ns
         self._segmenter.begin(end_ns)
-        self._begin_window(self.sequence + 1, self._last_measurement + 1)
+        self._begin_window(self.sequence + 1, self.last_measurement + 1)
         return closed
 
     def _begin_window(self, sequence: int, first_measurement: int) -> None:
         self.sequence = sequence
-        self._first_measurement, self._last_measurement = first_measurement, first_measurement - 1
+        self._first_measurement, self.last_measurement = first_measurement, first_measurement - 1
         self._driven_m = 0.0
         self._open = OpenWindow(self._config, self._incarnation, sequence)
 
