@@ -81,14 +81,14 @@ class RobotNode:
         if announced is not None:
             self._announcement = msgspec.structs.replace(self._announcement, digest=announced)
         self.inbox = Inbox()
-        self.stream_end = EndOfStream(config.id, self.inbox)
+        self._stream_end = EndOfStream(config.id, self.inbox)
         digest = self._announcement.digest
         self.mapper = self.makes(
             config, exchange, digest, poses, replaced, on_window, on_disposition
         )
         self.out, self.warnings = self.mapper.out, self.mapper.warnings
         self._incarnation = self.consumed = 0
-        self.steps_before = self.steps = 0
+        self._steps_before = self._steps = 0
         self._acknowledged = self._unreported = 0
         self._centre_alive: bool | None = None
         self.done = self._has_sent_done = False
@@ -130,7 +130,7 @@ class RobotNode:
 
     def request(self) -> m.MeasurementsRequest | None:
         """The measurements that are missing and must be asked for at their source."""
-        missing = self.stream_end.missing()
+        missing = self._stream_end.missing()
         if missing is None:
             return None
         incarnation, first, last = missing
@@ -144,7 +144,15 @@ class RobotNode:
 
     def status(self) -> m.Status:
         """The robot's status, for people."""
-        return status_of(self)
+        measurements = self.next_measurement
+        return status_of(
+            self.mapper,
+            "done" if self.done else "mapping" if measurements else "waiting",
+            self._steps_before + self._steps,
+            measurements,
+            self.withheld,
+            waits_for_driver=self._stream_end.waits_for_driver,
+        )
 
     def begin(self) -> list[Outgoing]:
         """The first messages of the node: its configuration."""
@@ -199,7 +207,7 @@ class RobotNode:
                         "set is of another run; start the centre again with a new --set FILE"
                     )
             case m.End() | m.StreamHead():
-                return self.stream_end.refusal(message)
+                return self._stream_end.refusal(message)
             case _:
                 pass
         return None
@@ -220,7 +228,7 @@ class RobotNode:
         """Take the source's own answer that an incarnation ends so: what came behind it was not
         the source's.
         """
-        self.stream_end.at_source = incarnation, measurements
+        self._stream_end.at_source = incarnation, measurements
 
     # Receive.
 
@@ -248,9 +256,9 @@ class RobotNode:
             case m.Liveliness() if message.node == "central":
                 self._centre_alive = message.alive
             case m.Liveliness() | m.End() | m.TeamEnd():
-                self.stream_end.receive(message)
+                self._stream_end.receive(message)
             case m.StreamHead():
-                head = self.stream_end.take_head(message)
+                head = self._stream_end.take_head(message)
                 if head.state != "open":
                     self.out.append(Outgoing(ch.ROBOT_HEAD, self.robot, head))
                 if self.consumed:
@@ -284,8 +292,8 @@ class RobotNode:
         """Consume the measurements whose turn has come, while the centre gives credit."""
         while not self.is_held and (measurement := self.inbox.take_next()) is not None:
             self._consume(measurement)
-        self.stream_end.end_without_driver()
-        if not self.done and self.stream_end.reached and not self.is_held:
+        self._stream_end.end_without_driver()
+        if not self.done and self._stream_end.reached and not self.is_held:
             self._finish()
 
     @property
@@ -300,7 +308,7 @@ class RobotNode:
             self.mapper.begin(measurement)
             self._note_incarnation(measurement.incarnation)
         self.consumed = measurement.number + 1
-        self.steps += isinstance(measurement, m.AnyOdometry)
+        self._steps += isinstance(measurement, m.AnyOdometry)
         if self.mapper.take(measurement):
             self.report_progress()
         if isinstance(measurement, m.Sightings):
@@ -357,7 +365,7 @@ class RobotNode:
 
     def _note_incarnation(self, incarnation: int) -> None:
         self._incarnation, self.consumed, self._acknowledged = incarnation, 0, 0
-        self.steps_before, self.steps = self.steps_before + self.steps, 0
+        self._steps_before, self._steps = self._steps_before + self._steps, 0
 
     def _leave_incarnation(self) -> None:
         """Close the current incarnation, if there is one, because a later one begins."""
@@ -393,13 +401,13 @@ class RobotNode:
 
     def statement(self) -> m.Done:
         """The account of the incarnation, without what was consumed behind its end."""
-        last = self.stream_end.last_of(self._incarnation)
+        last = self._stream_end.last_of(self._incarnation)
         return m.Done(
             stamp_ns=self.mapper.now_ns,
             robot=self.robot,
             incarnation=self._incarnation,
             measurements=self.consumed if last is None else min(self.consumed, last),
-            steps=self.steps,
+            steps=self._steps,
             submaps=self.submaps,
             ledger=self.ledger.entries(),
         )
