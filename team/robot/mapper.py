@@ -7,6 +7,7 @@ Law 1 lives here: what is published for fusion depends on the robot's own measur
 team's map comes in as a prior and goes out as `team/pose`, and nowhere else.
 """
 
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -24,7 +25,7 @@ from team.estimation.plausible import start_beyond
 from team.estimation.scans import Scan, sensible
 from team.estimation.submap import LocalMap
 from team.rejection import UNMEASURED, Rejection
-from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition, no_listener
+from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
 from team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thinned
 from team.robot.poses import RunningPoses
 from team.robot.statements import MessageWriter
@@ -37,6 +38,9 @@ from team.wire.bus import Outgoing
 MOST_SET_ASIDE = 8
 """After so many measurements of one window were set aside, the window is not computed again for
 further ones."""
+
+MOST_WARNINGS = 64
+"""Number of the newest warnings that are kept."""
 
 Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWindow]
 """What is sent instead of a closed window, given the team's map and the submaps before it."""
@@ -63,17 +67,17 @@ class Mapper:
         poses: RunningPoses | None = None,
         replaced: Replaced | None = None,
         on_window: Callable[[ClosedWindow], None] = lambda _: None,
-        on_disposition: OnDisposition = no_listener,
+        on_disposition: OnDisposition | None = None,
     ) -> None:
         self.config = config
-        self.warnings: list[str] = []
+        self.warnings: deque[str] = deque(maxlen=MOST_WARNINGS)
         self.out: list[Outgoing] = []
         self.poses = RunningPoses(config, self.warnings) if poses is None else poses
         self.submaps = Submaps(config.id, exchange)
         self._digest = digest
         self._replaced, self._on_window = replaced, on_window
         self._on_disposition = on_disposition
-        self._offset_s = config.clock_offset_s
+        self._offset_ns = round(config.clock_offset_s * 1e9)
         self._period_ns = round(config.pose_s * 1e9)
         self.gated = 0
         self.now_ns = self.passed_ns = 0
@@ -144,21 +148,19 @@ class Mapper:
     def take(self, measurement: m.Measurement) -> bool:
         """Take the next measurement; returns whether it closed a window."""
         self._taking = measurement
+        # A scan comes before the odometry that ends at its stamp, and that may end a window.
         is_odometry = isinstance(measurement, m.AnyOdometry)
-        stamp_ns = translate.team_time_of(measurement, self._offset_s)
-        is_near = self._is_near(stamp_ns)
+        stamp_ns = measurement.stamp_ns + (self._offset_ns if is_odometry else 0)
+        # Where its clock has leapt too far, no receiver takes a submap with such a stamp.
+        is_near = another_time(stamp_ns, self._began_ns) is None
         if is_near:
             self.now_ns = max(self.now_ns, stamp_ns)
-            # A scan comes before the odometry that ends at its stamp, and that may end a window.
             self.passed_ns = max(self.passed_ns, stamp_ns if is_odometry else stamp_ns - 1)
+        self.note_input(measurement.number)
         if isinstance(measurement, m.AnyOdometry):
             return self.drive(measurement, is_near)
         self.account(measurement, self._observe(measurement, is_near))
         return False
-
-    def _is_near(self, stamp_ns: int) -> bool:
-        """Whether receivers take a submap with this stamp: the clock has not leapt too far."""
-        return another_time(stamp_ns, self._began_ns) is None
 
     def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
         """Account for the measurement in progress and add it to the open window."""
@@ -170,7 +172,6 @@ class Mapper:
     def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
         """Take an odometry interval; returns whether it closed the window."""
         before_ns = self._slam.last_keyframe_ns
-        self.note_input(measurement.number)
         interval, rejected = self.judge_interval(measurement, is_near)
         closed = None
         if interval is not None:
@@ -199,7 +200,6 @@ class Mapper:
 
     def _observe(self, measurement: m.Measurement, is_near: bool) -> Rejection | None:
         """Take what is no odometry; returns the reason if it is rejected."""
-        self.note_input(measurement.number)
         match measurement:
             case m.Observations() | m.Points() | m.Detections():
                 return self._observe_landmarks(measurement, is_near)
@@ -217,28 +217,26 @@ class Mapper:
         near = self._judge.near(scan.ranges)
         if scan.own.size:
             near &= sensible(scan.own, scan.ranges, self.config.bounds)
-        accepted, rejected = np.count_nonzero(near), self._judge_time(measurement, is_near)
-        if rejected is None and len(near) and not accepted:
-            rejected = Rejection.RANGE
-        if rejected is None:
-            scan = scan if accepted == len(near) else scan.only(near)
-            rejected = self.observe(measurement.stamp_ns, scan)
-        return rejected
+        rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
+        if rejected is not None:
+            return rejected
+        if not near.all():
+            if not near.any():
+                return Rejection.RANGE
+            scan = scan.only(near)
+        return self.observe(measurement.stamp_ns, scan)
 
     def _observe_teammates(self, measurement: m.Sightings, is_near: bool) -> Rejection | None:
         teammates, ranges, bearings = translate.detections_of(measurement)
         others = np.array([name != self.config.id for name in teammates], dtype=np.bool_)
         near = self._judge.near(ranges) & others
-        rejected = self._judge_time(measurement, is_near)
+        rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
         if rejected is None and len(near) and not near.any():
             rejected = Rejection.RANGE if others.any() else Rejection.ITSELF
         if rejected is not None:
             return rejected
         seen = tuple(name for name, is_in in zip(teammates, near, strict=True) if is_in)
         return self.sight(measurement, (seen, ranges[near], bearings[near]))
-
-    def _judge_time(self, measurement: m.Measurement, is_near: bool) -> Rejection | None:
-        return self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
 
     # A window closes.
 
@@ -320,9 +318,9 @@ class Mapper:
         """Compute the open window again from its measurements."""
         self._reopen_window()
         for measurement in self._window:
-            is_near = self._is_near(translate.team_time_of(measurement, self._offset_s))
+            is_near = another_time(measurement.stamp_ns, self._began_ns) is None
+            self.note_input(measurement.number)
             if isinstance(measurement, m.AnyOdometry):
-                self.note_input(measurement.number)
                 interval, rejected = self.judge_interval(measurement, is_near)
                 if interval is not None:
                     self._slam.drive(interval, measured=rejected is None)

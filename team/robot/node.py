@@ -21,7 +21,7 @@ from team.door import absurd
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.pairs import COMPARISON_ROBOT, PAIRS
 from team.registry import loaded
-from team.robot.ledger import Ledger, OnDisposition, no_listener
+from team.robot.ledger import Ledger, OnDisposition
 from team.robot.mapper import Mapper, Replaced
 from team.robot.poses import RunningPoses
 from team.robot.status import status_of
@@ -73,7 +73,7 @@ class RobotNode:
         poses: RunningPoses | None = None,
         replaced: Replaced | None = None,
         on_window: Callable[[ClosedWindow], None] = lambda _: None,
-        on_disposition: OnDisposition = no_listener,
+        on_disposition: OnDisposition | None = None,
     ) -> None:
         self.config = config
         self.robot = config.id
@@ -292,8 +292,7 @@ class RobotNode:
         """Consume the measurements whose turn has come, while the centre gives credit."""
         while not self.is_held and (measurement := self.inbox.take_next()) is not None:
             self._consume(measurement)
-        self._stream_end.end_without_driver()
-        if not self.done and self._stream_end.reached and not self.is_held:
+        if not self.done and self._stream_end.is_reached() and not self.is_held:
             self._finish()
 
     @property

@@ -7,6 +7,7 @@ receiver, late joiners included.
 """
 
 import math
+from collections import deque
 from typing import Protocol, runtime_checkable
 
 import msgspec
@@ -50,7 +51,7 @@ class RunningPoses:
     sigma_m: standard deviation of the last pose in the team's frame; 0 where there is none.
     """
 
-    def __init__(self, config: RobotConfig, warnings: list[str]) -> None:
+    def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
         self._bounds = config.bounds
         self._period_ns = config.pose_s * 1e9
         self._warnings = warnings

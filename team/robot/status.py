@@ -53,6 +53,6 @@ def status_of(
         warnings=(
             *warnings,
             *unexpected(nis, outliers, config.estimator),
-            *mapper.warnings[-3:],
+            *[*mapper.warnings][-3:],
         ),
     )

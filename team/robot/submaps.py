@@ -43,7 +43,8 @@ class Submaps(Sequence[LocalMap]):
     """The messages for fusion of one robot, and its incarnation's submaps as a sequence of maps.
 
     The sequence has the submaps' landmarks with identities; an item is decoded when it is read.
-    buffers: whether submaps wait for an encounter.
+    buffers: whether submaps wait for an encounter. sent: number of submaps of the incarnation that
+    were sent, also by an earlier process.
     """
 
     def __init__(self, robot: str, exchange: Exchange) -> None:
@@ -52,12 +53,12 @@ class Submaps(Sequence[LocalMap]):
         self._greeted: set[str] = set()  # told of an encounter since the last window ended
         self._streams: dict[int, _Stream] = {}
         self._newest = _Stream()
-        self._sent = 0
+        self.sent = 0
 
     def begin(self, start: m.InitialPose) -> None:
         """Begin an incarnation."""
         self._newest = self._streams[start.incarnation] = _Stream(start)
-        self._sent = 0
+        self.sent = 0
 
     def restore(self, message: m.Message) -> None:
         """Store a message that an earlier process has sent; the newest incarnation has begun."""
@@ -72,7 +73,7 @@ class Submaps(Sequence[LocalMap]):
                     factors = stream.factors.setdefault(message.sequence, [])
                     if message not in factors:
                         insort(factors, message, key=lambda each: (each.stamp_ns, each.teammate))
-        self._sent = len(self._newest.submaps)
+        self.sent = len(self._newest.submaps)
 
     def close(self, factors: Sequence[m.SightingFactor], submap: m.Submap) -> list[Outgoing]:
         """Store a window's messages; returns those that go out now."""
@@ -84,22 +85,17 @@ class Submaps(Sequence[LocalMap]):
 
     def _take_unsent(self) -> list[Outgoing]:
         out: list[Outgoing] = []
-        for sequence in range(self._sent, len(self)):
+        for sequence in range(self.sent, len(self)):
             factors = self._newest.factors.get(sequence, ())
             out += (Outgoing(ch.SIGHTING_FACTOR, self._robot, each) for each in factors)
             out.append(Outgoing(ch.SUBMAP, self._robot, self._newest.submaps[sequence]))
-        self._sent = len(self)
+        self.sent = len(self)
         return out
-
-    @property
-    def sent(self) -> int:
-        """Number of submaps of the incarnation that were sent, also by an earlier process."""
-        return self._sent
 
     @property
     def since_ns(self) -> int | None:
         """Start of the oldest buffered window; None where nothing is buffered."""
-        return None if self._sent == len(self) else self._newest.submaps[self._sent].start_ns
+        return None if self.sent == len(self) else self._newest.submaps[self.sent].start_ns
 
     @property
     def last(self) -> m.Submap | None:
@@ -111,11 +107,11 @@ class Submaps(Sequence[LocalMap]):
 
         seen: the teammates that are to release theirs, too. Nothing where no message would be new.
         """
-        count, start = len(self) - self._sent, self._newest.start
+        count, start = len(self) - self.sent, self._newest.start
         if start is None or not self.buffers or not (count or set(seen) - self._greeted):
             return []
         self._greeted.update(seen)
-        waited_ns = now_ns - self._newest.submaps[self._sent].stamp_ns if count else 0
+        waited_ns = now_ns - self._newest.submaps[self.sent].stamp_ns if count else 0
         announced = m.Rendezvous(
             stamp_ns=now_ns,
             robot=self._robot,
@@ -141,7 +137,7 @@ class Submaps(Sequence[LocalMap]):
             if stream.start is not None:
                 yield stream.start
             for message in stream.from_sequence(0 if every else request.first):
-                if stream is not self._newest or message.sequence < self._sent:
+                if stream is not self._newest or message.sequence < self.sent:
                     yield message
 
     def __len__(self) -> int:

@@ -1,5 +1,6 @@
 """Recomputes one robot's messages: its node over its recorded measurements."""
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
 
@@ -8,7 +9,7 @@ from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.robot.ledger import OnDisposition, no_listener
+from team.robot.ledger import OnDisposition
 from team.robot.node import robot_node
 from team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
 from team.wire import channels as ch
@@ -32,7 +33,7 @@ class RecordedPoses(RunningPoses):
     def __init__(
         self, config: RobotConfig, recorded: PriorsNamed, withdrawn: WithdrawnAt = ()
     ) -> None:
-        super().__init__(config, [])
+        super().__init__(config, deque(maxlen=0))
         self._recorded = recorded
         self._withdrawn = withdrawn
 
@@ -60,7 +61,7 @@ class RecomputedRobot:
         digest: bytes,
         recorded: PriorsNamed,
         withdrawn: WithdrawnAt = (),
-        on_disposition: OnDisposition = no_listener,
+        on_disposition: OnDisposition | None = None,
     ) -> None:
         self.node = robot_node(
             config,

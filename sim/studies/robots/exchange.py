@@ -4,6 +4,8 @@ A map goes out every `exchange_s`, with its joint covariance. Under a rule with 
 then waits for the answer (lockstep), which its own map absorbs.
 """
 
+from collections import deque
+
 from team.config import RobotConfig
 from team.estimation.gaussian import LandmarkGaussian
 from team.pairs import FEEDBACK, PAIRS
@@ -23,7 +25,7 @@ class MapExchange:
     last: the sequence of the last map that was sent; −1: none.
     """
 
-    def __init__(self, config: RobotConfig, warnings: list[str]) -> None:
+    def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
         self.exchanges = PAIRS[config.estimator, config.fusion] == "own/map"
         self.lockstep = config.fusion in FEEDBACK
         self._warnings = warnings
