@@ -106,7 +106,8 @@ def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measure
 
 
 def submaps(out: list[Outgoing]) -> list[m.Message]:
-    return [o.message for o in out if o.channel is ch.SUBMAP]
+    shown = (ch.SUBMAP, ch.OWN_POSE, ch.OWN_MAP)
+    return [o.message for o in out if o.channel in shown]
 
 
 def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_in_the_map(

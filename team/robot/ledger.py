@@ -83,7 +83,8 @@ class Ledger:
     def close(self, closed: ClosedWindow) -> None:
         """A window has become a submap, which lists what it could not use."""
         self.leave_out(set().union(*(each.measurements for each in closed.sightings)))
-        self._reject(self._behind(closed.late), Rejection.LATE, self.used)
+        if closed.late:
+            self._reject(self._behind(closed.late), Rejection.LATE, self.used)
         behind = {n: at_ns for n, at_ns in self._scans.items() if at_ns > closed.end_ns}
         if closed.unsolved:
             self._reject(sorted(self._scans.keys() - behind), Rejection.UNSOLVED, self.used)
