@@ -49,8 +49,8 @@ class RobotNode:
     when and from which priors poses are published; replaced, what is sent instead of a window, to
     show what that costs; on_window is given each window that closes.
 
-    final: the team's final map, once it is there. withheld: number of messages that no receiver
-    would have accepted.
+    finished: whether the team's final map, `final`, is there. withheld: number of messages that no
+    receiver would have accepted.
     """
 
     listens: tuple[ch.Channel, ...] = (
@@ -93,15 +93,11 @@ class RobotNode:
         self._centre_alive: bool | None = None
         self.done = self._has_sent_done = False
         self._dones: list[m.Done] = []
+        self.finished = False
         self.final: m.FusedMap | None = None
         self.withheld = 0
 
     # What the shell asks.
-
-    @property
-    def finished(self) -> bool:
-        """Whether the team's final map is there."""
-        return self.final is not None
 
     @property
     def ledger(self) -> Ledger:
@@ -246,7 +242,7 @@ class RobotNode:
             case m.Prior():
                 self.out += self.mapper.poses.follow(message)
             case m.FusedMap() if message.final:
-                self.final = message
+                self.finished, self.final = True, message
             case m.Progress():
                 if message.incarnation == self._incarnation:
                     self._acknowledged = max(self._acknowledged, message.submaps)

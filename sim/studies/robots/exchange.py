@@ -76,5 +76,6 @@ class MapExchange:
         if joint and len(landmarks.ids) > JOINT_LANDMARKS:
             joint = False
             self._warnings.append("the own map is too large for a joint covariance")
-        kind = "joint" if joint else "blocks"
-        return writer.own_map(stamp_ns, sequence, self.awaited, landmarks, kind)
+        return writer.own_map(
+            stamp_ns, sequence, self.awaited, landmarks, "joint" if joint else "blocks"
+        )

@@ -53,6 +53,8 @@ class HybridSlam:
         self._standing_ns = _nanoseconds(front.standing_s)
         self._innovation, self._scans = NOTHING, 0
         self._driven_m: float
+        self._open: OpenWindow
+        self.last_keyframe_ns: int | None
         self._start_ns: int | None = None
         self._begin_window(0, 0)
 
@@ -162,7 +164,7 @@ class HybridSlam:
         self.sequence = sequence
         self._first_measurement, self.last_measurement = first_measurement, first_measurement - 1
         self._driven_m = 0.0
-        self.last_keyframe_ns: int | None = None
+        self.last_keyframe_ns = None
         self._open = OpenWindow(self._config, self._incarnation, sequence)
 
     # The open window meanwhile.
