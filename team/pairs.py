@@ -14,7 +14,8 @@ maps. measurements: the sensor channels; the robots' estimators are then for the
 
 
 class EstimatorRow(NamedTuple):
-    """made_by: a `team.robot.estimator.Factory`. feeds: rules, beside those that name it.
+    """made_by: a `sim.studies.robots.estimator.Factory`; of `hybrid` its mapper. feeds: rules,
+    beside those that name it.
 
     needs_map: it is given a prior map.
     """
@@ -36,6 +37,8 @@ class RuleRow(NamedTuple):
     feedback: bool = False
 
 
+COMPARISON_ROBOT = "sim.studies.robots.node:comparison_robot"
+"""Makes the robot's node of a pair whose rule does not fuse submaps."""
 _RUNNING = "sim.studies.robots.running:running_estimator"
 _WHOLE = ("latest", "alone")
 _ROUNDS = "sim.studies.rules.feedback_rule:ExchangeRule"
@@ -45,7 +48,7 @@ _PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")
 
 ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(
     {
-        "hybrid": EstimatorRow("team.robot.hybrid:HybridEstimator"),
+        "hybrid": EstimatorRow("team.robot.mapper:Mapper"),
         "hybrid-thesis": EstimatorRow(_RUNNING, _WHOLE),
         "hybrid-thesis-coded": EstimatorRow(_RUNNING, ("alone",)),
         "ekf-slam": EstimatorRow(_RUNNING, _WHOLE),

@@ -65,17 +65,16 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
     if isinstance(message, m.Detections):
         seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
     else:
-        seen = ids(message.ids, "ids").astype(np.uint32)
+        seen = np.frombuffer(message.ids, "<u4").astype(np.uint32)
     claimed = None
     if message.covariances:
         claimed = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
     if isinstance(message, m.Points):
         positions = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
         return point_scan(seen, positions, claimed)
-    ranges = floats(message.ranges, "ranges").astype(np.float64)
-    return polar_scan(
-        seen, ranges, floats(message.bearings, "bearings").astype(np.float64), claimed
-    )
+    ranges = np.frombuffer(message.ranges, "<f8").astype(np.float64)
+    bearings = np.frombuffer(message.bearings, "<f8").astype(np.float64)
+    return polar_scan(seen, ranges, bearings, claimed)
 
 
 def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
@@ -89,7 +88,8 @@ def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
 
 def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval:
     """One odometry interval, in the form that the robot's motion model takes."""
-    end_ns, duration_ns = team_time_of(message, config.clock_offset_s), message.duration_ns
+    end_ns = message.stamp_ns + round(config.clock_offset_s * 1e9)
+    duration_ns = message.duration_ns
     match message:
         case m.Odometry():
             return OdometryInterval(end_ns, duration_ns, message.forward, message.yaw_rate)

@@ -23,7 +23,7 @@ from sim.world.streams import (
 )
 from team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.pairs import NEEDS_MAP
-from team.robot.node import RobotNode
+from team.robot.node import RobotNode, robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -160,7 +160,7 @@ def of(out: Sequence[Outgoing], channel: ch.Channel) -> list[m.Message]:
 
 def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
     """What a lonely robot sends for fusion."""
-    return of(driven(RobotNode(config(each.robot, **options)), published(each)), ch.SUBMAP)
+    return of(driven(robot_node(config(each.robot, **options)), published(each)), ch.SUBMAP)
 
 
 class Submaps(Mapping[str, list[m.Submap]]):
@@ -215,7 +215,7 @@ class Team:
             tells_map=self.configs[0].estimator in NEEDS_MAP,
         )
         self.centre = CentralNode(rule, names)
-        self.robots = {c.id: RobotNode(c, self.exchange) for c in self.configs}
+        self.robots = {c.id: robot_node(c, self.exchange) for c in self.configs}
         self.nodes = {"world": self.world, "central": self.centre}
         self.nodes |= {ch.robot_node(name): node for name, node in self.robots.items()}
         for name in list(self.nodes):
@@ -253,7 +253,7 @@ class Team:
 
     def resume(self, robot: RobotConfig) -> None:
         """The process is there again: it takes over the submaps that the centre has."""
-        name, node = ch.robot_node(robot.id), RobotNode(robot, self.exchange)
+        name, node = ch.robot_node(robot.id), robot_node(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
         request = encoded(m.SubmapsRequest(stamp_ns=0, robot=robot.id))
         kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]
@@ -288,7 +288,7 @@ class Team:
         found = False
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.request()
-            if wanted is None and not node.finished and not node._inbox.waiting:
+            if wanted is None and not node.finished and not node.inbox.waiting:
                 wanted = build.measurements_request(
                     robot=node.robot, incarnation=node.incarnation, first=node.next_measurement
                 )

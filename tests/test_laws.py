@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sim.publisher.node
-import team.robot.pace
+import team.robot.node
 from central.config import CentralConfig
 from central.node import CentralNode
 from sim.datasets.utias_writer import write_utias
@@ -24,9 +24,10 @@ from sim.in_memory.team import final_map, run_team
 from sim.publisher.node import WorldNode
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
+from sim.studies.robots.node import ExchangingRobot
 from team import translate
 from team.pairs import PAIRS
-from team.robot.node import RobotNode
+from team.robot.node import RobotNode, robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, opened
@@ -49,8 +50,8 @@ def scarce(monkeypatch):
     """Little credit and small portions, so that everybody waits for somebody."""
     monkeypatch.setattr(sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
     monkeypatch.setattr(sim.publisher.node, "BATCH", 5)
-    monkeypatch.setattr(team.robot.pace, "PROGRESS_MEASUREMENTS", 4)
-    monkeypatch.setattr(team.robot.pace, "CREDIT_SUBMAPS", 1)
+    monkeypatch.setattr(team.robot.node, "PROGRESS_MEASUREMENTS", 4)
+    monkeypatch.setattr(team.robot.node, "CREDIT_SUBMAPS", 1)
 
 
 # Law 1.
@@ -134,7 +135,7 @@ def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
     measurements = published(PAIR.streams[0])
     maps = []
     for shift in (0.0, 1.0):
-        node, out = RobotNode(robot), []
+        node, out = robot_node(robot), []
         for measurement in measurements:
             new = node.handle(measurement, 0)
             while new:
@@ -426,5 +427,5 @@ def test_every_team_comes_to_its_end_in_whatever_order_things_happen(estimator, 
 @pytest.mark.usefixtures("scarce")
 def test_a_waiting_robot_that_gives_no_credit_stalls_its_team(monkeypatch):
     """The mutant: this search finds a stall where there is one."""
-    monkeypatch.setattr(RobotNode, "_credit", lambda _: [])
+    monkeypatch.setattr(ExchangingRobot, "consume", RobotNode.consume)
     assert not all(played(seed, "hybrid", "kalman").centre.finished for seed in range(40))

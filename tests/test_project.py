@@ -204,7 +204,7 @@ PROCESSES: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "a template's start": (("sim.launch.ahead",), set()),
     "router": ((), {"zenoh"}),
     "record": ((), {"mcap", "zenoh"}),
-    "robot": (("team.robot.main", "team.robot.hybrid"), COMPUTES),
+    "robot": (("team.robot.main",), COMPUTES),
     "central": (("central.main",), COMPUTES),
     "world": (("sim.publisher.main",), COMPUTES),
 }  # fmt: skip

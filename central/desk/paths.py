@@ -16,7 +16,7 @@ from team import translate
 from team.containment import Boundary
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.window_path import Ends, placed, window_path
-from team.robot.node import RobotNode
+from team.robot.node import robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
@@ -64,7 +64,7 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
     def keep(closed: ClosedWindow) -> None:
         windows[closed.end_ns] = closed
 
-    node, boundary = RobotNode(config, on_window=keep), Boundary(ch.robot_node(robot))
+    node, boundary = robot_node(config, on_window=keep), Boundary(ch.robot_node(robot))
     boundary.give(node, m.Liveliness(stamp_ns=0, node="central", alive=False))
     count = 0
     measurements = found.measurements.get((robot, incarnation))

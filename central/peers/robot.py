@@ -159,7 +159,7 @@ class PeerRobot(Peer):
             # a reply of the source: it has no key
             out = self._vouched(Outgoing(ch.START, self.robot, message)) + self.grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
-        if own or isinstance(message, m.KnownMap | m.Rendezvous):
+        if own or isinstance(message, m.Rendezvous):
             out = self._to_estimator(message, sample) + out
         return out
 

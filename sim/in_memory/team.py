@@ -14,7 +14,7 @@ from sim.scenarios.source import tells_map
 from sim.world.streams import WorldStreams
 from team.config import Exchange, RobotConfig
 from team.containment import Boundary
-from team.robot.node import RobotNode
+from team.robot.node import RobotNode, robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
@@ -84,7 +84,7 @@ def _opened(sample: Sample) -> m.Message:
 def run_team(
     scenario: Scenario,
     streams: WorldStreams,
-    robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
+    robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
     """Run the team to its final map; returns the samples that a recorder would record, in its
@@ -102,7 +102,7 @@ def run_nodes(
     scenario: Scenario,
     world: World,
     conditions: Conditions | None = None,
-    robot: Callable[[RobotConfig, Exchange], RobotNode] = RobotNode,
+    robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
 ) -> Iterator[Sample]:
     """Run the scenario's robots and centre in a world until no message is on its way.
@@ -176,7 +176,7 @@ def _centre(
 
 def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:
     bus = MemoryBus(network)
-    for channel in RobotNode.listens:
+    for channel in node.listens:
         bus.subscribe(channel, node.robot)
     for channel in node.overhears:
         bus.subscribe(channel)

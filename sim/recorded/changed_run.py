@@ -11,7 +11,7 @@ from sim.recorded.world import RecordedWorld, Samples
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario, with_options
 from team.pairs import FEEDBACK
-from team.robot.node import RobotNode
+from team.robot.node import robot_node
 from team.wire.bus import Sample
 
 
@@ -25,7 +25,7 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     scenario = changed_scenario(world.scenario, changes)
     world.announce(scenario)
     conditions = _conditions(scenario, changes, world.first_ns)
-    node = unsafe_robot if changes.unsafe_feedback else RobotNode
+    node = unsafe_robot if changes.unsafe_feedback else robot_node
     return list(run_nodes(scenario, world, conditions, node))
 
 

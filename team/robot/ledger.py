@@ -19,10 +19,6 @@ it.
 """
 
 
-def no_listener(_number: int, _disposition: str) -> None:
-    """Ignores the dispositions of single measurements."""
-
-
 class Ledger:
     """Counts the measurements of an incarnation by their disposition.
 
@@ -33,7 +29,7 @@ class Ledger:
     """
 
     def __init__(
-        self, used: str, resumed: int = 0, on_disposition: OnDisposition = no_listener
+        self, used: str, resumed: int = 0, on_disposition: OnDisposition | None = None
     ) -> None:
         self.used = used
         self.counts = Counter({used: resumed} if resumed else {})
@@ -61,14 +57,16 @@ class Ledger:
                     pass
         disposition = taken if rejected is None else rejected.disposition
         self.counts[disposition] += 1
-        self._on_disposition(number, disposition)
+        if self._on_disposition is not None:
+            self._on_disposition(number, disposition)
 
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
         """Recounts measurements that were counted as used and were not, for this reason."""
         for number in numbers:
             self.counts[used] -= 1
             self.counts[reason.disposition] += 1
-            self._on_disposition(number, reason.disposition)
+            if self._on_disposition is not None:
+                self._on_disposition(number, reason.disposition)
             self._scans.pop(number, None)
             self._detections.pop(number, None)
 
@@ -85,7 +83,8 @@ class Ledger:
     def close(self, closed: ClosedWindow) -> None:
         """A window has become a submap, which lists what it could not use."""
         self.leave_out(set().union(*(each.measurements for each in closed.sightings)))
-        self._reject(self._behind(closed.late), Rejection.LATE, self.used)
+        if closed.late:
+            self._reject(self._behind(closed.late), Rejection.LATE, self.used)
         behind = {n: at_ns for n, at_ns in self._scans.items() if at_ns > closed.end_ns}
         if closed.unsolved:
             self._reject(sorted(self._scans.keys() - behind), Rejection.UNSOLVED, self.used)

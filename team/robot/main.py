@@ -13,7 +13,7 @@ import msgspec
 from team.config import Exchange, RobotConfig
 from team.containment import reply_of
 from team.missing import ASK_TIMEOUT_S, MissingMeasurements
-from team.robot.node import RobotNode
+from team.robot.node import robot_node
 from team.shell import RECORDER, Shell
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -51,7 +51,7 @@ class RobotShell:
         self._stop = stop
         self._patience_s = patience_s
         self._config, self._exchange = config, exchange
-        self.node = RobotNode(config, exchange)
+        self.node = robot_node(config, exchange)
         self._first_of: dict[int, Sample] = {}
         self._confirm_at = 0.0
         self._doubted: dict[tuple[int, int], Sample] = {}
@@ -194,7 +194,7 @@ class RobotShell:
         except Exception as error:
             sample = Sample(ch.SUBMAPS.key(), replies[0], 0, 0, -1)
             self.shell.publish([self.shell.boundary.note(error, sample, "")])
-            self.node = self.shell.node = RobotNode(self._config, self._exchange)
+            self.node = self.shell.node = robot_node(self._config, self._exchange)
             return False
         _LOG.info(
             "resumed after submap %d of incarnation %d",

@@ -7,21 +7,42 @@ receiver, late joiners included.
 """
 
 import math
+from collections import deque
+from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
 
 from team.config import RobotConfig
-from team.estimation.gaussian import NotACovarianceError
+from team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from team.estimation.map_joining.gauss_newton import NotDeterminedError
 from team.estimation.plausible import prior_beyond
-from team.robot.front_end import BoundedEstimator
+from team.estimation.submap import LocalMap
 from team.robot.statements import MessageWriter
+from team.robot.submaps import Submaps
 from team.robot.team_map import TeamMap
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.newer import is_newer_prior
+
+
+@runtime_checkable
+class PoseEstimator(Protocol):
+    """The estimates of a mapper that make a pose."""
+
+    writer: MessageWriter
+    submaps: Submaps
+
+    @property
+    def sequence(self) -> int:
+        """The number of the open window."""
+
+    def open_window(self) -> LocalMap | None:
+        """The Gaussian of the open window, if there is one."""
+
+    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+        """The pose by own measurements alone, given the open window."""
 
 
 class RunningPoses:
@@ -30,7 +51,7 @@ class RunningPoses:
     sigma_m: standard deviation of the last pose in the team's frame; 0 where there is none.
     """
 
-    def __init__(self, config: RobotConfig, warnings: list[str]) -> None:
+    def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
         self._bounds = config.bounds
         self._period_ns = config.pose_s * 1e9
         self._warnings = warnings
@@ -44,7 +65,7 @@ class RunningPoses:
         self.team_map = TeamMap()
         self.sigma_m = 0.0
 
-    def take(self, prior: m.Prior) -> list[Outgoing]:
+    def follow(self, prior: m.Prior) -> list[Outgoing]:
         """Take a prior from the team's map; the newest one is used.
 
         Returns the message that withdraws the last pose, if that was in another frame.
@@ -90,13 +111,13 @@ class RunningPoses:
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 
-    def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
+    def at(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
         """A new pose: the messages to publish, if they are due."""
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
-        prior = self.prior_of(writer.incarnation)
-        out = self.posed(stamp_ns, prior, front, writer)
+        prior = self.prior_of(estimator.writer.incarnation)
+        out = self.posed(stamp_ns, prior, estimator)
         self._own = out[0]
         if len(out) == 1:
             return [*out, *self._withdrawn_pose()]
@@ -105,20 +126,16 @@ class RunningPoses:
         return out
 
     def posed(
-        self,
-        stamp_ns: int,
-        prior: m.Prior | None,
-        front: BoundedEstimator,
-        writer: MessageWriter,
+        self, stamp_ns: int, prior: m.Prior | None, estimator: PoseEstimator
     ) -> list[Outgoing]:
         """The message of the own pose and, given a prior, of the pose in the team's map."""
-        sequence = front.estimator.sequence
-        out = [writer.own_pose(stamp_ns, sequence, front.estimator.own_pose())]
+        sequence, writer, window = estimator.sequence, estimator.writer, estimator.open_window()
+        out = [writer.own_pose(stamp_ns, sequence, estimator.own_pose(window))]
         if prior is None:
             return out
         try:
             with np.errstate(all="ignore"):  # what is no number is withheld
-                posed = self.team_map.pose(prior, front.submaps, front.open_window()).pose
+                posed = self.team_map.pose(prior, estimator.submaps, window).pose
         except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out

@@ -1,6 +1,5 @@
 """Turns what a robot's estimator has found into messages on their channels."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,7 +10,7 @@ from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.submap import Became
-from team.robot.estimator import Cloud
+from team.robot.own_map import Cloud
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -31,9 +30,9 @@ class MessageWriter:
     config: bytes
     started: bool
 
-    def submap(self, closed: ClosedWindow) -> Outgoing:
+    def submap(self, closed: ClosedWindow) -> m.Submap:
         """The window's Gaussian with the names of its inputs."""
-        message = translate.submap_message(
+        return translate.submap_message(
             robot=self.robot,
             incarnation=self.incarnation,
             sequence=closed.sequence,
@@ -44,18 +43,15 @@ class MessageWriter:
             sightings=len(closed.sightings),
             gated=closed.gated,
         )
-        return Outgoing(ch.SUBMAP, self.robot, message)
 
-    def association(self, sequence: int, stamp_ns: int, became: Became | None) -> list[Outgoing]:
-        """The outcomes of the window's detections without identities, if it had any."""
-        if became is None:
-            return []
+    def association(self, sequence: int, stamp_ns: int, became: Became) -> Outgoing:
+        """The outcomes of the window's detections without identities."""
         message = translate.association_message(
             self.robot, self.incarnation, sequence, stamp_ns, became
         )
-        return [Outgoing(ch.ASSOCIATION, self.robot, message)]
+        return Outgoing(ch.ASSOCIATION, self.robot, message)
 
-    def sighting(self, closed: ClosedWindow, each: NodeSighting) -> Outgoing:
+    def sighting(self, closed: ClosedWindow, each: NodeSighting) -> m.SightingFactor:
         """The inter-robot measurement from a pose node of the window."""
         sighting = InterRobotFactor(
             self.robot,
@@ -66,16 +62,13 @@ class MessageWriter:
             each.measurement,
             each.covariance,
         )
-        message = translate.sighting_message(sighting, self.config, each.measurements)
-        return Outgoing(ch.SIGHTING_FACTOR, self.robot, message)
+        return translate.sighting_message(sighting, self.config, each.measurements)
 
-    def cloud(self, stamp_ns: int, cloud: Callable[[], Cloud] | None) -> list[Outgoing]:
-        """The thinned particles at this time, if there are any."""
-        if cloud is None:
-            return []
-        poses, weights = (from_floats(x) for x in cloud())
+    def cloud(self, stamp_ns: int, cloud: Cloud) -> Outgoing:
+        """The thinned particles at this time."""
+        poses, weights = (from_floats(x) for x in cloud)
         message = m.ParticleCloud(stamp_ns=stamp_ns, robot=self.robot, poses=poses, weights=weights)
-        return [Outgoing(ch.PARTICLES, self.robot, message)]
+        return Outgoing(ch.PARTICLES, self.robot, message)
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
         """The innovations of a window's measurements, or of those since the last such message."""

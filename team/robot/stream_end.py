@@ -1,6 +1,7 @@
 """Where a robot's stream ends, as its world, its driver or an operator says."""
 
 from team.stream.inbox import Inbox
+from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.newer import later_end, later_head
 
@@ -19,15 +20,16 @@ class EndOfStream:
         self.at_source: tuple[int, int] | None = None
         """Incarnation and measurements at which a world ends the stream, by its own answer."""
 
-    @property
-    def reached(self) -> bool:
-        """Whether every measurement up to the last one has been consumed."""
-        return self._last is not None and self._inbox.complete(self._last)
+    def is_reached(self) -> bool:
+        """Whether every measurement up to the last one has been consumed.
 
-    @property
-    def is_open(self) -> bool:
-        """Whether neither an end nor an order to end has come."""
-        return self._last is None and not self.is_ordered
+        A live team that is to end ends the stream where it is, if its driver is not present.
+        """
+        if self._last is None:
+            if self.driver_is_there or not self.is_ordered:
+                return False
+            self._last = self._at(self._inbox.received)
+        return self._inbox.complete(self._last)
 
     def last_of(self, incarnation: int) -> int | None:
         """The measurements of an incarnation that has ended; None while it has not."""
@@ -63,6 +65,17 @@ class EndOfStream:
         ended = message.state == "ended"
         return self._inbox.contradicts(_end_at(message), self._robot) if ended else None
 
+    def receive(self, message: m.Liveliness | m.End | m.TeamEnd) -> None:
+        """Take the driver's presence, a world's end or an order to end."""
+        match message:
+            case m.Liveliness():
+                if message.node == ch.source_node(self._robot):
+                    self.driver_is_there = message.alive
+            case m.End():
+                self.take(message)
+            case m.TeamEnd():
+                self.is_ordered = True
+
     def take(self, end: m.End) -> None:
         """Take a world's end; one that does not name this robot ends its stream where it is."""
         self._world_end = end = later_end(end, self._world_end)
@@ -86,11 +99,6 @@ class EndOfStream:
         elif self._last is not None and head.incarnation > self._last.incarnation:
             self._last = None
         return head
-
-    def end_without_driver(self) -> None:
-        """End the stream where it is: a live team is to end and the driver is not present."""
-        if self.is_ordered and self._last is None and not self.driver_is_there:
-            self._last = self._at(self._inbox.received)
 
     def _at(self, measurements: int) -> m.StreamEnd:
         return m.StreamEnd(

@@ -1,7 +1,5 @@
 """Puts the measurements of one robot in the order of its measurement counter."""
 
-from collections.abc import Iterator
-
 from team.door import another_time
 from team.wire.messages import End, InitialPose, Measurement, StreamEnd
 
@@ -12,7 +10,7 @@ NEAR_LIVES = 16
 class Inbox:
     """Holds measurements until their turn: Zenoh promises no order across keys.
 
-    A measurement is yielded once; duplicates and measurements of earlier incarnations are dropped.
+    A measurement is taken once; duplicates and measurements of earlier incarnations are dropped.
     A later incarnation begins when its measurement 0 arrives.
     """
 
@@ -92,8 +90,8 @@ class Inbox:
             )
         return None
 
-    def taken(self) -> Iterator[Measurement]:
-        """Yield the measurements whose turn has come, one by one."""
+    def take_next(self) -> Measurement | None:
+        """The next measurement, if its turn has come; it is removed."""
         while True:
             measurement = self._waiting.pop(self.next_measurement, None)
             if measurement is not None:
@@ -101,11 +99,10 @@ class Inbox:
                 self.next_measurement += 1
                 if isinstance(measurement, InitialPose):
                     self._began_ns = measurement.stamp_ns
-                yield measurement
-                continue
+                return measurement
             beginnings = [e for e, r in self._later.items() if 0 in r] if self._later else None
             if not beginnings:
-                return
+                return None
             following = min(beginnings)
             self.incarnation, self.next_measurement = following, 0
             self._waiting = self._later.pop(following)

@@ -57,8 +57,8 @@ class StreamJudge:
 
     def time(self, stamp_ns: int) -> Rejection | None:
         """Why a measurement at this time is refused."""
-        ahead_ns = 0 if self._now_ns is None else stamp_ns - self._now_ns
-        return Rejection.TIME if ahead_ns > self._jump_ns else None
+        is_ahead = self._now_ns is not None and stamp_ns - self._now_ns > self._jump_ns
+        return Rejection.TIME if is_ahead else None
 
     def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Which ranges are within the bounds."""

@@ -95,9 +95,25 @@ def unsound(message: Message) -> WireError | None:
 
     A sender checks its own messages with it before publishing; the checks are those of `decoded`.
     """
-    payload = encoded(message)
+    payload = _ENCODER.encode(message)
+    kind = type(message)
     try:
-        decoded(payload, type(message))
+        if len(payload) > SMALL:
+            decoded(payload, kind)
+        else:
+            _decoder((kind,)).decode(payload)
+            message.check()
+    except WireError as error:
+        return error
+    except (msgspec.ValidationError, ValueError):
+        return _refusal(payload, kind)
+    return None
+
+
+def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
+    """Why a payload is refused."""
+    try:
+        decoded(payload, kind)
     except WireError as error:
         return error
     return None

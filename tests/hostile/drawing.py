@@ -15,7 +15,7 @@ import numpy as np
 from central.config import CentralConfig
 from central.node import CentralNode
 from team.config import RobotConfig
-from team.robot.node import RobotNode
+from team.robot.node import RobotNode, robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
@@ -346,7 +346,7 @@ def robot_session(
     messages: Iterator[m.Message], config: RobotConfig
 ) -> tuple[RobotNode, list[Outgoing]]:
     """A robot that hears what of these its door lets in; what it says every receiver takes."""
-    node = RobotNode(config)
+    node = robot_node(config)
     out = node.begin()
     if config.estimator == "localisation":
         out += node.handle(

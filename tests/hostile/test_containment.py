@@ -16,10 +16,10 @@ from central.scheduler import Scheduler
 from central.submap_intake import SubmapIntake
 from sim.in_memory.team import final_map
 from team.containment import Boundary
+from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.recording.recorder import Recorder
 from team.recording.shell import RecordLoop
 from team.rejection import Rejection
-from team.robot.hybrid import HybridEstimator
 from team.robot.main import RobotShell
 from team.robot.node import RobotNode
 from team.shell import FaultyRunError, Shell
@@ -40,16 +40,16 @@ BROKEN_NS = 17_000_000_000
 @pytest.fixture
 def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimator that raises at one odometry, in the middle of what it changes."""
-    whole = HybridEstimator.drive
+    whole = HybridSlam.drive
 
     def drive(self, interval, **how):  # type: ignore[no-untyped-def]
         if interval.end_ns == BROKEN_NS:
-            self._slam.sequence += 7
-            self._slam._segmenter = None
+            self.sequence += 7
+            self._segmenter = None
             raise ZeroDivisionError("no way")
         return whole(self, interval, **how)
 
-    monkeypatch.setattr(HybridEstimator, "drive", drive)
+    monkeypatch.setattr(HybridSlam, "drive", drive)
 
 
 def faults(samples: list[Sample]) -> list[m.Fault]:
@@ -70,7 +70,7 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
         ("ZeroDivisionError", "no way", BROKEN_NS)
     }
     for fault in told:
-        assert re.fullmatch(r"team\.robot\.front_end:BoundedEstimator\.drive:\d+", fault.place)
+        assert re.fullmatch(r"team\.robot\.mapper:Mapper\.drive:\d+", fault.place)
     assert_each_measurement_once(samples)
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)
@@ -97,7 +97,7 @@ def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measure
     for measurement in measurements:
         said[0] += submaps(boundary.give(node, measurement))
         if measurement is broken:
-            without._inbox.next_measurement += 1
+            without.inbox.next_measurement += 1
         else:
             said[1] += submaps(without.handle(measurement, 0))
     assert boundary.faults == 1
@@ -106,7 +106,8 @@ def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measure
 
 
 def submaps(out: list[Outgoing]) -> list[m.Message]:
-    return [o.message for o in out if o.channel is ch.SUBMAP]
+    shown = (ch.SUBMAP, ch.OWN_POSE, ch.OWN_MAP)
+    return [o.message for o in out if o.channel in shown]
 
 
 def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_in_the_map(
@@ -323,7 +324,7 @@ def test_a_message_of_a_log_is_encoded_only_where_somebody_looks_at_its_bytes(
     for message in measurements[:last]:
         boundary.give(node, message)
     assert not looked
-    monkeypatch.setattr(HybridEstimator, "drive", _raising)
+    monkeypatch.setattr(HybridSlam, "drive", _raising)
     out = boundary.give(node, measurements[last])
     assert looked == [measurements[last]]
     assert [each.message.error for each in out if isinstance(each.message, m.Fault)] == [

@@ -2,13 +2,14 @@
 
 import numpy as np
 
+from sim.studies.robots.estimator import NOTHING_NEW, Estimates, KnownMap
 from team.config import RobotConfig
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
 from team.rejection import Rejection
-from team.robot.estimator import NOTHING_NEW, Estimates, InitialPose, KnownMap
+from team.robot.own_map import InitialPose
 
 
 class Standing:

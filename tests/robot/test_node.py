@@ -13,8 +13,8 @@ from team import translate
 from team.pairs import PAIRS
 from team.rejection import Rejection
 from team.robot import node as robot_node
-from team.robot import pace
 from team.robot.node import RobotNode
+from team.robot.node import robot_node as node_for
 from team.wire import channels as ch
 from team.wire import codec
 from team.wire import messages as m
@@ -182,7 +182,7 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
     measurements = published(STREAMS[name])
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
     fusion = {"hybrid": "join", "hybrid-thesis": "kalman-per-axis"}.get(estimator, "alone")
-    node = RobotNode(config(front_end=front_end, estimator=estimator, fusion=fusion))
+    node = node_for(config(front_end=front_end, estimator=estimator, fusion=fusion))
     node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
     node.handle(
         m.KnownMap(stamp_ns=0, ids=from_ids([1, 2]), positions=from_floats([5.0, 3.0, 9.0, -2.0])),
@@ -279,7 +279,7 @@ def test_everything_it_sends_passes_the_door():
 
 def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
     """At a progress's stamp every submap that ends there or before has been sent."""
-    monkeypatch.setattr(pace, "PROGRESS_MEASUREMENTS", 1)
+    monkeypatch.setattr(robot_node, "PROGRESS_MEASUREMENTS", 1)
     node, passed = RobotNode(config()), -1
     for measurement in published(stream("r1", 12)):
         for o in node.handle(measurement, 0):
@@ -291,7 +291,7 @@ def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
 
 
 def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeypatch):
-    monkeypatch.setattr(pace, "CREDIT_SUBMAPS", 1)
+    monkeypatch.setattr(robot_node, "CREDIT_SUBMAPS", 1)
     node = RobotNode(config())
     node.handle(CENTRE, 0)
     out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
@@ -375,7 +375,7 @@ def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
 
 
 def feedback(**options):
-    return RobotNode(config(fusion="kalman", **options))
+    return node_for(config(fusion="kalman", **options))
 
 
 def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
@@ -393,7 +393,7 @@ def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
 
 def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatch):
     """Else the world waits for it, and it for a teammate that waits for the world."""
-    monkeypatch.setattr(pace, "PROGRESS_MEASUREMENTS", 4)
+    monkeypatch.setattr(robot_node, "PROGRESS_MEASUREMENTS", 4)
     node = feedback()
     out = [o for r in MEASUREMENTS for o in node.handle(r, 0)]
     assert node.next_measurement < len(MEASUREMENTS) - 10
@@ -403,7 +403,7 @@ def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatc
 
 def test_under_feedback_the_last_map_is_sent_whether_or_not_an_exchange_is_due():
     for estimator, fusion in (("hybrid", "kalman"), ("hybrid-thesis", "kalman-per-axis")):
-        node = RobotNode(config(estimator=estimator, fusion=fusion, exchange_s=1e6))
+        node = node_for(config(estimator=estimator, fusion=fusion, exchange_s=1e6))
         node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
         maps = of(driven(node, MEASUREMENTS), ch.OWN_MAP)
         assert len(maps) == 2

@@ -19,7 +19,8 @@ def measurement(number, incarnation=0):
     )
 
 
-def names(taken):
+def names(inbox):
+    taken = iter(inbox.take_next, None)
     return [(each.incarnation, each.number) for each in taken]
 
 
@@ -30,8 +31,8 @@ def test_any_order_with_duplicates_comes_out_in_order_and_once(order, at_once):
     for i, number in enumerate(order):
         inbox.put(measurement(number))
         if i % at_once == 0:
-            out += names(inbox.taken())
-    out += names(inbox.taken())
+            out += names(inbox)
+    out += names(inbox)
     assert out == [(0, number) for number in range(12)]
     assert inbox.waiting == 0
 
@@ -42,7 +43,7 @@ def test_of_two_incarnations_the_earlier_is_taken_as_far_as_it_is_there(order):
     inbox, out = Inbox(), []
     for incarnation, number in order:
         inbox.put(measurement(number, incarnation))
-        out += names(inbox.taken())
+        out += names(inbox)
     assert out == sorted(out)
     assert [name for name in out if name[0] == 3] == [(3, number) for number in range(4)]
     assert inbox.waiting == 0, "nothing of a past incarnation is kept"
@@ -51,17 +52,17 @@ def test_of_two_incarnations_the_earlier_is_taken_as_far_as_it_is_there(order):
 def test_a_measurement_waits_until_those_before_it_are_here():
     inbox = Inbox()
     inbox.put(measurement(1))
-    assert names(inbox.taken()) == []
+    assert names(inbox) == []
     inbox.put(measurement(0))
-    assert names(inbox.taken()) == [(0, 0), (0, 1)]
+    assert names(inbox) == [(0, 0), (0, 1)]
 
 
 def test_who_stops_taking_finds_the_next_measurement_later():
     inbox = Inbox()
     for number in range(3):
         inbox.put(measurement(number))
-    assert next(inbox.taken()).number == 0
-    assert names(inbox.taken()) == [(0, 1), (0, 2)]
+    assert inbox.take_next().number == 0
+    assert names(inbox) == [(0, 1), (0, 2)]
 
 
 def test_the_gap_is_what_is_missing_before_the_earliest_that_waits():
@@ -69,19 +70,19 @@ def test_the_gap_is_what_is_missing_before_the_earliest_that_waits():
     assert inbox.gap is None
     for number in (0, 4, 7):
         inbox.put(measurement(number))
-    assert names(inbox.taken()) == [(0, 0)]
+    assert names(inbox) == [(0, 0)]
     assert inbox.gap == (0, 1, 3)
     for number in (1, 2, 3):
         inbox.put(measurement(number))
     assert inbox.gap is None
-    assert names(inbox.taken()) == [(0, 1), (0, 2), (0, 3), (0, 4)]
+    assert names(inbox) == [(0, 1), (0, 2), (0, 3), (0, 4)]
     assert inbox.gap == (0, 5, 6)
 
 
 def test_a_later_incarnation_whose_beginning_is_missing_is_a_gap():
     inbox = Inbox()
     inbox.put(measurement(3, incarnation=1))
-    assert names(inbox.taken()) == []
+    assert names(inbox) == []
     assert inbox.gap == (1, 0, 2)
 
 
@@ -90,9 +91,9 @@ def test_a_later_incarnation_begins_with_its_measurement_0_and_the_earlier_one_i
     for number in (0, 2):
         inbox.put(measurement(number))
     inbox.put(measurement(0, incarnation=5))
-    assert names(inbox.taken()) == [(0, 0), (5, 0)]
+    assert names(inbox) == [(0, 0), (5, 0)]
     inbox.put(measurement(1))
-    assert names(inbox.taken()) == []
+    assert names(inbox) == []
     assert (inbox.incarnation, inbox.next_measurement, inbox.waiting) == (5, 1, 0)
 
 
@@ -103,7 +104,7 @@ def test_what_an_earlier_life_consumed_is_not_taken_again():
     inbox.put(measurement(0))
     inbox.resume(2, 4)
     inbox.put(measurement(3, incarnation=2))
-    assert names(inbox.taken()) == [(2, 4), (2, 5)]
+    assert names(inbox) == [(2, 4), (2, 5)]
 
 
 def test_received_counts_what_is_here_without_a_gap_consumed_or_not():
@@ -111,12 +112,12 @@ def test_received_counts_what_is_here_without_a_gap_consumed_or_not():
     for number in (0, 1, 2, 4):
         inbox.put(measurement(number))
     assert inbox.received == 3
-    assert next(inbox.taken()).number == 0
+    assert inbox.take_next().number == 0
     assert inbox.received == 3
     inbox.put(measurement(3))
     assert inbox.received == 5
     inbox.put(measurement(0, incarnation=1))
-    list(inbox.taken())
+    names(inbox)
     assert inbox.received == 1
 
 
@@ -127,7 +128,7 @@ def test_the_tail_is_asked_for_whatever_a_stranger_has_published_behind_it():
         inbox.put(each)
     end = m.StreamEnd(robot="r1", incarnation=0, measurements=9)
     assert inbox.missing(end) == (0, 3, 8), "what waits for its turn is here"
-    assert names(inbox.taken()) == [(0, 0), (0, 1), (0, 2)]
+    assert names(inbox) == [(0, 0), (0, 1), (0, 2)]
     assert inbox.missing(end) == (0, 3, 8)
     inbox.put(measurement(40))
     assert inbox.missing(end) == (0, 3, 39)

@@ -1,5 +1,6 @@
 """Recomputes one robot's messages: its node over its recorded measurements."""
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
 
@@ -8,11 +9,9 @@ from central.desk.verification.recorded import Identity, Recorded, identity
 from team.config import RobotConfig
 from team.containment import Boundary
 from team.pairs import FEEDBACK
-from team.robot.front_end import BoundedEstimator
-from team.robot.ledger import OnDisposition, no_listener
-from team.robot.node import RobotNode
-from team.robot.poses import RunningPoses, outside_team_frame
-from team.robot.statements import MessageWriter
+from team.robot.ledger import OnDisposition
+from team.robot.node import robot_node
+from team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -34,17 +33,18 @@ class RecordedPoses(RunningPoses):
     def __init__(
         self, config: RobotConfig, recorded: PriorsNamed, withdrawn: WithdrawnAt = ()
     ) -> None:
-        super().__init__(config, [])
+        super().__init__(config, deque(maxlen=0))
         self._recorded = recorded
         self._withdrawn = withdrawn
 
-    def at(self, stamp_ns: int, front: BoundedEstimator, writer: MessageWriter) -> list[Outgoing]:
+    def at(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
         """The poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
-        for prior in self._recorded.get((writer.incarnation, stamp_ns), ()):
-            here = prior if prior is not None and prior.incarnation == writer.incarnation else None
-            out += self.posed(stamp_ns, here, front, writer)
-        if out and (writer.incarnation, stamp_ns) in self._withdrawn:
+        incarnation = estimator.writer.incarnation
+        for prior in self._recorded.get((incarnation, stamp_ns), ()):
+            here = prior if prior is not None and prior.incarnation == incarnation else None
+            out += self.posed(stamp_ns, here, estimator)
+        if out and (incarnation, stamp_ns) in self._withdrawn:
             out.append(outside_team_frame(out[0]))
         return out
 
@@ -61,9 +61,9 @@ class RecomputedRobot:
         digest: bytes,
         recorded: PriorsNamed,
         withdrawn: WithdrawnAt = (),
-        on_disposition: OnDisposition = no_listener,
+        on_disposition: OnDisposition | None = None,
     ) -> None:
-        self.node = RobotNode(
+        self.node = robot_node(
             config,
             announced=digest,
             poses=RecordedPoses(config, recorded, withdrawn),
@@ -86,7 +86,7 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
     def new() -> RecomputedRobot:
         robot = RecomputedRobot(config, digest, named, withdrawn)
-        if log.known_map is not None:
+        if log.known_map is not None and ch.KNOWN_MAP in robot.node.listens:
             robot.given(log.known_map)
         return robot
 
@@ -230,7 +230,7 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     config, digest = log.robot_config(robot)
     disposition_of: dict[int, str] = {}
     node = RecomputedRobot(config, digest, {}, on_disposition=disposition_of.__setitem__)
-    if log.known_map is not None:
+    if log.known_map is not None and ch.KNOWN_MAP in node.node.listens:
         node.given(log.known_map)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = log.measurements.get((robot, incarnation))

@@ -19,8 +19,8 @@ from sim.studies.experiments.task import Task
 from sim.studies.experiments.true_minimum import true_minimum
 from sim.world.config import SimulatedWorld
 from sim.world.streams import WorldStreams
-from team.config import Estimator, FusionRule
-from team.robot.node import RobotNode
+from team.config import Estimator, Exchange, FusionRule, RobotConfig
+from team.robot.node import RobotNode, robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
@@ -145,21 +145,29 @@ class TimedRun:
             "seconds_per_fusion": self._centre.seconds / self._fusions if self._fusions else None,
         }
 
-    def _nodes(self) -> tuple[type[RobotNode], type[CentralNode]]:
-        """The node classes that measure the time of handling a message."""
+    def _nodes(
+        self,
+    ) -> tuple[Callable[[RobotConfig, Exchange], RobotNode], type[CentralNode]]:
+        """The makers of nodes that measure the time of handling a message."""
         robots, centre = self._robots, self._centre
 
-        class TimedRobot(RobotNode):
-            def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        def timed_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
+            node = robot_node(config, exchange)
+            handle = node.handle
+
+            def timed(message: m.Message, now_ns: int) -> list[Outgoing]:
                 with robots:
-                    return super().handle(message, now_ns)
+                    return handle(message, now_ns)
+
+            node.handle = timed  # type: ignore[method-assign]
+            return node
 
         class TimedCentre(CentralNode):
             def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
                 with centre:
                     return super().handle(message, now_ns)
 
-        return TimedRobot, TimedCentre
+        return timed_robot, TimedCentre
 
 
 class _Watch:

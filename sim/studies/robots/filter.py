@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sim.studies.robots.estimator import KnownMap
 from team.config import RobotConfig, Sensor
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.models import Increment
-from team.robot.estimator import InitialPose, KnownMap
+from team.robot.own_map import InitialPose
 
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"

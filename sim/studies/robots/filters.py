@@ -18,6 +18,7 @@ from sim.studies.estimators import (
 from sim.studies.estimators.hybrid_thesis_coded import CodedState
 from sim.studies.estimators.localisation import Localisation
 from sim.studies.estimators.plain_fastslam import PlainFastSlam
+from sim.studies.robots.estimator import KnownMap
 from sim.studies.robots.filter import IN_POSE, Filter, FilterStep, InitialState, Judged, Step
 from sim.studies.robots.likelihood import with_association
 from team import translate
@@ -28,7 +29,7 @@ from team.estimation.geometry import tangent
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import Increment
-from team.robot.estimator import InitialPose, KnownMap
+from team.robot.own_map import InitialPose
 
 
 def _random(filter_step: Callable[..., Any]) -> FilterStep:

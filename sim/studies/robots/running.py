@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from sim.studies.robots.estimator import Estimates, KnownMap
 from sim.studies.robots.filter import Step
 from sim.studies.robots.filters import FILTERS
 from team.config import UNNAMED, RobotConfig
@@ -28,7 +29,7 @@ from team.estimation.scans import Scan, unclaimed
 from team.estimation.submap import Became
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
-from team.robot.estimator import Cloud, Estimates, InitialPose, KnownMap, thinned
+from team.robot.own_map import Cloud, InitialPose, thinned
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 """Added to a running pose's covariance [m², m², rad²], which may be singular: an exactly known

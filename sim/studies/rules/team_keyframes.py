@@ -55,7 +55,7 @@ class _Stream:
         """Cut the measurements that are complete into keyframes."""
         if self.config is None:
             return
-        for measurement in self.inbox.taken():
+        while (measurement := self.inbox.take_next()) is not None:
             if not self.broken:
                 self._take(measurement, self.config)
         if self.complete and self.covered_ns != float("inf"):

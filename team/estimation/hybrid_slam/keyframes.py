@@ -98,7 +98,7 @@ class Segmenter:
         self._scan_motion = np.zeros(3)
         self._since_look: Increment | None = None
         self.rest_forward = np.zeros(3)
-        self._mount = np.array(sensor.mount)
+        self._is_mounted, self._mount = sensor.is_mounted, np.array(sensor.mount)
         self._unmount = adjoint(inverse(self._mount))
         self._last = STANDING
         self._unmeasured: Float[np.ndarray, "3 3"] | None = None
@@ -127,11 +127,10 @@ class Segmenter:
         if self.now_ns is not None and stamp_ns < self.now_ns:
             return Rejection.OLDER
         mask, r, b = scanned(self._sensor, ranges, bearings)
-        accepted = np.count_nonzero(mask)
-        if len(ids) and not accepted:
-            return Rejection.SENSOR_LIMITS
         noises = unclaimed(len(r)) if own is None else own
-        if accepted < len(mask):
+        if not mask.all():
+            if not mask.any():
+                return Rejection.SENSOR_LIMITS
             ids, r, b, noises = ids[mask], r[mask], b[mask], noises[mask]
         noises = calibrated(noises, self._sensor)
         scan = KeyframeScan(stamp_ns, ids, r, b, noises)
@@ -159,35 +158,43 @@ class Segmenter:
         self._here_ns = stamp_ns - duration_ns
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             scan = self._waiting.pop(0)
-            keyframes += self._nodes(scan.stamp_ns - 1, over)
+            if self._grid is not None:
+                keyframes += self._nodes(scan.stamp_ns - 1, over, self._grid)
             at_ns = self._go_on_to(scan.stamp_ns, over)
-            if self._keyframe_ns and not scan.is_unnamed:
-                self._keep(scan)
-                continue
-            self._settle()
-            motion = self._increment if self._since_look is None else self._since_look
-            scan = replace(scan, at_ns=at_ns, motion=motion)
             if scan.is_unnamed:
-                self._since_look = Increment.identity()
-            if self._keyframe_ns:
+                keyframes += self._look(scan, at_ns)
+            elif self._keyframe_ns:
                 self._keep(scan)
-            elif scan.is_unnamed:
-                keyframes.append(replace(self._keyframe_at(at_ns, *NOTHING), looks=(scan,)))
             else:
+                self._settle()
                 seen = scan.ids, scan.ranges, scan.bearings
                 keyframes.append(self._keyframe_at(at_ns, *seen, scan.own))
-        keyframes += self._nodes(stamp_ns, over)
-        self._integrate(stamp_ns - self._here_ns, 0, over)
+        if self._grid is not None:
+            keyframes += self._nodes(stamp_ns, over, self._grid)
+        self._go_on_to(stamp_ns, over)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
             self._settle()
             keyframes.append(self._close_keyframe(stamp_ns))
         return keyframes
 
+    def _look(self, scan: KeyframeScan, at_ns: int) -> list[Keyframe]:
+        """Keep a scan without identities with the motion since the one before; returns its
+        keyframe, if it is one.
+        """
+        self._settle()
+        motion = self._increment if self._since_look is None else self._since_look
+        scan = replace(scan, at_ns=at_ns, motion=motion)
+        self._since_look = Increment.identity()
+        if self._keyframe_ns:
+            self._keep(scan)
+            return []
+        return [replace(self._keyframe_at(at_ns, *NOTHING), looks=(scan,))]
+
     def _keep(self, scan: KeyframeScan) -> None:
         """Keep a scan of the keyframe, here; its pose is known once the motion up to it is."""
         self._keyframe.append(scan)
-        if self._run:
+        if self._run.is_pending:
             self._run.mark()
         else:
             self._scan_poses.append(self._scan_motion)
@@ -220,13 +227,12 @@ class Segmenter:
         """Number of scans that wait for odometry to cover their time."""
         return len(self._waiting)
 
-    def _nodes(self, until_ns: int, over: OdometryInterval) -> list[Keyframe]:
+    def _nodes(self, until_ns: int, over: OdometryInterval, grid: PoseGrid) -> list[Keyframe]:
         """The grid times up to until_ns as keyframes; inter-robot measurements up to there reach
         their node.
         """
         keyframes = []
-        grid = self._grid
-        while grid is not None and (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
+        while (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
             self._go_on_to(next_ns, over)
             self._settle()
             if grid.reach():
@@ -235,15 +241,14 @@ class Segmenter:
 
     def _go_on_to(self, stamp_ns: int, over: OdometryInterval) -> int:
         """Integrate up to a stamp; a stamp before the interval's start is taken as its start."""
-        at_ns = max(stamp_ns, self._here_ns)
-        self._integrate(at_ns - self._here_ns, over.end_ns - at_ns, over)
-        self._here_ns = at_ns
-        return at_ns
+        if stamp_ns <= self._here_ns:
+            return self._here_ns
+        self._integrate(stamp_ns - self._here_ns, over.end_ns - stamp_ns, over)
+        self._here_ns = stamp_ns
+        return stamp_ns
 
     def _integrate(self, duration_ns: int, rest_ns: int, over: OdometryInterval) -> None:
-        if duration_ns <= 0:
-            return
-        if self._is_plain(over):
+        if over.moved is None and self._unmeasured is None and not self._is_mounted:
             self._run.add(over, duration_ns)
             return
         self._settle()
@@ -253,12 +258,12 @@ class Segmenter:
             step = Increment(step.mean, added)
         if self._grid is not None:
             self._grid.moved(step)
-        if self._sensor.is_mounted:
+        if self._is_mounted:
             step = of_sensor(step, self._mount)
         self._increment = self._increment.then(step)
         if self._motion.calibrated_speed is not None:
             column = over.forward_column(self._motion, duration_ns)
-            if self._sensor.is_mounted:
+            if self._is_mounted:
                 column = dense.product(self._unmount, column)
             self._forward = carried_on(self._forward, step.mean) + column
         if self._keyframe_ns:
@@ -266,14 +271,9 @@ class Segmenter:
         if self._since_look is not None:
             self._since_look = self._since_look.then(step)
 
-    def _is_plain(self, over: OdometryInterval) -> bool:
-        """Whether an interval's motion follows from its speeds alone."""
-        is_measured = over.moved is None and self._unmeasured is None
-        return is_measured and not self._sensor.is_mounted
-
     def _settle(self) -> None:
         """Bring the motions up to date with the intervals driven since the last call."""
-        if not self._run:
+        if not self._run.is_pending:
             return
         if self._since_look is not None:
             self._since_look = self._run.behind(self._since_look)

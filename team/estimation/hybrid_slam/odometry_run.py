@@ -105,26 +105,32 @@ def _adjoint_of_inverse(step: Pose, Ad: Spread) -> None:
 
 
 class OdometryRun:
-    """Parts of intervals whose motion follows from their speeds, stored until it is needed."""
+    """Parts of intervals whose motion follows from their speeds, stored until it is needed.
+
+    is_pending: whether there are any.
+    """
 
     def __init__(self, motion: MotionModel) -> None:
         self._model = model_of(motion)
-        self._parts: list[tuple[int, float, float]] = []
-        self._marks: list[int] = []
-        self._count = 0
+        self._clear()
 
-    def __bool__(self) -> bool:
-        """Whether there are any, or marks."""
-        return bool(self._count or self._marks)
+    def _clear(self) -> None:
+        self._durations: list[int] = []
+        self._forward: list[float] = []
+        self._yaw_rates: list[float] = []
+        self._marks: list[int] = []
+        self.is_pending = False
 
     def add(self, over: OdometryInterval, duration_ns: int) -> None:
         """Adds the next part of an interval."""
-        self._parts.append((duration_ns, over.forward, over.yaw_rate))
-        self._count += 1
+        self._durations.append(duration_ns)
+        self._forward.append(over.forward)
+        self._yaw_rates.append(over.yaw_rate)
+        self.is_pending = True
 
     def mark(self) -> None:
         """Marks this place: `driven` returns the pose here."""
-        self._marks.append(self._count)
+        self._marks.append(len(self._durations))
 
     def behind(self, motion: Increment) -> Increment:
         """A motion followed by all stored parts, which remain stored."""
@@ -144,14 +150,16 @@ class OdometryRun:
         """The motions up to now with all stored parts, which are removed, and the poses since the
         first scan at the marks.
         """
-        whole, self._parts = self._whole(), []
+        whole = self._whole()
         marks = np.array(self._marks, np.int64) if self._marks else NO_MARKS
-        self._marks, self._count = [], 0
+        self._clear()
         node = since_node.mean, since_node.covariance
         since = Since(increment.mean, increment.covariance, shift, *node, of_scan)
         return gone_on(since, self._model, *whole, marks)
 
     def _whole(self) -> Driven:
-        durations = np.array([part[0] for part in self._parts], np.int64)
-        speeds = np.array([part[1:] for part in self._parts], np.float64).reshape(-1, 2)
-        return durations, np.ascontiguousarray(speeds[:, 0]), np.ascontiguousarray(speeds[:, 1])
+        return (
+            np.array(self._durations, np.int64),
+            np.array(self._forward, np.float64),
+            np.array(self._yaw_rates, np.float64),
+        )

@@ -44,7 +44,6 @@ class OpenWindow:
         self._gate = OutlierGate(config.sensor, config.front_end.outlier_share)
         self._solvable = True
         self._motions: list[Increment] = []
-        self.last_keyframe_ns: int | None = None
         self._keyframes: list[Keyframe] = []
         self.settled = AssociatedKeyframes(())
         self._begin()
@@ -57,7 +56,7 @@ class OpenWindow:
         self.particles = windows.opened(front, config.sensor)
         self._least = math.inf
         self._generator = generator(config.seed, config.id, *self._key)
-        self.keyframes_ns: tuple[int, ...] = ()
+        self.keyframes_ns: list[int] = []
 
     @property
     def motion(self) -> Increment:
@@ -76,8 +75,7 @@ class OpenWindow:
     def advance(self, keyframe: Keyframe) -> None:
         """Move and weigh the particles with the measurements that agree with others so far."""
         self._motions.append(keyframe.increment)
-        self.last_keyframe_ns = keyframe.stamp_ns
-        self._try(lambda: self._admit(keyframe))
+        self._try(self._admit, keyframe)
 
     def confirm(self) -> None:
         """Compute the window again with the measurements that are confirmed by all of it.
@@ -94,7 +92,7 @@ class OpenWindow:
         """
         if rest.mean.any() or rest.covariance.any():
             self._motions.append(rest)
-            self._try(lambda: self._go(rest, forward))
+            self._try(self._go, rest, forward)
 
     def solved(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
         """The Gaussian that `step` makes of the window; None where it has none."""
@@ -114,7 +112,7 @@ class OpenWindow:
         most = self._config.bounds.submap_landmarks
         bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
         self._keyframes.append(bounded)
-        self._take(self._gate.admitted(bounded))
+        self._take(self._gate.admitted(bounded) if self._gate.judges else bounded)
 
     def _take(self, keyframe: Keyframe) -> None:
         self.particles = windows.advanced(
@@ -128,13 +126,13 @@ class OpenWindow:
             own=keyframe.own,
         )
         self._least = min(self._least, self.particles.effective)
-        self.keyframes_ns = (*self.keyframes_ns, keyframe.stamp_ns)
+        self.keyframes_ns.append(keyframe.stamp_ns)
         if keyframe.is_node:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
         keyframes = self._gate.settled() if self._gate.judges else tuple(self._keyframes)
-        has_unnamed = any(each.looks for each in self._keyframes)
+        has_unnamed = bool([each for each in self._keyframes if each.looks])
         if has_unnamed:
             config = self._config
             self.settled = associate_keyframes(
@@ -161,11 +159,11 @@ class OpenWindow:
     def _go(self, rest: Increment, forward: np.ndarray) -> None:
         self.particles = windows.moved(self.particles, rest, self._generator, forward)
 
-    def _try(self, step: Callable[[], None]) -> None:
+    def _try(self, step: Callable[..., None], *arguments: object) -> None:
         """Apply a step to the particles, unless one has failed before."""
         if self._solvable:
             try:
                 with np.errstate(all="ignore"):
-                    step()
+                    step(*arguments)
             except (NotACovarianceError, np.linalg.LinAlgError):
                 self._solvable = False

@@ -18,18 +18,16 @@ class OutlierGate:
     While the window is open, a measurement is accepted if earlier ones, or others at the same time,
     agree with it. For the submap all are compared with all others, since the first measurement of a
     landmark can only be confirmed by a later one.
+
+    judges: whether outliers are expected; otherwise all measurements are accepted.
     """
 
     def __init__(self, sensor: Sensor, outlier_share: float) -> None:
         self._sensor = sensor
         self._outlier_share = outlier_share
+        self.judges = outlier_share > 0.0
         self._keyframes: list[Keyframe] = []
         self.gated = 0
-
-    @property
-    def judges(self) -> bool:
-        """Whether outliers are expected; otherwise all measurements are accepted."""
-        return self._outlier_share > 0.0
 
     def begin(self) -> None:
         """Begin a window."""

@@ -31,10 +31,16 @@ LONGEST_NS = 2**62
 """No two stamps are as far apart."""
 
 
+def _nanoseconds(seconds: float) -> int:
+    """A configured duration [ns]; one that no two stamps are apart is as good as any longer one."""
+    return min(round(seconds * 1e9), LONGEST_NS)
+
+
 class HybridSlam:
     """One incarnation of a robot's stream, from its beginning or from its last submap.
 
-    sequence: of the open window.
+    sequence: of the open window. last_measurement: the newest measurement that belongs to it, even
+    if it was rejected; the caller sets it. last_keyframe_ns: team time of its last keyframe.
     """
 
     def __init__(self, config: RobotConfig, incarnation: int) -> None:
@@ -43,26 +49,22 @@ class HybridSlam:
         self._config, self._incarnation = config, incarnation
         self._grid = PoseGrid(config.sensor, front) if with_nodes else None
         self._segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s, self._grid)
-        self._lasting_ns = (
-            min(round(front.window_s * 1e9), LONGEST_NS),
-            min(round(front.standing_s * 1e9), LONGEST_NS),
-        )
+        self._window_ns = _nanoseconds(front.window_s)
+        self._standing_ns = _nanoseconds(front.standing_s)
         self._innovation, self._scans = NOTHING, 0
         self._driven_m: float
+        self._open: OpenWindow
+        self.last_keyframe_ns: int | None
         self._start_ns: int | None = None
         self._begin_window(0, 0)
 
-    def resume(self, closed: ClosedWindow) -> None:
-        """Continue behind an earlier submap: the next window begins where that one ended."""
-        self._start_ns = closed.end_ns
-        self._segmenter.begin(closed.end_ns)
-        self._begin_window(closed.sequence + 1, closed.last_measurement + 1)
+    def resume(self, sequence: int, last_measurement: int, end_ns: int) -> None:
+        """Continue after an earlier submap: the next window begins where that one ended."""
+        self._start_ns = end_ns
+        self._segmenter.begin(end_ns)
+        self._begin_window(sequence + 1, last_measurement + 1)
 
     # A measurement comes in.
-
-    def consumed(self, measurement: int) -> None:
-        """Note that the measurement belongs to the open window, even if it was rejected."""
-        self._last_measurement = measurement
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""
@@ -87,6 +89,7 @@ class HybridSlam:
         self._driven_m += abs(interval.speed) * interval.duration_ns * 1e-9
         for keyframe in self._segmenter.drive(interval, measured=measured):
             self._open.advance(keyframe)
+            self.last_keyframe_ns = keyframe.stamp_ns
         if self._is_full(stamp_ns - self._start_ns):
             return self._close(self._start_ns, stamp_ns, self._segmenter.leave())
         if self._grid is not None:
@@ -109,15 +112,12 @@ class HybridSlam:
 
         A window with half as many landmarks as a submap may hold closes at once.
         """
-        front = self._config.front_end
-        if self._is_half_a_submap:
+        landmarks = self._open.particles.particles.ids
+        if 2 * len(landmarks) >= self._config.bounds.submap_landmarks:
             return True
-        stands = self._driven_m < front.window_m and lasting_ns < round(front.standing_s * 1e9)
-        return lasting_ns >= round(front.window_s * 1e9) and not stands
-
-    @property
-    def _is_half_a_submap(self) -> bool:
-        return 2 * len(self.window.particles.ids) >= self._config.bounds.submap_landmarks
+        is_slow = self._driven_m < self._config.front_end.window_m
+        stands = is_slow and lasting_ns < self._standing_ns
+        return lasting_ns >= self._window_ns and not stands
 
     def _close(self, start_ns: int, end_ns: int, late: int = 0) -> ClosedWindow:
         """Close the open window; where it has no solution, its submap is the odometry's motion
@@ -134,7 +134,7 @@ class HybridSlam:
         closed = ClosedWindow(
             sequence=self.sequence,
             first_measurement=self._first_measurement,
-            last_measurement=self._last_measurement,
+            last_measurement=self.last_measurement,
             start_ns=start_ns,
             end_ns=end_ns,
             local=submap if is_sensible and submap is not None else self._moved_alone(),
@@ -151,32 +151,28 @@ class HybridSlam:
                 slips=found.slips,
                 sightings=() if self._grid is None else self._grid.sightings(),
                 window=windows.of_base(self.window),
-                keyframes_ns=self._open.keyframes_ns,
+                keyframes_ns=tuple(self._open.keyframes_ns),
                 innovation=self.window.innovation,
             )
         self._innovation = self._innovation.plus(closed.innovation)
         self._start_ns = end_ns
         self._segmenter.begin(end_ns)
-        self._begin_window(self.sequence + 1, self._last_measurement + 1)
+        self._begin_window(self.sequence + 1, self.last_measurement + 1)
         return closed
 
     def _begin_window(self, sequence: int, first_measurement: int) -> None:
         self.sequence = sequence
-        self._first_measurement, self._last_measurement = first_measurement, first_measurement - 1
+        self._first_measurement, self.last_measurement = first_measurement, first_measurement - 1
         self._driven_m = 0.0
+        self.last_keyframe_ns = None
         self._open = OpenWindow(self._config, self._incarnation, sequence)
 
-    # What the open window says meanwhile.
+    # The open window meanwhile.
 
     @property
     def window(self) -> Window:
         """The particles of the open window, their paths and measurements."""
         return self._open.particles
-
-    @property
-    def last_keyframe_ns(self) -> int | None:
-        """Team time of the open window's last keyframe."""
-        return self._open.last_keyframe_ns
 
     def running(self) -> LocalMap | None:
         """The Gaussian of the open window at its last keyframe, if there is one; it is not a
@@ -184,7 +180,7 @@ class HybridSlam:
         """
         if self.last_keyframe_ns is None:
             return None
-        found = self._open.solved(lambda window: windows.gaussian(window, running=True))
+        found = self._open.solved(_running)
         return self._moved_alone() if found is None else found
 
     def _moved_alone(self) -> LocalMap:
@@ -195,6 +191,11 @@ class HybridSlam:
     def innovation(self) -> Innovation:
         """The innovations of all windows of this incarnation that this process has computed."""
         return self._innovation.plus(self.window.innovation)
+
+
+def _running(window: Window) -> LocalMap:
+    """The window's Gaussian so far."""
+    return windows.gaussian(window, running=True)
 
 
 def _submap(window: Window) -> LocalMap:

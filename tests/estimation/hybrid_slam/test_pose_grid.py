@@ -154,7 +154,7 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
     slam = HybridSlam(config(front_end=front), 1)
     closed = []
     for k in range(1, 7):
-        slam.consumed(k)
+        slam.last_measurement = k
         if k > 1:
             reason = slam.sight(k * SECOND - 500_000_000, k, look())
             assert reason == ("no pose node near it" if k == 4 else None), "its node was the end"

@@ -5,22 +5,21 @@ import numpy as np
 import pytest
 
 from sim.studies.estimators import dead_reckoning, ekf_slam, localisation, plain_fastslam
-from sim.studies.robots.running import POSE_FLOOR
-from team import translate
-from team.estimation.gaussian import NO_LANDMARKS
-from team.estimation.models import Increment, corrected, increment_of
-from team.estimation.odometry import OdometryInterval
-from team.estimation.randomness import generator
-from team.pairs import PAIRS, rules_for
-from team.robot.estimator import (
+from sim.studies.robots.estimator import (
     NOTHING_KNOWN,
     AbsorbsMaps,
     InitialPose,
     KnownMap,
-    MakesSubmaps,
     estimator_of,
 )
-from team.robot.node import RobotNode
+from sim.studies.robots.running import POSE_FLOOR
+from team import translate
+from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from team.estimation.models import Increment, corrected, increment_of
+from team.estimation.odometry import OdometryInterval
+from team.estimation.randomness import generator
+from team.pairs import PAIRS, rules_for
+from team.robot.node import robot_node
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
@@ -138,7 +137,7 @@ def test_a_map_is_said_once_per_window_and_at_the_end():
 
 @pytest.mark.parametrize("estimator", ALL)
 def test_a_node_says_how_well_its_measurements_were_predicted(estimator):
-    node = RobotNode(config(estimator=estimator, fusion=rules_for(estimator)[-1]))
+    node = robot_node(config(estimator=estimator, fusion=rules_for(estimator)[-1]))
     said = of(node.handle(TOLD, 0) + driven(node, MEASUREMENTS), ch.INNOVATION)
     if estimator == "dead-reckoning":
         assert not said, "it predicts no measurements"
@@ -172,7 +171,7 @@ def test_the_last_keyframe_is_used_at_the_end(keyframe_s):
 
 @pytest.mark.parametrize("estimator", LOCALISERS)
 def test_who_only_localises_himself_says_no_map(estimator):
-    node = RobotNode(of_name(estimator))
+    node = robot_node(of_name(estimator))
     out = node.handle(TOLD, 0) + driven(node, MEASUREMENTS)
     assert of(out, ch.OWN_POSE)
     assert not of(out, ch.OWN_MAP)
@@ -181,7 +180,7 @@ def test_who_only_localises_himself_says_no_map(estimator):
 
 
 def test_dead_reckoning_has_a_pose_at_every_interval_and_rejects_landmarks():
-    node = RobotNode(of_name("dead-reckoning"))
+    node = robot_node(of_name("dead-reckoning"))
     out = driven(node, MEASUREMENTS)
     assert [x.stamp_ns for x in of(out, ch.OWN_POSE)] == STREAM.intervals.end_ns.tolist()
     (done,) = of(out, ch.ROBOT_DONE)
@@ -191,7 +190,7 @@ def test_dead_reckoning_has_a_pose_at_every_interval_and_rejects_landmarks():
 
 
 def test_localisation_waits_for_the_map_that_it_is_told():
-    node = RobotNode(of_name("localisation"))
+    node = robot_node(of_name("localisation"))
     assert driven(node, MEASUREMENTS) == []
     out = node.handle(TOLD, 0)
     assert len(of(out, ch.OWN_POSE)) == 12
@@ -211,12 +210,12 @@ def test_localisation_finds_itself_from_an_unknown_start():
 
 
 def test_the_last_word_names_the_last_map():
-    out = driven(RobotNode(of_name("ekf-slam")), MEASUREMENTS[:-2])
+    out = driven(robot_node(of_name("ekf-slam")), MEASUREMENTS[:-2])
     maps, (done,) = of(out, ch.OWN_MAP), of(out, ch.ROBOT_DONE)
     assert (done.incarnation, done.last_map) == (maps[-1].incarnation, maps[-1].sequence)
     assert [x.sequence for x in maps] == [3, 6, 9, 11]
     assert all(x.joint for x in maps)
-    own = driven(RobotNode(config()), MEASUREMENTS)
+    own = driven(robot_node(config()), MEASUREMENTS)
     assert of(own, ch.ROBOT_DONE)[0].last_map == -1, "under `join` nobody consumes own maps"
 
 
@@ -224,8 +223,22 @@ def test_the_last_word_names_the_last_map():
 def test_what_has_no_meaning_is_refused_with_the_estimators_name(estimator):
     member = estimator_of(of_name(estimator), 1)
     assert not isinstance(member, AbsorbsMaps)
-    assert not isinstance(member, MakesSubmaps)
-    node = RobotNode(of_name(estimator))
-    (submap,) = of(driven(RobotNode(config()), MEASUREMENTS), ch.SUBMAP)[:1]
+    node = robot_node(of_name(estimator))
+    (submap,) = of(driven(robot_node(config()), MEASUREMENTS), ch.SUBMAP)[:1]
     with pytest.raises(ValueError, match="no submaps to resume from"):
         node.resume(MEASUREMENTS[0], [submap])
+
+
+def test_the_thesis_member_starts_where_it_is_told_and_replaces_what_it_absorbs():
+    robot = config(estimator="hybrid-thesis", fusion="kalman-per-axis")
+    member = estimator_of(robot, 1, InitialPose(np.array([1.0, 2.0, 0.5]), None))
+    np.testing.assert_array_equal(member.own_pose().mean, [1.0, 2.0, 0.5])
+    fed(member, MEASUREMENTS[1:])
+    assert member.sequence == sum(isinstance(r, m.Observations) for r in MEASUREMENTS)
+    before = member.own_map()
+    assert len(before.ids) > 0
+    told = LandmarkGaussian(before.ids[:1], np.array([[50.0, 60.0]]), 4.0 * np.eye(2))
+    member.absorb(told)
+    after = member.own_map()
+    np.testing.assert_array_equal(after.means, [[50.0, 60.0], *before.means[1:]])
+    np.testing.assert_array_equal(after.covariance[:2, :2], 4.0 * np.eye(2))

@@ -1,6 +1,4 @@
-"""The interface between a robot's node and its estimator, and the further abilities that some
-have.
-"""
+"""The interface between a robot of a comparison and its estimator over a whole stream."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -10,28 +8,15 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import RobotConfig
-from team.estimation import elementwise, geometry
-from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.fastslam import Particles
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.pose_grid import TeammateScan
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import Scan
-from team.estimation.submap import Became, LocalMap
+from team.estimation.submap import Became
 from team.pairs import ESTIMATORS
 from team.registry import loaded
 from team.rejection import Rejection
-
-CLOUD_PARTICLES = 32
-"""Particles in a cloud for viewers."""
-
-
-class InitialPose(NamedTuple):
-    """Where a stream begins: a pose (None: unknown) and its covariance (None: exact)."""
-
-    pose: Float[np.ndarray, "3"] | None
-    covariance: Matrix | None
+from team.robot.own_map import AT_ORIGIN, Cloud, InitialPose
 
 
 class KnownMap(NamedTuple):
@@ -41,35 +26,17 @@ class KnownMap(NamedTuple):
     landmarks: Float[np.ndarray, "L 2"]
 
 
-AT_ORIGIN = InitialPose(np.zeros(3), None)
 NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
 
 
-class Cloud(NamedTuple):
-    """A thinned particle cloud in the own map's frame: P poses and their weights, summing to 1."""
-
-    poses: Float[np.ndarray, "P 3"]
-    weights: Float[np.ndarray, " P"]
-
-
-def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
-    """Thin out the particles evenly; origin: the pose of their frame in the own map's frame."""
-    every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
-    logs = particles.log_weights[::every]
-    weights = elementwise.exp(logs - logs.max())
-    poses = np.ascontiguousarray(particles.poses[::every])
-    return Cloud(geometry.composed_with(origin, poses), weights / weights.sum())
-
-
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """What an odometry interval led to: a submap, and the stamps of a new running pose and map.
+    """The results of an odometry interval: the stamps of a new running pose and map.
 
     cloud: returns the particles, where there are any, until the next interval is taken. judged: the
-    innovation of an estimator without windows since it was last reported, and its time. became: the
-    outcomes of all detections without identities, from such an estimator at the end of its stream.
+    innovation since it was last reported, and its time. became: the outcomes of all detections
+    without identities, at the end of the stream.
     """
 
-    closed: ClosedWindow | None = None
     pose_ns: int | None = None
     map_ns: int | None = None
     cloud: Callable[[], Cloud] | None = None
@@ -103,12 +70,10 @@ class RobotEstimator(Protocol):
         """Take a scan of landmarks; returns the reason if it is rejected."""
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
-        """Take one odometry interval, or only its duration (not measured); returns what it led
-        to.
-        """
+        """Take one odometry interval, or only its duration (not measured); returns its results."""
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; returns what that led to, and the number of scans that no odometry
+        """End the stream; returns the last results, and the number of scans that no odometry
         covered.
         """
 
@@ -117,23 +82,6 @@ class RobotEstimator(Protocol):
 
     def own_map(self) -> LandmarkGaussian:
         """The running map from own measurements (and what was absorbed)."""
-
-
-@runtime_checkable
-class MakesSubmaps(Protocol):
-    """An estimator whose windows become submaps; it can be reset to its last submap."""
-
-    def consumed(self, measurement: int) -> None:
-        """Note that the measurement with this counter belongs to the open window."""
-
-    def resume(self, closed: ClosedWindow) -> None:
-        """Continue behind a submap of an earlier process."""
-
-    def sight(self, stamp_ns: int, measurement: int, looks: TeammateScan) -> Rejection | None:
-        """Take inter-robot measurements; returns the reason if they are rejected."""
-
-    def open_window(self) -> LocalMap | None:
-        """The Gaussian since the last submap, if there is a keyframe in it."""
 
 
 @runtime_checkable

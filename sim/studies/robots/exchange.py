@@ -1,0 +1,81 @@
+"""The exchange of whole maps between a robot and a centre that fuses them.
+
+A map goes out every `exchange_s`, with its joint covariance. Under a rule with feedback the robot
+then waits for the answer (lockstep), which its own map absorbs.
+"""
+
+from collections import deque
+
+from team.config import RobotConfig
+from team.estimation.gaussian import LandmarkGaussian
+from team.pairs import FEEDBACK, PAIRS
+from team.robot.statements import MessageWriter
+from team.wire.bus import Outgoing
+
+JOINT_LANDMARKS = 2000
+"""An own map with more landmarks carries their 2 × 2 covariances only: a message has at most 64
+MiB."""
+
+
+class MapExchange:
+    """The rounds of one robot.
+
+    exchanges: whether the rule fuses own maps. lockstep: each map is answered before the robot goes
+    on. answered: the last round that was answered; awaited: that of the last map that was sent.
+    last: the sequence of the last map that was sent; −1: none.
+    """
+
+    def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
+        self.exchanges = PAIRS[config.estimator, config.fusion] == "own/map"
+        self.lockstep = config.fusion in FEEDBACK
+        self._warnings = warnings
+        self._every_ns = config.exchange_s * 1e9
+        self._map_ns: int | None = None
+        self._sent_ns: int | None = None
+        self.answered = self.awaited = 0
+        self.last = -1
+
+    @property
+    def waits(self) -> bool:
+        """Whether a map that was sent has no answer yet."""
+        return self.lockstep and self.awaited > self.answered
+
+    def take_answer(self, round_: int) -> bool:
+        """Take the answer of a round; returns whether it is new."""
+        if not self.lockstep or round_ <= self.answered:
+            return False
+        self.answered = round_
+        return True
+
+    def is_sent(self, stamp_ns: int) -> bool:
+        """Note a new map; returns whether it is sent: for viewers, or because a round is due."""
+        self._map_ns = stamp_ns
+        since = None if self._sent_ns is None else stamp_ns - self._sent_ns
+        return not self.exchanges or since is None or since >= self._every_ns
+
+    @property
+    def unsent_ns(self) -> int | None:
+        """The stamp of the last map, if an exchange is still to have it."""
+        is_new = self.exchanges and self._map_ns != self._sent_ns
+        return self._map_ns if is_new else None
+
+    def message(
+        self,
+        stamp_ns: int,
+        sequence: int,
+        landmarks: LandmarkGaussian,
+        writer: MessageWriter,
+        *,
+        joint: bool,
+    ) -> Outgoing:
+        """The message of a map; one that is exchanged opens a round."""
+        if self.exchanges:
+            self._sent_ns, self.last = stamp_ns, sequence
+            self.awaited = self.answered + 1 if self.lockstep else self.awaited
+        joint = joint and self.exchanges
+        if joint and len(landmarks.ids) > JOINT_LANDMARKS:
+            joint = False
+            self._warnings.append("the own map is too large for a joint covariance")
+        return writer.own_map(
+            stamp_ns, sequence, self.awaited, landmarks, "joint" if joint else "blocks"
+        )

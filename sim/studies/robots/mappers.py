@@ -1,0 +1,220 @@
+"""The mappers of robots of a comparison: Hybrid-SLAM whose own map is exchanged, and estimators
+with one state over a whole stream.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sim.studies.robots.estimator import (
+    NOTHING_KNOWN,
+    AbsorbsMaps,
+    Associates,
+    Estimates,
+    KnownMap,
+    RobotEstimator,
+    estimator_of,
+)
+from sim.studies.robots.exchange import MapExchange
+from team import translate
+from team.config import RobotConfig
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.hybrid_slam.pose_grid import TeammateScan
+from team.estimation.map_joining.whole_map import absorbed
+from team.estimation.scans import Scan
+from team.estimation.submap import LocalMap
+from team.pairs import NEEDS_MAP
+from team.rejection import UNMEASURED, Rejection
+from team.robot.mapper import Mapper
+from team.robot.own_map import InitialPose
+from team.wire import messages as m
+
+
+class ExchangingMapper(Mapper):
+    """Hybrid-SLAM whose own map goes out in exchanges, or for viewers where the rule takes no maps.
+
+    joint: whether its map has a joint covariance.
+    """
+
+    joint = True
+
+    def __init__(self, config: RobotConfig, *options: Any) -> None:
+        super().__init__(config, *options)
+        self.exchange = MapExchange(config, self.warnings)
+
+    def begin(self, start: m.InitialPose) -> None:
+        """Begin an incarnation, whose maps are numbered from 0."""
+        super().begin(start)
+        self.exchange.last = -1
+
+    def is_map_due(self, start_ns: int, end_ns: int) -> bool:
+        """Whether a map is published at the end of this window, or may be exchanged."""
+        return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
+
+    def publish_map(self, stamp_ns: int) -> None:
+        """Publish the running map for viewers, or in an exchange that is due."""
+        if self.exchange.is_sent(stamp_ns):
+            self._send_map(stamp_ns)
+
+    def publish_last_map(self) -> None:
+        """Publish the last map of the stream, unless an exchange had it."""
+        if self.exchange.unsent_ns is not None:
+            self._send_map(self.exchange.unsent_ns)
+
+    def _send_map(self, stamp_ns: int) -> None:
+        landmarks = self.own_landmarks()
+        message = self.exchange.message(
+            stamp_ns, self.sequence, landmarks, self.writer, joint=self.joint
+        )
+        self.out.append(message)
+
+    @property
+    def waits_for_map(self) -> bool:
+        """Whether it waits for the map that it localises in."""
+        return False
+
+    def know(self, message: m.KnownMap) -> None:
+        """Ignore a map to localise in: Hybrid-SLAM makes its own."""
+
+    def absorb(self, landmarks: LandmarkGaussian) -> None:
+        """Replace the landmarks of the own map by the fused ones; submaps never see it."""
+        self.own_map.whole = absorbed(self.own_map.whole, *landmarks)
+
+
+class StreamMapper(ExchangingMapper):
+    """An estimator with one state from the start of a stream to its end: poses and maps, no
+    submaps.
+
+    After a fault it continues with the state as it is.
+    """
+
+    def __init__(self, config: RobotConfig, *options: Any) -> None:
+        self._known: KnownMap | None = None if config.estimator in NEEDS_MAP else NOTHING_KNOWN
+        self._known_ns: int | None = None
+        super().__init__(config, *options)
+
+    def restart_estimator(self, incarnation: int, initial: InitialPose) -> None:
+        """Make the estimator of an incarnation."""
+        known = self._known or NOTHING_KNOWN
+        self.estimator: RobotEstimator = estimator_of(self.config, incarnation, initial, known)
+        self.ledger.used, self.joint = self.estimator.used, self.estimator.joint
+
+    def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
+        """Raise ValueError: there are no submaps to resume from."""
+        raise ValueError(f"the estimator {self.config.estimator} has no submaps to resume from")
+
+    @property
+    def waits_for_map(self) -> bool:
+        """Whether it waits for the map that it localises in."""
+        return self._known is None
+
+    def know(self, message: m.KnownMap) -> None:
+        """Take the map to localise in; of two the newer one by its stamp.
+
+        Landmarks beyond the bounds are left out.
+        """
+        if self._known_ns is not None and message.stamp_ns <= self._known_ns:
+            return
+        self._known_ns = message.stamp_ns
+        ids, landmarks = translate.landmarks_of(message)
+        bound = self.config.bounds.coordinate_m
+        inside = np.abs(landmarks).max(axis=1, initial=0.0) <= bound
+        if not inside.all():
+            self.warnings.append(f"{np.count_nonzero(~inside)} known landmarks beyond the bounds")
+        self._known = KnownMap(ids[inside], landmarks[inside])
+
+    def absorb(self, landmarks: LandmarkGaussian) -> None:
+        """Replace the landmarks by the fused ones."""
+        if not isinstance(self.estimator, AbsorbsMaps):
+            raise TypeError(f"the estimator {self.config.estimator} absorbs no map")
+        self.estimator.absorb(landmarks)
+
+    # Measurements.
+
+    def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
+        """Take an odometry interval; it never closes a window."""
+        interval, rejected = self.judge_interval(measurement, is_near)
+        estimates = None
+        if interval is not None:
+            estimates = self.estimator.drive(interval, measured=rejected is None)
+        self.account(measurement, rejected)
+        if rejected in UNMEASURED:
+            offset_s = self.config.clock_offset_s
+            self.ledger.cover(translate.team_time_of(measurement, offset_s))
+        if estimates is not None:
+            self._publish(estimates)
+        return False
+
+    def finish(self) -> bool:
+        """End the incarnation: publish the last pose and map."""
+        self.passed_ns = self.now_ns
+        estimates, uncovered = self.estimator.finish()
+        self._publish(estimates)
+        self.ledger.leave_out(set())
+        self.ledger.uncover(uncovered)
+        return False
+
+    def _publish(self, estimates: Estimates) -> None:
+        """Publish the results of an interval, or of the stream's end."""
+        writer, sequence = self.writer, self.sequence
+        if estimates.pose_ns is not None:
+            self.out += self.poses.at(estimates.pose_ns, self)
+        if estimates.judged is not None:
+            judged, stamp_ns = estimates.judged
+            self.out.append(writer.innovation(stamp_ns, sequence, judged))
+        if estimates.map_ns is not None:
+            if estimates.cloud is not None:
+                self.out.append(writer.cloud(estimates.map_ns, estimates.cloud()))
+            self.publish_map(estimates.map_ns)
+        if estimates.became is not None:
+            self.out.append(writer.association(sequence, self.now_ns, estimates.became))
+
+    def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
+        """Account for the measurement in progress."""
+        super().account(measurement, rejected)
+        self.forget_window()
+
+    def note_input(self, number: int) -> None:
+        """There is no window that names its inputs."""
+
+    def repeat_window(self) -> None:
+        """There is no window to compute again."""
+
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
+        """Take a scan of landmarks; returns the reason if it is rejected."""
+        return self.estimator.observe(stamp_ns, scan)
+
+    def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
+        """Reject inter-robot measurements."""
+        return Rejection.NO_TEAMMATES
+
+    # The estimates.
+
+    @property
+    def associates(self) -> bool:
+        """Whether the estimator takes detections without identities."""
+        return isinstance(self.estimator, Associates) and self.estimator.associates
+
+    @property
+    def sequence(self) -> int:
+        """The number of the running pose and map."""
+        return self.estimator.sequence
+
+    @property
+    def innovation(self) -> Innovation:
+        """The innovation of all measurements that were predicted."""
+        return self.estimator.innovation
+
+    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+        """The running pose."""
+        return self.estimator.own_pose()
+
+    def own_landmarks(self) -> LandmarkGaussian:
+        """The running map."""
+        return self.estimator.own_map()
+
+    def open_window(self) -> LocalMap | None:
+        """There is no window."""
+        return None

@@ -1,0 +1,113 @@
+"""The node of a robot of a comparison: its centre fuses whole maps or raw measurements.
+
+Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot's map
+absorbs the fused one, and the robot waits for the answer of each exchange before it goes on.
+"""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from sim.studies.robots.mappers import ExchangingMapper, StreamMapper
+from team import translate
+from team.config import Exchange, RobotConfig
+from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
+from team.robot import node as product
+from team.robot.node import RobotNode
+from team.wire import channels as ch
+from team.wire import messages as m
+
+
+class ExchangingRobot(RobotNode):
+    """A robot with Hybrid-SLAM whose centre gives no credit for submaps."""
+
+    listens = (*RobotNode.listens, ch.KNOWN_MAP, ch.FUSED_MAP)
+    makes = ExchangingMapper
+    mapper: ExchangingMapper
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._centre_is_away = False
+        self._reported = 0
+
+    def receive(self, message: m.Message) -> None:
+        """Take a message that is no measurement."""
+        match message:
+            case m.KnownMap():
+                self.mapper.know(message)
+            case m.FusedMap() if not message.final:
+                self._absorb(message)
+            case m.Liveliness() if message.node == "central":
+                self._centre_is_away = not message.alive
+            case _:
+                super().receive(message)
+
+    def _absorb(self, fused: m.FusedMap) -> None:
+        """Take the answer of an exchange: under a rule with feedback the own map absorbs it."""
+        if not self.mapper.exchange.take_answer(fused.exchange):
+            return
+        ids, means = translate.landmarks_of(fused)
+        joint = translate.landmark_covariance_of(fused)
+        try:
+            self.mapper.absorb(LandmarkGaussian(ids, means, joint))
+        except (NotACovarianceError, np.linalg.LinAlgError) as error:
+            self.warnings.append(f"the fused map can not be absorbed: {error}")
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the robot waits for a map: to localise in, or of its centre unless it is away.
+
+        A centre that was never present may still answer: lockstep does not depend on the order in
+        which tokens arrive.
+        """
+        waits = self.mapper.exchange.waits and not self._centre_is_away
+        return self.mapper.waits_for_map or waits
+
+    def consume(self) -> None:
+        """Consume the measurements whose turn has come; a waiting robot reports those received.
+
+        Otherwise the world would wait for it, and with the world a teammate that needs more
+        measurements for its map, or the end.
+        """
+        super().consume()
+        received = self.inbox.received
+        if not self.mapper.exchange.lockstep or not self.is_held:
+            return
+        ahead = received - max(self._reported, self.consumed)
+        if ahead >= product.PROGRESS_MEASUREMENTS:
+            self._reported = received
+            self.report_progress()
+
+    def progress(self) -> m.Progress:
+        """How many measurements were consumed or reported ahead, and the time that has passed."""
+        progress = super().progress()
+        count = max(progress.measurements, self._reported)
+        return msgspec.structs.replace(progress, measurements=count)
+
+    def statement(self) -> m.Done:
+        """The account of the incarnation, with the sequence of its last map."""
+        return msgspec.structs.replace(super().statement(), last_map=self.mapper.exchange.last)
+
+    def _note_incarnation(self, incarnation: int) -> None:
+        super()._note_incarnation(incarnation)
+        self._reported = 0
+
+    def _close_incarnation(self) -> None:
+        super()._close_incarnation()
+        if self.done:
+            self.mapper.publish_last_map()
+
+
+class StreamRobot(ExchangingRobot):
+    """A robot whose estimator has one state over its whole stream."""
+
+    makes = StreamMapper
+
+
+def comparison_robot(
+    config: RobotConfig, exchange: Exchange = "continuous", **options: Any
+) -> ExchangingRobot:
+    """The robot of a comparison for a configuration."""
+    made = ExchangingRobot if config.estimator == "hybrid" else StreamRobot
+    return made(config, exchange, **options)

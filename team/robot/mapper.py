@@ -1,0 +1,379 @@
+"""The robot's mapper: measurements in their order in, messages out.
+
+    bounds → Hybrid-SLAM → ledger → submap → own map → poses
+    check    estimate      account   publish
+
+Law 1 lives here: what is published for fusion depends on the robot's own measurements alone. The
+team's map comes in as a prior and goes out as `team/pose`, and nowhere else.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from team import translate
+from team.config import Exchange, RobotConfig
+from team.door import another_time
+from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.hybrid_slam.innovation import Innovation
+from team.estimation.hybrid_slam.pipeline import HybridSlam
+from team.estimation.hybrid_slam.pose_grid import TeammateScan
+from team.estimation.odometry import OdometryInterval
+from team.estimation.plausible import start_beyond
+from team.estimation.scans import Scan, sensible
+from team.estimation.submap import LocalMap
+from team.rejection import UNMEASURED, Rejection
+from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
+from team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thinned
+from team.robot.poses import RunningPoses
+from team.robot.statements import MessageWriter
+from team.robot.submaps import Submaps
+from team.robot.warnings import slipped
+from team.stream.judge import StreamJudge
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+MOST_SET_ASIDE = 8
+"""After so many measurements of one window were set aside, the window is not computed again for
+further ones."""
+
+MOST_WARNINGS = 64
+"""Number of the newest warnings that are kept."""
+
+Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWindow]
+"""What is sent instead of a closed window, given the team's map and the submaps before it."""
+
+
+class Mapper:
+    """Hybrid-SLAM on one incarnation of a robot's stream after the other.
+
+    Call `begin` with an initial pose, `take` for each measurement in its order, and `finish`; the
+    messages to publish are appended to `out`.
+
+    ledger: law 1's account of the incarnation. submaps: all that was closed. warnings: what is
+    implausible, in words. gated: number of measurements that no others of their window confirmed.
+    now_ns: the latest stamp. passed_ns: no further window ends at this time or before.
+    """
+
+    used = "in a submap"
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        exchange: Exchange,
+        digest: bytes,
+        poses: RunningPoses | None = None,
+        replaced: Replaced | None = None,
+        on_window: Callable[[ClosedWindow], None] = lambda _: None,
+        on_disposition: OnDisposition | None = None,
+    ) -> None:
+        self.config = config
+        self.warnings: deque[str] = deque(maxlen=MOST_WARNINGS)
+        self.out: list[Outgoing] = []
+        self.poses = RunningPoses(config, self.warnings) if poses is None else poses
+        self.submaps = Submaps(config.id, exchange)
+        self._digest = digest
+        self._replaced, self._on_window = replaced, on_window
+        self._on_disposition = on_disposition
+        self._offset_ns = round(config.clock_offset_s * 1e9)
+        self._period_ns = round(config.pose_s * 1e9)
+        self.gated = 0
+        self.now_ns = self.passed_ns = 0
+        self._began_ns = 0
+        self.writer = MessageWriter(config.id, 0, digest, started=True)
+        self._restart(0, AT_ORIGIN)
+
+    # An incarnation begins, and ends.
+
+    def begin(self, start: m.InitialPose) -> None:
+        """Begin an incarnation, from its initial pose."""
+        initial = self._plausible_start(start)
+        is_known = initial.pose is not None
+        self.writer = MessageWriter(self.config.id, start.incarnation, self._digest, is_known)
+        self.submaps.begin(start)
+        self.poses.begin_incarnation(start.incarnation)
+        self._began_ns = start.stamp_ns
+        self.now_ns, self.passed_ns = max(self.now_ns, start.stamp_ns), start.stamp_ns - 1
+        self._restart(start.incarnation, initial)
+        self.note_input(start.number)
+
+    def _restart(self, incarnation: int, initial: InitialPose) -> None:
+        self.ledger = Ledger(self.used, on_disposition=self._on_disposition)
+        self._judge = StreamJudge(self.config.bounds)
+        self._taking: m.Measurement | None = None
+        self.forget_window()
+        self.restart_estimator(incarnation, initial)
+
+    def restart_estimator(self, incarnation: int, initial: InitialPose) -> None:
+        """Make the estimator of an incarnation."""
+        self._slam = HybridSlam(self.config, incarnation)
+        self.own_map = OwnMap(initial)
+
+    def _plausible_start(self, start: m.InitialPose) -> InitialPose:
+        """The initial pose and its covariance; one beyond the bounds is taken as unknown."""
+        value = translate.start_of(start)
+        why = None if value is None else start_beyond(value, self.config.bounds)
+        if why is not None:
+            self.warnings.append(f"the initial pose is refused, taken as unknown: {why}")
+            return InitialPose(None, None)
+        return InitialPose(*translate.pose_of(start))
+
+    def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
+        """Continue after the last of an incarnation's submaps, as an earlier process sent them."""
+        self.begin(start)
+        for submap in submaps:
+            self.submaps.restore(submap)
+            self.own_map.join(translate.local_map_of(submap))
+        last = submaps[-1]
+        used = last.last_measurement + 1
+        self.ledger = Ledger(self.used, used, self._on_disposition)
+        self._reopen_window()
+        self.now_ns = self.passed_ns = last.stamp_ns
+
+    def finish(self) -> bool:
+        """End the incarnation; returns whether that closed a last window."""
+        self.passed_ns = self.now_ns
+        closed, uncovered = self._slam.finish()
+        if closed is not None:
+            self._close(closed)
+        else:
+            self.ledger.leave_out(set())
+        self.ledger.uncover(uncovered)
+        return closed is not None
+
+    # A measurement.
+
+    def take(self, measurement: m.Measurement) -> bool:
+        """Take the next measurement; returns whether it closed a window."""
+        self._taking = measurement
+        # A scan comes before the odometry that ends at its stamp, and that may end a window.
+        is_odometry = isinstance(measurement, m.AnyOdometry)
+        stamp_ns = measurement.stamp_ns + (self._offset_ns if is_odometry else 0)
+        # Where its clock has leapt too far, no receiver takes a submap with such a stamp.
+        is_near = another_time(stamp_ns, self._began_ns) is None
+        if is_near:
+            self.now_ns = max(self.now_ns, stamp_ns)
+            self.passed_ns = max(self.passed_ns, stamp_ns if is_odometry else stamp_ns - 1)
+        self.note_input(measurement.number)
+        if isinstance(measurement, m.AnyOdometry):
+            return self.drive(measurement, is_near)
+        self.account(measurement, self._observe(measurement, is_near))
+        return False
+
+    def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
+        """Account for the measurement in progress and add it to the open window."""
+        used = INITIAL_POSE if isinstance(measurement, m.InitialPose) else None
+        self.ledger.count(measurement, rejected, used)
+        self._window.append(measurement)
+        self._taking = None
+
+    def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
+        """Take an odometry interval; returns whether it closed the window."""
+        before_ns = self._slam.last_keyframe_ns
+        interval, rejected = self.judge_interval(measurement, is_near)
+        closed = None
+        if interval is not None:
+            closed = self._slam.drive(interval, measured=rejected is None)
+        if closed is not None:
+            self._close(closed, measurement, rejected)
+            return True
+        self.account(measurement, rejected)
+        keyframe_ns = self._slam.last_keyframe_ns
+        if keyframe_ns != before_ns and keyframe_ns is not None:
+            self.out += self.poses.at(keyframe_ns, self)
+        return False
+
+    def judge_interval(
+        self, measurement: m.AnyOdometry, is_near: bool
+    ) -> tuple[OdometryInterval | None, Rejection | None]:
+        """The interval of an odometry message, and the reason if it, or its motion, is rejected.
+
+        Where only the motion is rejected, the interval's time is used.
+        """
+        if not is_near:
+            return None, Rejection.TIME
+        interval = translate.interval_of(measurement, self.config)
+        rejected = self._judge.odometry(interval)
+        return interval if rejected in UNMEASURED else None, rejected
+
+    def _observe(self, measurement: m.Measurement, is_near: bool) -> Rejection | None:
+        """Take what is no odometry; returns the reason if it is rejected."""
+        match measurement:
+            case m.Observations() | m.Points() | m.Detections():
+                return self._observe_landmarks(measurement, is_near)
+            case m.Sightings():
+                return self._observe_teammates(measurement, is_near)
+            case _:
+                return None
+
+    def _observe_landmarks(
+        self, measurement: m.AnyScan | m.Detections, is_near: bool
+    ) -> Rejection | None:
+        if isinstance(measurement, m.Detections) and not self.associates:
+            return Rejection.NO_ASSOCIATION
+        scan = translate.scan_of(measurement)
+        near = self._judge.near(scan.ranges)
+        if scan.own.size:
+            near &= sensible(scan.own, scan.ranges, self.config.bounds)
+        rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
+        if rejected is not None:
+            return rejected
+        if not near.all():
+            if not near.any():
+                return Rejection.RANGE
+            scan = scan.only(near)
+        return self.observe(measurement.stamp_ns, scan)
+
+    def _observe_teammates(self, measurement: m.Sightings, is_near: bool) -> Rejection | None:
+        teammates, ranges, bearings = translate.detections_of(measurement)
+        others = np.array([name != self.config.id for name in teammates], dtype=np.bool_)
+        near = self._judge.near(ranges) & others
+        rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
+        if rejected is None and len(near) and not near.any():
+            rejected = Rejection.RANGE if others.any() else Rejection.ITSELF
+        if rejected is not None:
+            return rejected
+        seen = tuple(name for name, is_in in zip(teammates, near, strict=True) if is_in)
+        return self.sight(measurement, (seen, ranges[near], bearings[near]))
+
+    # A window closes.
+
+    def _close(
+        self,
+        closed: ClosedWindow,
+        measurement: m.Measurement | None = None,
+        rejected: Rejection | None = None,
+    ) -> None:
+        """Publish a submap before anything else can raise an exception, then join it.
+
+        measurement: which closed the window; None: the stream ended.
+        """
+        writer = self.writer
+        if self._replaced is not None:
+            prior = self.poses.prior_of(writer.incarnation)
+            closed = self._replaced(closed, prior, self.submaps)
+        factors = [writer.sighting(closed, each) for each in closed.sightings]
+        submap = writer.submap(closed)
+        if measurement is not None:
+            self.account(measurement, rejected)
+        self.ledger.close(closed)
+        self.warnings += [slipped(slip) for slip in closed.slips]
+        self.out += self.submaps.close(factors, submap)
+        self.forget_window()
+        self._judge = StreamJudge(self.config.bounds, closed.end_ns)
+        self.gated += closed.gated
+        self._on_window(closed)
+        self.own_map.join(closed.local)
+        end_ns = closed.end_ns
+        shown = self.is_map_due(closed.start_ns, end_ns)
+        if shown and closed.window is not None:
+            self.out.append(
+                writer.cloud(end_ns, thinned(closed.window.particles, self.own_map.origin))
+            )
+        self.out.append(writer.innovation(end_ns, closed.sequence, closed.innovation))
+        if closed.became is not None:
+            self.out.append(writer.association(closed.sequence, end_ns, closed.became))
+        self.out += self.poses.at(end_ns, self)
+        if shown:
+            self.publish_map(end_ns)
+
+    def is_map_due(self, start_ns: int, end_ns: int) -> bool:
+        """Whether own map and particles are published at the end of this window: a multiple of
+        `pose_s` lies in it.
+
+        It depends on the stamps alone, so that a restarted robot publishes the same ones.
+        """
+        period_ns = self._period_ns
+        return period_ns == 0 or end_ns // period_ns > start_ns // period_ns
+
+    def publish_map(self, stamp_ns: int) -> None:
+        """Publish the own map, for viewers."""
+        landmarks = self.own_landmarks()
+        self.out.append(self.writer.own_map(stamp_ns, self.sequence, 0, landmarks, "blocks"))
+
+    # A fault.
+
+    def forget_window(self) -> None:
+        """Forget the measurements of the open window."""
+        self._window: list[m.Measurement] = []
+        self._aside = 0
+
+    def set_aside(self) -> bool:
+        """Reset to the state before the measurement whose handling raised an exception.
+
+        Returns False where no measurement was in progress.
+        """
+        if self._taking is None:
+            return False
+        self.ledger.count(self._taking, Rejection.SET_ASIDE)
+        self._taking = None
+        self._aside += 1
+        if self._aside <= MOST_SET_ASIDE:
+            self.repeat_window()
+        return True
+
+    def repeat_window(self) -> None:
+        """Compute the open window again from its measurements."""
+        self._reopen_window()
+        for measurement in self._window:
+            is_near = another_time(measurement.stamp_ns, self._began_ns) is None
+            self.note_input(measurement.number)
+            if isinstance(measurement, m.AnyOdometry):
+                interval, rejected = self.judge_interval(measurement, is_near)
+                if interval is not None:
+                    self._slam.drive(interval, measured=rejected is None)
+            else:
+                self._observe(measurement, is_near)
+
+    def _reopen_window(self) -> None:
+        """Open the window behind the last submap anew, without measurements."""
+        last = self.submaps.last
+        self._slam = HybridSlam(self.config, self.writer.incarnation)
+        if last is None:
+            self.note_input(0)
+        else:
+            self._slam.resume(last.sequence, last.last_measurement, last.stamp_ns)
+        self._judge = StreamJudge(self.config.bounds, None if last is None else last.stamp_ns)
+
+    # The estimator.
+
+    def note_input(self, number: int) -> None:
+        """Note that the open window names the measurement among its inputs, even if rejected."""
+        self._slam.last_measurement = number
+
+    def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
+        """Take a scan of landmarks; returns the reason if it is rejected."""
+        return self._slam.observe(stamp_ns, scan)
+
+    def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
+        """Take inter-robot measurements; returns the reason if they are rejected."""
+        return self._slam.sight(measurement.stamp_ns, measurement.number, looks)
+
+    @property
+    def associates(self) -> bool:
+        """Whether the estimator takes detections without identities."""
+        return self.config.fusion == "join"
+
+    @property
+    def sequence(self) -> int:
+        """The number of the open window."""
+        return self._slam.sequence
+
+    @property
+    def innovation(self) -> Innovation:
+        """The innovations of all windows of this incarnation that this process has computed."""
+        return self._slam.innovation
+
+    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+        """The running pose by own measurements alone, given the open window."""
+        return self.own_map.pose(window)
+
+    def own_landmarks(self) -> LandmarkGaussian:
+        """The running map by own measurements alone."""
+        return self.own_map.landmarks
+
+    def open_window(self) -> LocalMap | None:
+        """The Gaussian of the open window at its last keyframe, if there is one."""
+        return self._slam.running()

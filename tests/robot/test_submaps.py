@@ -1,0 +1,98 @@
+"""The robot's submaps: each is held once, and decoded to the bits of the window that closed."""
+
+import gc
+
+import msgspec
+import numpy as np
+
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
+from team.estimation.submap import LocalMap
+from team.robot.node import RobotNode
+from team.robot.submaps import Submaps
+from team.robot.team_map import CONDENSED
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import decoded, encoded
+from tests.support import submap
+from tests.teams import config, driven, of, published, stream
+
+
+def start(incarnation: int) -> m.InitialPose:
+    return m.InitialPose(
+        stamp_ns=0, robot="r1", incarnation=incarnation, number=0, pose=b"", covariance=b""
+    )
+
+
+def sent(k: int, incarnation: int) -> m.Submap:
+    return msgspec.structs.replace(submap(k, robot="r1"), incarnation=incarnation)
+
+
+def request(**wanted: int) -> bytes:
+    return encoded(m.SubmapsRequest(stamp_ns=0, robot="r1", **wanted))
+
+
+def test_a_stored_submap_has_the_bits_of_the_window_that_closed() -> None:
+    windows: list[ClosedWindow] = []
+    node = RobotNode(config(), on_window=windows.append)
+    driven(node, published(stream("r1", 30)))
+    stored = node.mapper.submaps
+    assert len(stored) == len(windows) > 5
+    for local, window in zip(stored, windows, strict=True):
+        assert local.ids.tobytes() == window.local.ids.tobytes()
+        assert local.mean.tobytes() == window.local.mean.tobytes()
+        assert local.covariance.tobytes() == window.local.covariance.tobytes()
+    assert [x.mean.tobytes() for x in stored[2:]] == [w.local.mean.tobytes() for w in windows[2:]]
+
+
+def local_maps() -> int:
+    gc.collect()
+    return sum(isinstance(each, LocalMap) for each in gc.get_objects())
+
+
+def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages() -> None:
+    """The number of local maps is that of the submaps that a prior lacks, at most 2 · CONDENSED."""
+    before = local_maps()
+    node = RobotNode(config())
+    out = driven(node, published(stream("r1", 60)), end=False)
+    assert len(of(out, ch.SUBMAP)) == 20
+    del out
+    assert local_maps() - before <= 1
+    prior = m.Prior(
+        stamp_ns=0,
+        robot="r1",
+        incarnation=1,
+        sequence=16,
+        digest=bytes(8),
+        ids=b"",
+        mean=np.zeros(3).tobytes(),
+        covariance=np.eye(3)[np.triu_indices(3)].tobytes(),
+    )
+    node.handle(prior, 0)
+    driven(node, published(stream("r1", 70))[len(published(stream("r1", 60))) :], end=False)
+    assert 0 < local_maps() - before <= 2 * CONDENSED
+
+
+def test_a_request_is_answered_by_incarnation_and_from_a_sequence_on() -> None:
+    submaps = Submaps("r1", "continuous")
+    for incarnation in (1, 2):
+        submaps.begin(start(incarnation))
+        for k in range(3):
+            submaps.close([], sent(k, incarnation))
+    answered = [decoded(each) for each in submaps.answer(request(incarnation=1, first=2))]
+    assert answered == [start(1), sent(2, 1)]
+    every = [decoded(each) for each in submaps.answer(request())]
+    assert [type(each).__name__ for each in every] == 2 * ["InitialPose", *3 * ["Submap"]]
+    assert len(submaps) == submaps.sent == 3
+    assert submaps.answer(request(incarnation=3)) == []
+
+
+def test_a_member_that_is_restored_twice_is_held_once() -> None:
+    submaps = Submaps("r1", "rendezvous")
+    submaps.begin(start(1))
+    for message in 2 * (start(1), sent(0, 1)):
+        submaps.restore(message)
+    assert [decoded(each) for each in submaps.answer(request())] == [
+        start(1),
+        sent(0, 1),
+    ]
+    assert submaps.since_ns is None, "an earlier process has sent it"
