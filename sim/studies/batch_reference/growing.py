@@ -96,6 +96,7 @@ class GrowingBatch:
 
     @cached_property
     def values(self) -> Any:
+        """The estimate as GTSAM's values."""
         gtsam = load_gtsam()
         values = gtsam.Values()
         for k, pose in enumerate(self.poses):
