@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from central.stored_set import StoredSet
 from team.missing import MissingMeasurements
 from team.shell import WAIT_S, Shell
@@ -55,7 +55,7 @@ class CentralShell:
     ) -> None:
         self._bus = bus
         self._stored = None if store is None else StoredSet(store)
-        self.node = CentralNode(config, robots, admit=admit)
+        self.node = make_centre(config, robots, admit=admit)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
         self._shell.notes = self._awaited

@@ -4,10 +4,10 @@ The tests are files under tests/. The comparison methods of `sim/studies` are no
 """
 
 CENTRE = (
-    "central/test_join_rule.py",
+    "central/test_map_publisher.py",
     "central/test_node.py",
     "central/test_tick_fold.py",
-    "central/test_submap_set.py",
+    "test_store.py",
     "central/test_withdrawal.py",
     "central/test_confirmed.py",
 )
@@ -128,7 +128,7 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
             *JOIN,
             "central/test_confirmed.py",
             "central/test_monitor.py",
-            "central/test_join_rule.py",
+            "central/test_map_publisher.py",
         ),
     ),
     "team/estimation/map_joining/merging.py": (8, JOIN),
@@ -168,11 +168,10 @@ MODULES: dict[str, tuple[int, tuple[str, ...]]] = {
     "central/tick_fold.py": (8, CENTRE),
     "central/checkpoints.py": (4, CENTRE),
     "central/fold_inputs.py": (6, CENTRE),
-    "central/submap_set.py": (10, CENTRE),
-    "central/join_rule.py": (14, CENTRE),
+    "team/store.py": (18, CENTRE),
+    "central/submap_fold.py": (14, CENTRE),
     "central/join_messages.py": (8, CENTRE),
-    "central/scheduler.py": (12, CENTRE),
-    "central/submap_intake.py": (10, CENTRE),
+    "central/map_publisher.py": (12, CENTRE),
     "central/sent_priors.py": (10, ("central/test_sent_priors.py",)),
     "team/estimation/chi2_kernel.py": (8, ("estimation/test_consistency.py",)),
     "team/estimation/map_joining/join_kernel.py": (

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from central.config import CentralConfig
 from central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
-from central.node import CentralNode
+from central.node import CentralNode, node_class
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
@@ -131,7 +132,7 @@ class TimedRun:
         """
         measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
-        for sample in run_team(scenario, measurements, *self._nodes()):
+        for sample in run_team(scenario, measurements, *self._nodes(scenario.central)):
             self._steps += sample.key in odometry
             self._fusions += sample.key == ch.FUSED_MAP.key()
             yield sample
@@ -145,7 +146,7 @@ class TimedRun:
             "seconds_per_fusion": self._centre.seconds / self._fusions if self._fusions else None,
         }
 
-    def _nodes(self) -> tuple[type[RobotNode], type[CentralNode]]:
+    def _nodes(self, config: CentralConfig) -> tuple[type[RobotNode], type[CentralNode]]:
         """The node classes that measure the time of handling a message."""
         robots, centre = self._robots, self._centre
 
@@ -154,7 +155,7 @@ class TimedRun:
                 with robots:
                     return super().handle(message, now_ns)
 
-        class TimedCentre(CentralNode):
+        class TimedCentre(node_class(config)):  # type: ignore[misc]
             def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
                 with centre:
                     return super().handle(message, now_ns)
