@@ -75,7 +75,7 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
-        self._hear_orders()
+        self._request_orders()
         self._shell.look_for_the_end()
         self._restore()
         self._shell.begin()
@@ -89,7 +89,7 @@ class CentralShell:
             self._give_up()
             self._shell.contained("wanted", lambda: self._missing.look(self.node.requests()))
             self._shell.contained("wanted", self._gather)
-            self._hear_orders()
+            self._request_orders()
             self._shell.report()
         self._shell.report(last=True)
         if self._stored is not None:
@@ -173,7 +173,7 @@ class CentralShell:
             )
         return tuple(warnings)
 
-    def _hear_orders(self) -> None:
+    def _request_orders(self) -> None:
         """Ask the router now and then for the operator's orders.
 
         The operator's command ends at once, and this process may have been cut off when it gave the

@@ -59,19 +59,29 @@ class CentralNode:
         self.config = config
         self.announcement = configured("central", 0, 0, config)
         self.config_digest = self.announcement.digest
-        self.store = SubmapStore()
-        self.maps = MapPublisher(self.fold_class(config, self.config_digest, self.store))
-        self.warnings = self.maps.warnings
-        self.attendance = TeamAttendance.of(robots)
+        self.attendance = TeamAttendance.of(
+            robots, self.has_received, lambda stream: self.store.processed(stream)
+        )
         self._door = Door(robots)
         self._admits = admit
         self._admitted: list[str] = []
         self._broadcasts = 0
+        self._begin_set()
+
+    def _begin_set(self) -> None:
+        self.store = SubmapStore()
+        self.maps = MapPublisher(self.fold_class(self.config, self.config_digest, self.store))
+        self.warnings = self.maps.warnings
         self._newest_map: m.FusedMap | None = None
         self._credit: list[Outgoing] | None = None
         self._concluding = False
         self.finished = False
         self.final: m.FusedMap | None = None
+
+    def restart(self) -> None:
+        """Begin with an empty set, whose members are handed in again; the attendance stays."""
+        self._begin_set()
+        self.attendance.forget_members()
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
@@ -95,8 +105,8 @@ class CentralNode:
             refused = self.attendance.contradicts(message)
             if refused is not None:
                 self.attendance.note_end(message)
-                # Where the robots' last words confirm it, nothing may come behind it.
-                refused = None if self.attendance.concluded(self.has_received) else refused
+                # Where the robots' `Done` messages confirm it, no further message may follow.
+                refused = None if self.attendance.is_concluded() else refused
         return refused
 
     def _admit(self, message: m.Message) -> None:
@@ -220,19 +230,15 @@ class CentralNode:
 
     def publish_due(self) -> list[Outgoing]:
         """Fold what the least progress of the live robots has closed; the maps that are due."""
-        return self.maps.publish_due(self._watermark_ns, self.attendance.now_ns)
+        return self.maps.publish_due(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_newest(self) -> list[Outgoing]:
         """A map of the whole set, if the last one lacks a member."""
-        return self.maps.publish_newest(self._watermark_ns, self.attendance.now_ns)
+        return self.maps.publish_newest(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_final(self) -> list[Outgoing]:
         """The last messages, the final map after all others."""
         return self.maps.publish_final(self.attendance.now_ns)
-
-    @property
-    def _watermark_ns(self) -> float:
-        return self.attendance.watermark_ns(self.has_received, self.store.processed)
 
     def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
         maps = [o.message for o in out if isinstance(o.message, m.FusedMap)]
@@ -258,7 +264,7 @@ class CentralNode:
     @property
     def _is_over(self) -> bool:
         """Whether the streams have ended and nothing of them is waited for."""
-        return self.attendance.concluded(self.has_received) and self.has_all_measurements
+        return self.attendance.is_concluded() and self.has_all_measurements
 
     def _conclude(self) -> list[Outgoing]:
         self._concluding = True
@@ -266,7 +272,7 @@ class CentralNode:
         final = last.message
         assert isinstance(final, m.FusedMap)
         self.finished = True
-        lost = tuple(self.attendance.missing(self.has_received))
+        lost = tuple(self.attendance.missing())
         if lost:
             final = msgspec.structs.replace(final, provisional=True, lost=lost)
         self.final = final
@@ -280,7 +286,7 @@ class CentralNode:
                 self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
             )
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
-        lost = tuple(self.attendance.missing(self.has_received))
+        lost = tuple(self.attendance.missing())
         final = msgspec.structs.replace(
             newest, final=True, provisional=True, reasons=reasons, lost=lost
         )
@@ -297,7 +303,7 @@ class CentralNode:
     @property
     def awaited(self) -> list[str]:
         """The absent robots that the final map waits for."""
-        return [] if self.finished else self.attendance.awaited(self.has_received)
+        return [] if self.finished else self.attendance.awaited()
 
     @property
     def ends(self) -> bool:

@@ -10,8 +10,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from team.peers.exchange import answered, named, oversized, request_for
-from team.peers.feed import new_of_streams, turn
+from team.peers.exchange import is_oversized, list_requested, make_answer, make_request
+from team.peers.feed import feed_order, new_of_streams
 from team.peers.given import GIVEN_BYTES, Given
 from team.peers.members import CHANNELS, Member, Stream, member_of
 from team.peers.proofs import Proofs
@@ -151,14 +151,14 @@ class PeerNode:
         orders first, since it may end with the last member of a stream, and what ends it last.
         """
         statements, self._new_messages = self._new_messages, []
-        statements.sort(key=turn)
-        orders = sum(turn(each) < 0 for each in statements)
+        statements.sort(key=feed_order)
+        orders = sum(feed_order(each) < 0 for each in statements)
         yield from statements[:orders]
         yield from new_of_streams(self.replica, self._fed)
         yield from statements[orders:]
 
-    def again(self) -> None:
-        """Give everything to the fold again, which begins anew."""
+    def restart_fold(self) -> None:
+        """Queue every stored member for a fold that begins anew."""
         self.rebuild = False
         self._fed.clear()
         self._new_messages = [
@@ -169,7 +169,7 @@ class PeerNode:
 
     # Talk.
 
-    def hear(self, summary: m.SetSummary) -> list[Outgoing]:
+    def take_summary(self, summary: m.SetSummary) -> list[Outgoing]:
         """Take another node's summary: request what it has more, and publish a summary where it
         lacks members.
         """
@@ -178,13 +178,13 @@ class PeerNode:
         if summary.node not in self.known:
             self._refuse(f"a summary of {summary.node[:80]}, not in this team")
             return []
-        if oversized(self.replica, summary):
+        if is_oversized(self.replica, summary):
             self._refuse(f"a summary of {summary.node} with more than a team can have")
             return []
         self._summaries[summary.node] = self._now_s, summary
         if self._announced_digest is not None and summary.digest != self._announced_digest:
             self.greet()
-        return self._ask(summary)
+        return self._request_from(summary)
 
     def greet(self) -> None:
         """Publish a summary soon, for a node that has appeared."""
@@ -198,7 +198,7 @@ class PeerNode:
         by_trust = sorted(self._summaries, key=lambda node: self._failures.get(node, 0))
         for received_s, summary in [self._summaries[node] for node in by_trust]:
             if now_s - received_s < FRESH_S and summary.digest != self.replica.digest:
-                out += self._ask(summary)
+                out += self._request_from(summary)
         since_s = now_s - self._announced_s
         over = self.replica.concluded.keys() >= set(self.replica.robots)
         if since_s < (LAST_S if over else SUMMARY_S):
@@ -239,19 +239,19 @@ class PeerNode:
     def _lacks(self, stream: Stream, sequence: int) -> bool:
         return sequence >= 0 and sequence not in self.replica.share_of(stream).complete
 
-    def more_of(self, node: str) -> list[Outgoing]:
+    def request_rest(self, node: str) -> list[Outgoing]:
         """Request the rest from a node that has answered."""
         received = self._summaries.get(node)
-        return [] if received is None else self._ask(received[1])
+        return [] if received is None else self._request_from(received[1])
 
-    def _ask(self, summary: m.SetSummary) -> list[Outgoing]:
+    def _request_from(self, summary: m.SetSummary) -> list[Outgoing]:
         if self._open[summary.node] >= MOST_OPEN:
             return []
-        request = request_for(self.replica, summary, self._asked)
+        request = make_request(self.replica, summary, self._asked)
         if request is None:
             return []
         until = self._now_s + PATIENCE_S, summary.node
-        for name in named(request):
+        for name in list_requested(request):
             self._close(name)
             self._asked[name] = until
             self._open[summary.node] += 1
@@ -279,7 +279,7 @@ class PeerNode:
 
     def _answered(self, request: m.MembersRequest) -> list[m.Members]:
         sign = None if self.proofs is None else self.proofs.of
-        return answered(self.replica, request, self.node, sign)
+        return make_answer(self.replica, request, self.node, sign)
 
     @property
     def agrees(self) -> dict[str, bool]:

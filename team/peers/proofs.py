@@ -75,7 +75,7 @@ class Proofs:
             signature=signature,
         )
 
-    def hear(self, signature: m.Signature, publisher: str) -> None:
+    def take_signature(self, signature: m.Signature, publisher: str) -> None:
         """Keep a signature that a robot or an operator publishes on its own key, of its own
         members only.
         """
