@@ -9,7 +9,8 @@ import math
 from bisect import bisect_right
 from collections.abc import Collection, Mapping
 
-from central.submap_fold import SubmapFold, Tail
+from central.join_messages import Tail
+from central.submap_fold import SubmapFold
 from team.store import Stream
 from team.wire import channels as ch
 from team.wire import messages as m

@@ -57,12 +57,14 @@ _EMPTY = StoredStream()
 class SubmapStore:
     """The members of the team's set, each in one place.
 
-    withdrawals: the first order on each robot that an operator has withdrawn. verdicts: those in
-    force, with their landmarks in order. refused: number of refused members.
+    chains: the submaps that a map can have, those of the streams with an initial pose; they grow
+    in place. withdrawals: the first order on each robot that an operator has withdrawn. verdicts:
+    those in force, with their landmarks in order. refused: number of refused members.
     """
 
     def __init__(self) -> None:
         self.streams: dict[Stream, StoredStream] = {}
+        self.chains: dict[Stream, Sequence[m.Submap]] = {}
         self.withdrawals: dict[str, m.Withdrawal] = {}
         self.verdicts: set[m.Judgement] = set()
         self.refused = 0
@@ -90,8 +92,10 @@ class SubmapStore:
 
     def add_start(self, start: m.InitialPose) -> None:
         """Add the initial pose of a stream; a second one is ignored."""
-        stream = self._stream((start.robot, start.incarnation))
+        key = start.robot, start.incarnation
+        stream = self._stream(key)
         stream.start = stream.start or start
+        self._note_chain(key)
 
     def add_submap(self, submap: m.Submap) -> str | None:
         """Add a submap; returns the reason if it is refused. A stored submap is accepted again."""
@@ -126,8 +130,14 @@ class SubmapStore:
         if reason is not None:
             self.refuse(member)
         else:
-            self._stream((member.robot, member.incarnation)).extend_chain()
+            self._note_chain((member.robot, member.incarnation))
         return reason
+
+    def _note_chain(self, key: Stream) -> None:
+        stream = self._stream(key)
+        stream.extend_chain()
+        if stream.start is not None and stream.chain:
+            self.chains[key] = stream.chain
 
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
         """Store a submap, or return why it can not be in the set.
@@ -188,15 +198,6 @@ class SubmapStore:
     def chain(self, stream: Stream) -> Sequence[m.Submap]:
         """The complete submaps of a stream from sequence 0 on; the sequence grows with the set."""
         return self.streams.get(stream, _EMPTY).chain
-
-    @property
-    def chains(self) -> Mapping[Stream, Sequence[m.Submap]]:
-        """The submaps that a map can have: the chains of the streams with an initial pose."""
-        return {
-            key: stream.chain
-            for key, stream in self.streams.items()
-            if stream.start is not None and stream.chain
-        }
 
     def start(self, stream: Stream) -> m.InitialPose:
         """The initial pose of a stream of `chains`."""

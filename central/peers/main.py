@@ -14,7 +14,7 @@ from central.peers.robot import PeerRobot
 from team.config import Exchange, RobotConfig
 from team.peers.members import Member
 from team.peers.proofs import Signs
-from team.peers.store import Keeper
+from team.peers.set_file import Keeper
 from team.robot.main import SECOND_PATIENCE_S, RobotShell
 from team.shell import Shell
 from team.wire import channels as ch

@@ -15,7 +15,7 @@ from team.peers.members import LARGEST_SIGNATURE
 from team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
 from team.peers.proofs import LARGEST_OF_ROBOT, Proofs
 from team.peers.replica import MOST_INTERVALS, MOST_STREAMS
-from team.peers.store import Store
+from team.peers.set_file import SetFile
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
@@ -129,10 +129,10 @@ def test_a_large_signature_is_refused_and_does_not_cut_the_file(tmp_path: Path) 
     for pose, signature in zip(poses, (b"", huge, b""), strict=True):
         node.take_carried(members_of(pose.key, payload=pose.payload, signature=signature))
     assert f"{len(huge)} bytes, {LARGEST_SIGNATURE} at most" in node.last_refused
-    store = Store(tmp_path / "r1.set")
+    store = SetFile(tmp_path / "r1.set")
     store.append(node.unsaved)
     store.close()
-    again = Store(tmp_path / "r1.set")
+    again = SetFile(tmp_path / "r1.set")
     again.close()
     assert [each.key for each in again.members] == [poses[0].key, poses[2].key]
 

@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 from central.fused import fused_message, version_entry
+from central.join_messages import Tail
 from central.node import CentralNode
-from central.submap_fold import RecordedFields, SubmapFold, Tail
+from central.submap_fold import RecordedFields, SubmapFold
 from team import translate
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.geometry import transformed

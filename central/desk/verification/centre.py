@@ -11,8 +11,9 @@ from typing import Any
 import msgspec
 
 from central.desk.verification.recorded import Identity, Recorded, identity
+from central.join_messages import Tail
 from central.node import node_class
-from central.submap_fold import RecordedFields, SubmapFold, Tail
+from central.submap_fold import RecordedFields, SubmapFold
 from team.pairs import RULES
 from team.store import Stream, SubmapStore
 from team.wire import channels as ch

@@ -158,7 +158,8 @@ class TimedRun:
         class TimedCentre(node_class(config)):  # type: ignore[misc]
             def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
                 with centre:
-                    return super().handle(message, now_ns)
+                    out: list[Outgoing] = super().handle(message, now_ns)
+                    return out
 
         return TimedRobot, TimedCentre
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.fused import fused_message, version_entry
+from central.join_messages import Tail
 from central.node import CentralNode
-from central.submap_fold import RecordedFields, SubmapFold, Tail
+from central.submap_fold import RecordedFields, SubmapFold
 from sim.studies.estimators import svd_joining
 from sim.studies.estimators.svd_joining import (
     NO_PAIRS,
