@@ -105,7 +105,7 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Take the set that an earlier process has stored, so that nobody has to send it again."""
+        """Take the set that an earlier process has stored: robots need not send it again."""
         if self._stored is None or not self._shell.going:
             return
         stored = self._stored.samples()

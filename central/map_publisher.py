@@ -66,7 +66,8 @@ class MapPublisher:
     def publish_newest(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
         """Publish a map of the whole set at once, if the last one lacks a submap.
 
-        It waits for no tick's end and no teammate: what lies ahead of the watermark is provisional.
+        The map waits for no tick's end and no teammate; submaps ahead of the watermark make it
+        provisional.
         """
         if not self._has_news(math.inf):
             return []

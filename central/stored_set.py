@@ -1,6 +1,6 @@
 """A centre's set on disk: the messages of robots and operators for it, as they were sent.
 
-The file is a peer's (`team.peers.set_file`). A centre that was killed reads it and continues: nothing
+The file is a peer's (`team.peers.set_file`). A centre that was killed continues from it: nothing
 of it has to be sent again, and the same set gives the same map.
 """
 

@@ -29,8 +29,8 @@ def absence(place: str, what: str) -> str | None:
 
 
 def loaded(place: str, what: str) -> Any:
-    """The `name` of `package.module:name`. Raises NotInstalledError, which says that `what` is
-    missing.
+    """The `name` of `package.module:name`. Raises NotInstalledError, whose text names
+    `what`.
     """
     module, _, name = place.partition(":")
     absent = absence(place, what)

@@ -111,7 +111,7 @@ class PeerFold:
         return out
 
     def ask(self) -> list[Outgoing]:
-        """Fold what is here now, without waiting; returns the messages to publish."""
+        """Fold the present set, without waiting; returns the messages to publish."""
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False
@@ -120,7 +120,7 @@ class PeerFold:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of everything that is here, if the last one lacks something."""
+        """A map of the whole set, if the last one lacks a member."""
         return [] if self._waits else [*self._restart_if_changed(), *self.centre.refresh()]
 
     def _restart_if_changed(self) -> list[Outgoing]:
@@ -137,7 +137,7 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Whether everything that any node has announced is here."""
+        """Whether all members up to an announced end are in the set."""
         return any(self._is_here(end) for end in self.centre.attendance.ends)
 
     def _is_here(self, end: m.End) -> bool:

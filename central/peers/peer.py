@@ -1,7 +1,7 @@
 """The common part of a robot without a centre and a centre among peers: the set and its fold.
 
 A peer takes members from any publisher, gives new ones to its own fold, and publishes the fold's
-messages under its own name. The rest (an estimator, say) is its subclass's.
+messages under its own name. A subclass adds the rest, such as an estimator.
 """
 
 from collections.abc import Iterable, Sequence
@@ -138,7 +138,7 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether the team has ended, and nobody is present who has the missing members.
+        """Whether the team has ended, and no node is present that has the missing members.
 
         It has ended where every other robot has announced its own end, but for those that an
         operator has given up or withdrawn.

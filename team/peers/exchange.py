@@ -29,8 +29,8 @@ BATCH_BYTES = 64 * 2**10
 def make_request(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
-    """The request for what the summary's node has and this replica lacks; None where that is
-    nothing.
+    """The request for the members that the summary's node has and this replica lacks; None where
+    there are none.
 
     not_now: (stream, sequence) that were requested from another peer a moment ago. A stream of
     which both have the same sequences with different digests is requested whole: its robot has

@@ -1,4 +1,4 @@
-"""The order in which a fold is given the set: orders, streams by time, `Done`, who was given up."""
+"""The order in which members are handed to a fold: orders, streams by time, `Done`, robots given up."""
 
 from collections.abc import Iterator
 

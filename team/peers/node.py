@@ -24,9 +24,9 @@ from team.wire.codec import WireError, decoded, encoded
 SUMMARY_S = 1.0
 """Least time [s] between two summaries."""
 LAST_S = 0.2
-"""… once all have concluded: peers leave soon, and need to know that their maps agree."""
+"""… once all have concluded: peers leave soon, and compare their maps before."""
 REPEAT_S = 10.0
-"""… and the longest: a node that has appeared unnoticed learns what is here."""
+"""… and the longest: a node that has appeared unnoticed receives a summary."""
 PATIENCE_S = 3.0
 """A request without an answer goes to another node after this time [s]."""
 FRESH_S = 25.0
@@ -48,7 +48,7 @@ class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
     known: the nodes that may have a set: the team's robots and a centre. proofs: checks members
-    that come over third nodes; None: there are no keys, and every node is believed. unsaved: new
+    that come over third nodes; None: there are no keys, and every node is trusted. unsaved: new
     members since it was last cleared. carried: traffic by node. refused: how many members were not
     kept; last_refused: why.
     """
@@ -148,7 +148,7 @@ class PeerNode:
 
     def new_messages(self) -> Iterator[m.Message]:
         """The messages that a fold can take now and has not yet been given, in order: operators'
-        orders first, since it may end with the last member of a stream, and what ends it last.
+        orders first, since it may end with the last member of a stream; `Done` and given-up robots last.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)
@@ -167,11 +167,11 @@ class PeerNode:
             for _, member in sorted(self.replica.statements[robot].items())
         ]
 
-    # Talk.
+    # Exchange.
 
     def take_summary(self, summary: m.SetSummary) -> list[Outgoing]:
-        """Take another node's summary: request what it has more, and publish a summary where it
-        lacks members.
+        """Take another node's summary: request members that are missing here, and publish a summary
+        where that node lacks members.
         """
         if summary.node == self.node:
             return []
@@ -212,7 +212,7 @@ class PeerNode:
         return out
 
     def _note_arrival(self, message: m.Message) -> None:
-        """Forget the request of what has arrived."""
+        """Forget the request of a member that has arrived."""
         match message:
             case m.InitialPose():
                 self._close(((message.robot, message.incarnation), -1))
@@ -229,7 +229,7 @@ class PeerNode:
             self._open[asked[1]] -= 1
 
     def _forget_questions(self) -> None:
-        """Let requests expire; nodes that did not give what they have are asked last."""
+        """Let requests expire; nodes that did not send members that they have are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
         self._open.subtract(node for _, node in over.values())
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:

@@ -1,6 +1,6 @@
 """A peer's or a centre's set on disk: an append-only file, from which it continues after a restart.
 
-After eight bytes that say what it is come records: length and CRC-32 of the body, four bytes each,
+Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A record that a crash has
 truncated is cut off when the file is opened again. Behind a damaged record reading continues at the
 next one whose CRC fits; the file is then written anew without the damage, which is named. Lost
@@ -40,7 +40,7 @@ _LARGEST = LARGEST_MEMBER + 2**16
 
 
 class SetFileError(RuntimeError):
-    """The file can not be used; the text says why and what to do."""
+    """The file can not be used; the text gives the reason and the remedy."""
 
 
 class Record(NamedTuple):
@@ -272,7 +272,7 @@ class Keeper:
         self._waiting, self._failure, self._retry_s = [], "", 0.0
 
     def close(self) -> None:
-        """Write what is not written yet, and close the file."""
+        """Write the members that are not written yet, and close the file."""
         if self._store is not None:
             self._write()
             if self._waiting:
