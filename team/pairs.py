@@ -80,7 +80,7 @@ PAIRS: Mapping[tuple[str, str], Channel] = MappingProxyType(
         if estimator in RULES[rule].takes or rule in row.feeds
     }
 )
-"""(estimator, rule) → the inputs to which the centre subscribes. Any other pair has no meaning: only
+"""(estimator, rule) → the inputs of the centre. Any other pair has no meaning: only
 `hybrid` makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis,
 and a robot that only localises has no map to fuse."""
 FEEDBACK = frozenset(rule for rule, row in RULES.items() if row.feedback)

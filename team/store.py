@@ -142,7 +142,8 @@ class SubmapStore:
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
         """Store a submap, or return why it can not be in the set.
 
-        By law 1 each measurement is used once: the nearest submaps in sequence bound those of this one.
+        Law 1: each measurement is used once. The nearest submaps in sequence bound those of this
+        one.
         """
         key = submap.robot, submap.incarnation
         stream = self._stream(key)

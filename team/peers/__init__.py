@@ -1,1 +1,1 @@
-"""The team's set of members at each peer: its contents, the exchange between peers, and its file."""
+"""The team's set of members at each peer: contents, exchange between peers, and file."""

@@ -1,4 +1,4 @@
-"""The order in which members are handed to a fold: orders, streams by time, `Done`, robots given up."""
+"""The order of members for a fold: orders, streams by time, `Done`, robots given up."""
 
 from collections.abc import Iterator
 

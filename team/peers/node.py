@@ -148,7 +148,7 @@ class PeerNode:
 
     def new_messages(self) -> Iterator[m.Message]:
         """The messages that a fold can take now and has not yet been given, in order: operators'
-        orders first, since it may end with the last member of a stream; `Done` and given-up robots last.
+        orders first, since it may end with the last member of a stream; `Done` messages last.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)

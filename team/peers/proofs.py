@@ -7,10 +7,10 @@ check them.
 
 A member is proven by any certificate of its author that the team's authority has issued, that is
 not revoked, and that had not ended at the member's stamp. That stamp is by the author's own
-clock: a stolen key can sign with an earlier date, and only its revocation ends that. A certificate of a later generation proves that the earlier ones are
-revoked, since the authority issues it only then; a roster beside the own key names revocations
-without a successor. Certificates of revoked generations stay in the set, which is the same for all
-peers; they prove nothing.
+clock: a stolen key can sign with an earlier date, and only its revocation ends that. A certificate
+of a later generation proves that the earlier ones are revoked, since the authority issues it only
+then; a roster beside the own key names revocations without a successor. Certificates of revoked
+generations stay in the set, which is the same for all peers; they prove nothing.
 """
 
 from collections.abc import Iterator
