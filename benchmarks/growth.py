@@ -26,9 +26,8 @@ import numpy as np
 
 from benchmarks.baseline import worse
 from central.config import CentralConfig
-from central.intake import Instant
-from central.join_rule import JoinRule
-from central.scheduler import Scheduler
+from central.map_publisher import MapPublisher
+from central.submap_fold import SubmapFold
 from team import translate
 from team.association import profile_for
 from team.config import UNNAMED, AssociationSettings, Sensor
@@ -160,13 +159,11 @@ def measured(
 ) -> list[dict[str, float]]:
     """A row of figures at each number of submaps."""
     world = World(robots, landmarks, hidden=hidden)
-    names = [f"r{r}" for r in range(robots)]
     lengths = profile_for(Sensor(range_sigma=SIGMAS[2], bearing_sigma=1e-6), 1.0)
     config = CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S, association=lengths)
-    scheduler = Scheduler(JoinRule(config, bytes(8), names))
-    intake = scheduler.intake
+    publisher = MapPublisher(SubmapFold(config, bytes(8)))
     for start in world.starts():
-        intake.take(start, 0)
+        publisher.store.add(start)
     rows: list[dict[str, float]] = []
     cpu_ms, sent = list[float](), list[tuple[int, int]]()
     for k in range(max(at) // robots):
@@ -174,8 +171,8 @@ def measured(
         now_ns = submaps[-1].stamp_ns
         before = time.process_time()
         for submap in submaps:
-            intake.take(submap, now_ns)
-        out = scheduler.at(Instant(now_ns, intake.inputs(now_ns, now_ns)))
+            publisher.store.add(submap)
+        out = publisher.publish_due(now_ns, now_ns)
         cpu_ms.append(1e3 * (time.process_time() - before))
         sent.append(_bytes(out))
         if (k + 1) * robots in at:

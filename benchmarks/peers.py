@@ -166,14 +166,14 @@ class Team:
             case Member():
                 node.take(what, ch.robot_node(sender))
             case m.SetSummary():
-                self.spread(to, node.hear(what), now_ns)
+                self.spread(to, node.take_summary(what), now_ns)
             case m.MembersRequest():
                 for reply in node.answer(encoded(what)):
                     self.said[to] += len(reply)
                     self.send(to, sender, decoded(reply, m.Members), now_ns)
             case m.Members():
                 node.take_carried(what)
-                self.spread(to, node.more_of(what.node), now_ns)
+                self.spread(to, node.request_rest(what.node), now_ns)
 
     @property
     def agrees(self) -> bool:

@@ -8,21 +8,26 @@ from team.wire import messages as m
 from team.wire.newer import further, later_end, later_head
 
 _OfAnEnd = tuple[m.End, Awaited[m.StreamEnd]]
-Dealt = Callable[[m.Done], bool]
-"""True once all messages announced in a robot's `Done` have been dealt with."""
+HasReceived = Callable[[m.Done], bool]
+"""Whether all messages announced in a robot's `Done` have been processed."""
+Processed = Callable[[tuple[str, int]], int]
+"""Number of submaps of a stream that have been processed."""
 
 
 @dataclass
 class TeamAttendance:
     """The progress and presence of each robot of the team.
 
-    now_ns: the newest team time in any message. withdrawn: the robots that were withdrawn; the map
-    waits for them only while they are present. world_end: the last counters that the world has
-    announced. ends: all announced ends, refused ones included; one that the robots' `Done`
-    messages confirm becomes world_end. ordered: an operator has ordered the live team to end.
+    has_received, processed: the progress of the node itself. now_ns: the newest team time in any
+    message. withdrawn: the robots that were withdrawn; the map waits for them only while they are
+    present. world_end: the last counters that the world has announced. ends: all announced ends,
+    refused ones included; one that the robots' `Done` messages confirm becomes world_end. ordered:
+    an operator has ordered the live team to end.
     """
 
     robots: dict[str, Attendance]
+    has_received: HasReceived
+    processed: Processed
     world_end: m.End | None = None
     ends: list[m.End] = field(default_factory=list)
     now_ns: int = 0
@@ -38,14 +43,23 @@ class TeamAttendance:
     _least: Least = field(default_factory=Least, init=False)
 
     @classmethod
-    def of(cls, robots: Sequence[str]) -> "TeamAttendance":
+    def of(
+        cls, robots: Sequence[str], has_received: HasReceived, processed: Processed
+    ) -> "TeamAttendance":
         """The attendance of a team at its start."""
-        return cls({robot: Attendance() for robot in sorted(robots)})
+        return cls({robot: Attendance() for robot in sorted(robots)}, has_received, processed)
 
     def admit(self, robot: str) -> None:
         """Add a robot to the team."""
         self.robots = dict(sorted({**self.robots, robot: Attendance()}.items()))
         self._changed.add(robot)
+
+    def forget_members(self) -> None:
+        """Forget the members of a set that will be taken again: `Done` and `GivenUp` messages."""
+        for robot in self.robots.values():
+            robot.done, robot.given_up = None, False
+            robot.dones.clear()
+        self._changed.update(self.robots)
 
     def take(self, message: m.Message) -> None:
         """Take a message's information on its sender; messages of strangers are ignored."""
@@ -60,7 +74,7 @@ class TeamAttendance:
             case m.Done() if message.robot in self.robots:
                 robot = self.robots[message.robot]
                 note(message, robot.dones)
-                # A robot's last word is that of its last incarnation, in whichever order they come.
+                # The `Done` of the last incarnation counts, in whichever order they arrive.
                 if robot.done is None or robot.done.incarnation <= message.incarnation:
                     robot.done = message
             case m.End():
@@ -84,13 +98,13 @@ class TeamAttendance:
                 pass
 
     def note_change(self, message: m.Message) -> None:
-        """Note that what is known of a message's robot may have changed."""
+        """Note that the state of a message's robot may have changed."""
         name = getattr(message, "robot", None) or getattr(message, "node", "").rpartition("/")[2]
         if name in self.robots:
             self._changed.add(name)
 
     def note_end(self, end: m.End) -> None:
-        """Keep an announced end, believed or refused: robots' last words may confirm it."""
+        """Keep an announced end, accepted or refused: the robots' `Done` may confirm it."""
         note(end, self.ends)
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
@@ -138,11 +152,13 @@ class TeamAttendance:
         """True where a live team was ordered to end before this robot had begun."""
         return self.ordered and not self.robots[name].began
 
-    def whole(self, name: str, dealt: Dealt) -> bool:
-        """True once the robot is done and everything of it is here."""
+    def is_complete(self, name: str) -> bool:
+        """Whether the robot is done and all its messages have been processed."""
         done = self.robots[name].done
         return (
-            done is not None and self._is_last_incarnation(name, done.incarnation) and dealt(done)
+            done is not None
+            and self._is_last_incarnation(name, done.incarnation)
+            and self.has_received(done)
         )
 
     def contradicts(self, end: m.End) -> str | None:
@@ -161,37 +177,35 @@ class TeamAttendance:
                 )
         return None
 
-    def settled(self, name: str, dealt: Dealt) -> bool:
-        """True once nobody waits for the robot: all of it is here, or it is given up, or withdrawn
-        and gone.
+    def is_settled(self, name: str) -> bool:
+        """Whether the final map need not wait for this robot: it is complete, or it was given up,
+        or it was withdrawn and is offline.
 
-        A lost robot is waited for: it may come back, and the map must not depend on when.
+        The map waits for a lost robot: it may come back, and the map must not depend on when.
         """
-        robot = self.robots[name]
-        gone = name in self.withdrawn and not robot.alive
-        return robot.given_up or gone or self._never_measured(name) or self.whole(name, dealt)
+        return self._is_excused(name) or self._never_measured(name) or self.is_complete(name)
 
     @property
     def given_up(self) -> list[str]:
         """The robots that are given up by an order."""
         return [robot for robot, attendance in self.robots.items() if attendance.given_up]
 
-    def missing(self, dealt: Dealt) -> list[str]:
-        """The robots of the team whose streams are not complete here.
+    def missing(self) -> list[str]:
+        """The robots of the team whose streams are not complete.
 
-        In a live team that was ordered to end, those whose drivers may have had more.
+        In a live team that was ordered to end, also those whose drivers may have measured more.
         """
         return [
             name
             for name, robot in self.robots.items()
             if name not in self.withdrawn
             and not self._never_measured(name)
-            and not (self.whole(name, dealt) and (robot.has_all or not self.ordered))
+            and not (self.is_complete(name) and (robot.has_all or not self.ordered))
         ]
 
-    def awaited(self, dealt: Dealt) -> list[str]:
-        """The robots that are absent and waited for."""
-        return [r for r, a in self.robots.items() if not (a.alive or self.settled(r, dealt))]
+    def awaited(self) -> list[str]:
+        """The absent robots that the final map waits for."""
+        return [r for r, a in self.robots.items() if not (a.alive or self.is_settled(r))]
 
     def _is_last_incarnation(self, name: str, incarnation: int) -> bool:
         end = self.end
@@ -202,23 +216,23 @@ class TeamAttendance:
             self._last = {s.robot: s.incarnation for s in reversed(end.streams)}
         return incarnation >= self._last.get(name, incarnation)
 
-    def concluded(self, dealt: Dealt) -> bool:
-        """True once the streams have ended and no robot is waited for."""
-        return self._is_concluded(dealt) or (self._agree(dealt) and self._is_concluded(dealt))
+    def is_concluded(self) -> bool:
+        """Whether the streams have ended and the final map waits for no robot."""
+        return self._all_settled() or (self._accept_confirmed_end() and self._all_settled())
 
-    def _is_concluded(self, dealt: Dealt) -> bool:
+    def _all_settled(self) -> bool:
         return self.end is not None and self._unsettled.is_none(
-            self.robots, lambda name: not self.settled(name, dealt)
+            self.robots, lambda name: not self.is_settled(name)
         )
 
-    def _agree(self, dealt: Dealt) -> bool:
-        """Believe an announced end and the robots' last words that confirm each other.
+    def _accept_confirmed_end(self) -> bool:
+        """Accept an announced end and the robots' `Done` messages that confirm each other.
 
-        Where there are no keys, a stranger may have announced ends and last words further than
-        there is anything; those of the world and of its robots name the same counters all the same.
+        Without keys, a stranger can announce ends and `Done` messages beyond the last measurement;
+        those of the world and of its robots name the same counters all the same.
         """
-        for end in self._possible_ends(dealt):
-            found = {s.robot: self._confirmed(s, dealt) for s in end.streams}
+        for end in self._possible_ends():
+            found = {s.robot: self._confirmed(s) for s in end.streams}
             others = self.robots.keys() - found.keys()
             if all(self._is_excused(r) for r in others) and any(found.values()):
                 self.world_end = end
@@ -228,11 +242,11 @@ class TeamAttendance:
                 return True
         return False
 
-    def _possible_ends(self, dealt: Dealt) -> Iterator[m.End]:
-        """The announced ends whose streams are each confirmed or not waited for."""
+    def _possible_ends(self) -> Iterator[m.End]:
+        """The announced ends whose streams are each confirmed or excused."""
 
         def is_open(stream: m.StreamEnd) -> bool:
-            return self._confirmed(stream, dealt) is None and not self._is_excused(stream.robot)
+            return self._confirmed(stream) is None and not self._is_excused(stream.robot)
 
         known = self._unconfirmed
         self._unconfirmed = {id(end): known.get(id(end), (end, Awaited())) for end in self.ends}
@@ -241,46 +255,46 @@ class TeamAttendance:
                 yield end
 
     def _is_excused(self, name: str) -> bool:
-        """Whether the team does not wait for the robot's last word."""
+        """Whether the robot was given up, or was withdrawn and is offline."""
         robot = self.robots[name]
         return robot.given_up or (name in self.withdrawn and not robot.alive)
 
-    def _confirmed(self, end: m.StreamEnd, dealt: Dealt) -> m.Done | None:
-        """The last word of a robot that its stream ends so, if everything of it is here."""
+    def _confirmed(self, end: m.StreamEnd) -> m.Done | None:
+        """The robot's `Done` that confirms this end of its stream, if all of it was processed."""
         robot = self.robots[end.robot]
         counts = end.incarnation, end.measurements
         same = (d for d in robot.dones if (d.incarnation, d.measurements) == counts)
-        return next(filter(dealt, same), None)
+        return next(filter(self.has_received, same), None)
 
     def takes_part(self, name: str) -> bool:
         """Whether the robot may still send a map; a lost one may come back."""
         robot = self.robots[name]
         return robot.done is None and not robot.given_up
 
-    def watermark_ns(self, dealt: Dealt, count: Callable[[tuple[str, int]], int]) -> float:
+    @property
+    def watermark_ns(self) -> float:
         """The least progress of the live robots: every submap that ends before it has arrived.
 
-        count: how many submaps of a stream have been dealt with. Only robots that something was
-        heard of since the last call are looked at again.
+        Only robots of which a message came since the last call are looked at again.
         """
         of_all = (self.end, self.withdrawn, self.ordered, self._has_head)
         if of_all != self._of_all:
             self._changed.update(self.robots)
         self._of_all = of_all
         for name in self._changed:
-            self._least.put(name, self._until_ns(name, dealt, count))
+            self._least.put(name, self._until_ns(name))
         self._changed.clear()
         return self._least.value
 
-    def _until_ns(self, name: str, dealt: Dealt, count: Callable[[tuple[str, int]], int]) -> float:
-        """The progress of one robot, as far as all of it has arrived; infinite where nothing waits
-        for the robot.
+    def _until_ns(self, name: str) -> float:
+        """The progress of one robot, if all its submaps until then have arrived; infinite where
+        the map does not wait for the robot.
         """
         robot = self.robots[name]
-        if robot.lost or self._is_away(robot) or self.settled(name, dealt):
+        if robot.lost or self._is_away(robot) or self.is_settled(name):
             return float("inf")
         progress = robot.progress
-        if progress is None or count((name, progress.incarnation)) < progress.submaps:
+        if progress is None or self.processed((name, progress.incarnation)) < progress.submaps:
             return float("-inf")
         return progress.stamp_ns
 

@@ -1,8 +1,8 @@
-"""Makes the messages of the rule `join` from a fold: the map, priors for robots, their paths."""
+"""Makes the messages of a map from a fold: the map, priors for robots, their paths."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -11,7 +11,6 @@ from jaxtyping import Float, UInt32
 from central.config import CentralConfig
 from central.fused import JOINT_LANDMARKS, version_entry
 from central.monitor import miscalibrations
-from central.rule import Tail
 from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from team import translate
 from team.config import UNNAMED
@@ -35,6 +34,8 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing
 
+Tail = Literal["final", "closed", "provisional"]
+"""The kind of a map: the last one; one with all submaps up to a time; one with later ones, too."""
 PRIOR_LANDMARKS = 30
 """Most landmarks in a robot's prior: the nearest ones."""
 CONFIRMED_BY = 2

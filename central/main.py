@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from central.stored_set import StoredSet
 from team.missing import MissingMeasurements
 from team.shell import WAIT_S, Shell
@@ -55,7 +55,7 @@ class CentralShell:
     ) -> None:
         self._bus = bus
         self._stored = None if store is None else StoredSet(store)
-        self.node = CentralNode(config, robots, admit=admit)
+        self.node = make_centre(config, robots, admit=admit)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
         self._shell.notes = self._awaited
@@ -75,7 +75,7 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
-        self._hear_orders()
+        self._request_orders()
         self._shell.look_for_the_end()
         self._restore()
         self._shell.begin()
@@ -89,7 +89,7 @@ class CentralShell:
             self._give_up()
             self._shell.contained("wanted", lambda: self._missing.look(self.node.requests()))
             self._shell.contained("wanted", self._gather)
-            self._hear_orders()
+            self._request_orders()
             self._shell.report()
         self._shell.report(last=True)
         if self._stored is not None:
@@ -105,7 +105,7 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Take the set that an earlier process has stored, so that nobody has to send it again."""
+        """Take the set that an earlier process has stored: robots need not send it again."""
         if self._stored is None or not self._shell.going:
             return
         stored = self._stored.samples()
@@ -173,7 +173,7 @@ class CentralShell:
             )
         return tuple(warnings)
 
-    def _hear_orders(self) -> None:
+    def _request_orders(self) -> None:
         """Ask the router now and then for the operator's orders.
 
         The operator's command ends at once, and this process may have been cut off when it gave the

@@ -40,7 +40,7 @@ class Members:
         self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """File a submap, with what else `digest` names; returns its tick."""
+        """File a submap; `digest` names it and the `sightings` from it. Returns its tick."""
         key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
         tick = self.tick_of(submap.stamp_ns)
         if tick not in self._ticks:

@@ -1,20 +1,30 @@
-"""The centre's node: messages in, messages out; no I/O, no clock.
+"""The centre's node: receive, file, fold, publish; no I/O, no clock.
 
-It subscribes to the inputs of its rule (submaps, own maps or raw measurements), to progress and
-liveliness, and to nothing that contains the fused map.
+    message ──> attendance   progress, presence and end of the robots' streams
+            ──> store        submaps, inter-robot measurements, initial poses, orders, verdicts
+            ──> fold         the ticks behind the watermark
+            ──> maps         map, priors, withdrawals; at the end the final map
+
+The node subscribes to submaps, to progress and liveliness, and to nothing that contains the fused
+map. A centre of a comparison method (`sim.studies.rules`) is a subclass that files other inputs
+and makes other maps.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import ClassVar
 
 import msgspec
 
 from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.rule import final_of, rule_of
-from central.scheduler import Scheduler
+from central.map_publisher import MapPublisher
+from central.submap_fold import SubmapFold
 from team.door import Door, absurd
 from team.estimation.gaussian import NO_LANDMARKS
+from team.pairs import RULES
+from team.registry import loaded
+from team.store import Stream, SubmapStore
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -28,28 +38,50 @@ MOST_ROBOTS = 100
 class CentralNode:
     """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
-    announcement: its configuration, which its maps name by the digest. admit: a robot that the
-    scenario does not name joins the team when it, or its driver, appears.
+    inputs: the channels of the set. fold_class: makes its maps. announcement: the configuration,
+    which maps name by its digest. admit: a robot that the scenario does not name joins the team
+    when it, or its driver, appears. store: the set. warnings: failures in words, the newest last.
+    final: the final map.
     """
+
+    inputs: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.START,
+        ch.SUBMAP,
+        ch.SIGHTING_FACTOR,
+        ch.ORDER,
+        ch.VERDICT,
+    )
+    fold_class: ClassVar[type[SubmapFold]] = SubmapFold
 
     def __init__(
         self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
     ) -> None:
         self.config = config
+        self.announcement = configured("central", 0, 0, config)
+        self.config_digest = self.announcement.digest
+        self.attendance = TeamAttendance.of(
+            robots, self.has_received, lambda stream: self.store.processed(stream)
+        )
+        self._door = Door(robots)
         self._admits = admit
         self._admitted: list[str] = []
-        self.announcement = configured("central", 0, 0, config)
-        self._door = Door(robots)
-        self._attendance = TeamAttendance.of(robots)
-        self._rule = rule_of(config, self.announcement.digest, sorted(robots))
-        self._scheduler = Scheduler(self._rule)
-        self._intake = self._scheduler.intake
         self._broadcasts = 0
-        self._newest: m.FusedMap | None = None
+        self._begin_set()
+
+    def _begin_set(self) -> None:
+        self.store = SubmapStore()
+        self.maps = MapPublisher(self.fold_class(self.config, self.config_digest, self.store))
+        self.warnings = self.maps.warnings
+        self._newest_map: m.FusedMap | None = None
         self._credit: list[Outgoing] | None = None
         self._concluding = False
         self.finished = False
         self.final: m.FusedMap | None = None
+
+    def restart(self) -> None:
+        """Begin with an empty set, whose members are handed in again; the attendance stays."""
+        self._begin_set()
+        self.attendance.forget_members()
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
@@ -57,27 +89,24 @@ class CentralNode:
         own = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.GIVEN_UP, ch.HEAD, ch.ROBOT_HEAD,
                ch.END_ORDER)  # fmt: skip
         others = (ch.ROBOT_CONFIG,) if self._admits else ()
-        return tuple(dict.fromkeys((*self._intake.listens, *own, *others)))
-
-    @property
-    def warnings(self) -> list[str]:
-        """What went wrong, in words, the newest last."""
-        return self._scheduler.warnings
+        return tuple(dict.fromkeys((*self.inputs, *own, *others)))
 
     def begin(self) -> list[Outgoing]:
         """The first messages of the node: its configuration."""
         return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement)]
+
+    # Receive.
 
     def refusal(self, message: m.Message) -> str | None:
         """Why a message can not be true of this team: its robots, counters, stamps, or its end."""
         self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
-            refused = self._attendance.contradicts(message)
+            refused = self.attendance.contradicts(message)
             if refused is not None:
-                self._attendance.note_end(message)
-                # Where the robots' last words confirm it, nothing may come behind it.
-                refused = None if self._attendance.concluded(self._intake.dealt) else refused
+                self.attendance.note_end(message)
+                # Where the robots' `Done` messages confirm it, no further message may follow.
+                refused = None if self.attendance.is_concluded() else refused
         return refused
 
     def _admit(self, message: m.Message) -> None:
@@ -85,11 +114,11 @@ class CentralNode:
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)
-        if not self._admits or robot is None or robot in self._attendance.robots or absurd(message):
+        if not self._admits or robot is None or robot in self.robots or absurd(message):
             return
-        if len(self._attendance.robots) < MOST_ROBOTS:
-            for admits in (self._door, self._attendance, self._scheduler):
-                admits.admit(robot)
+        if len(self.robots) < MOST_ROBOTS:
+            self._door.admit(robot)
+            self.attendance.admit(robot)
             self._admitted.append(robot)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
@@ -97,25 +126,25 @@ class CentralNode:
         if isinstance(message, m.FusedMap):
             return self._take_final(message)
         self._credit = None
-        known = self._attendance.ordered
-        self._attendance.take(message)
+        is_repeated = self.attendance.ordered
+        self.attendance.take(message)
         if isinstance(message, m.TeamEnd):  # a node that joins later gets it from the centre
-            repeated = [] if known else [Outgoing(ch.TEAM_END, "", message)]
-            return repeated + self._advance()
-        self._credit = self._intake.take(message, self._attendance.now_ns)
+            order = [] if is_repeated else [Outgoing(ch.TEAM_END, "", message)]
+            return order + self._advance()
+        self._credit = self.file(message)
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue behind a message whose handling raised an exception: its sender gets the credit.
 
-        One that the rule could not take counts as refused. A running map that raises takes nothing
+        A member that could not be filed counts as refused. A running map that raises takes nothing
         from the final one; where that can not be computed, the newest map that could is the final
         one, provisional and with the reason.
         """
         out, self._credit = self._credit, []
-        self._attendance.note_change(message)
+        self.attendance.note_change(message)
         if out is None:
-            out = self._intake.refuse(message, why, self._attendance.now_ns)
+            out = self._refuse(message, why)
         if self.finished or not self._is_over:
             return out
         return out + (self._conclude_anyway(why) if self._concluding else self._conclude())
@@ -126,114 +155,247 @@ class CentralNode:
             self.finished, self.final = True, final
         return []
 
-    @property
-    def robots(self) -> Collection[str]:
-        """The robots of the team."""
-        return self._attendance.robots.keys()
+    # File.
 
-    @property
-    def awaited(self) -> list[str]:
-        """The robots that are not there and that the final map waits for."""
-        return [] if self.finished else self._attendance.awaited(self._intake.dealt)
+    def file(self, message: m.Message) -> list[Outgoing]:
+        """File a member of the set; returns the credit of its sender, or the order to repeat."""
+        match message:
+            case m.Submap():
+                return self._file_submap(message)
+            case m.SightingFactor():
+                return self._file_sighting(message)
+            case m.Withdrawal():
+                return self._follow(message)
+            case _:
+                self.store.add(message)
+                return []
 
-    @property
-    def ends(self) -> bool:
-        """Whether all streams have ended, as the world or their drivers have announced."""
-        return self._attendance.end is not None
+    def _file_submap(self, submap: m.Submap) -> list[Outgoing]:
+        """File a submap; each one is acknowledged, a refused one too."""
+        self._warn_of_refusal(self.store.add_submap(submap))
+        return self._credit_of(submap, self.store.acknowledged(_stream_of(submap)))
+
+    def _file_sighting(self, sighting: m.SightingFactor) -> list[Outgoing]:
+        """File an inter-robot measurement; the last one from a submap completes the submap."""
+        stream = _stream_of(sighting)
+        before = self.store.processed(stream)
+        self._warn_of_refusal(self.store.add_sighting(sighting))
+        count = self.store.acknowledged(stream)
+        return self._credit_of(sighting, count) if count > before else []
+
+    def _refuse(self, message: m.Message, why: str) -> list[Outgoing]:
+        """Mark a submap as refused if its handling, or that of an inter-robot measurement from it,
+        has raised, so that nothing waits for it.
+        """
+        if not isinstance(message, m.Submap | m.SightingFactor):
+            return []
+        self.store.refuse(message)
+        self._warn_of_refusal(why)
+        return self._credit_of(message, self.store.processed(_stream_of(message)))
+
+    def _warn_of_refusal(self, reason: str | None) -> None:
+        if reason is not None:
+            self.warnings.append(f"refused: {reason}")
+
+    def _credit_of(self, member: m.Submap | m.SightingFactor, count: int) -> list[Outgoing]:
+        """The message that so many submaps of a member's stream need not be sent again."""
+        progress = m.Progress(
+            stamp_ns=self.attendance.now_ns,
+            node="central",
+            robot=member.robot,
+            incarnation=member.incarnation,
+            measurements=0,
+            submaps=count,
+        )
+        return [Outgoing(ch.CENTRAL_PROGRESS, member.robot, progress)]
+
+    def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
+        """Follow an order, and repeat it for robots that join later, since the operator's command
+        has ended.
+
+        An order that this centre itself gave in an earlier process is found again by its fold.
+        """
+        if order.by == "central" or not self.maps.withdraw(order):
+            return []
+        return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
+
+    # Fold and publish.
 
     def _advance(self) -> list[Outgoing]:
         if self.finished:
             return []
-        self._attendance.withdrawn = frozenset(self._intake.withdrawn)
-        out = self._counted(self._scheduler.advance(self._attendance))
+        self.attendance.withdrawn = frozenset(self.maps.withdrawn)
+        out = self._counted(self.publish_due())
         return out + self._conclude() if self._is_over else out
+
+    def publish_due(self) -> list[Outgoing]:
+        """Fold what the least progress of the live robots has closed; the maps that are due."""
+        return self.maps.publish_due(self.attendance.watermark_ns, self.attendance.now_ns)
+
+    def publish_newest(self) -> list[Outgoing]:
+        """A map of the whole set, if the last one lacks a member."""
+        return self.maps.publish_newest(self.attendance.watermark_ns, self.attendance.now_ns)
+
+    def publish_final(self) -> list[Outgoing]:
+        """The last messages, the final map after all others."""
+        return self.maps.publish_final(self.attendance.now_ns)
 
     def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
         maps = [o.message for o in out if isinstance(o.message, m.FusedMap)]
         self._broadcasts += bool(maps)
-        self._newest = maps[-1] if maps else self._newest
+        self._newest_map = maps[-1] if maps else self._newest_map
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of all that is here, if the last one lacks something; for when there is time."""
-        return [] if self.finished else self._counted(self._scheduler.refresh(self._attendance))
+        """A map of the whole set, if the last one lacks a member; for when there is time."""
+        return [] if self.finished else self._counted(self.publish_newest())
+
+    # Conclude.
+
+    def has_received(self, done: m.Done) -> bool:
+        """Whether every input announced in a robot's `Done` has arrived."""
+        return self.store.processed((done.robot, done.incarnation)) >= done.submaps
+
+    @property
+    def has_all_measurements(self) -> bool:
+        """Whether all raw measurements that the centre consumes have arrived: it consumes none."""
+        return True
 
     @property
     def _is_over(self) -> bool:
-        """The streams have ended, and nobody and nothing of them is waited for."""
-        return self._attendance.concluded(self._intake.dealt) and self._intake.complete
+        """Whether the streams have ended and nothing of them is waited for."""
+        return self.attendance.is_concluded() and self.has_all_measurements
+
+    def _conclude(self) -> list[Outgoing]:
+        self._concluding = True
+        *out, last = self.publish_final()
+        final = last.message
+        assert isinstance(final, m.FusedMap)
+        self.finished = True
+        lost = tuple(self.attendance.missing())
+        if lost:
+            final = msgspec.structs.replace(final, provisional=True, lost=lost)
+        self.final = final
+        return [*out, Outgoing(ch.FINAL_MAP, "", final)]
 
     def _conclude_anyway(self, why: str) -> list[Outgoing]:
-        newest = self._newest
+        newest = self._newest_map
         if newest is None:
-            digest, now_ns = self.announcement.digest, self._attendance.now_ns
+            digest, now_ns = self.config_digest, self.attendance.now_ns
             newest = fused_message(
                 self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
             )
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
-        lost = tuple(self._attendance.missing(self._intake.dealt))
+        lost = tuple(self.attendance.missing())
         final = msgspec.structs.replace(
             newest, final=True, provisional=True, reasons=reasons, lost=lost
         )
         self.finished, self.final = True, final
         return [Outgoing(ch.FINAL_MAP, "", final)]
 
-    def _conclude(self) -> list[Outgoing]:
-        self._concluding = True
-        out = self._scheduler.conclude(self._attendance.now_ns)
-        self.finished = True
-        final = final_of(out)
-        lost = tuple(self._attendance.missing(self._intake.dealt))
-        if lost:
-            final = msgspec.structs.replace(final, provisional=True, lost=lost)
-        self.final = final
-        return [*out[:-1], Outgoing(ch.FINAL_MAP, "", final)]
+    # Answers to the shell.
+
+    @property
+    def robots(self) -> Collection[str]:
+        """The robots of the team."""
+        return self.attendance.robots.keys()
+
+    @property
+    def awaited(self) -> list[str]:
+        """The absent robots that the final map waits for."""
+        return [] if self.finished else self.attendance.awaited()
+
+    @property
+    def ends(self) -> bool:
+        """Whether all streams have ended, as the world or their drivers have announced."""
+        return self.attendance.end is not None
 
     def requests(self) -> list[m.MeasurementsRequest]:
-        """The measurements that are missing and must be asked for at their source."""
-        return [] if self.finished else self._intake.requests(self._attendance.now_ns)
-
-    def answer_submaps(self, request: bytes) -> Iterable[bytes]:
-        """The answer to `SubmapsRequest`: what is here of the robot, its latest incarnation
-        first.
-        """
-        stored = self._intake.stored_messages(decoded(request, m.SubmapsRequest).robot)
-        return [encoded(message) for message in stored]
+        """Requests for missing raw measurements, for their source: the centre consumes none."""
+        return []
 
     def lacking(self) -> list[m.SubmapsRequest]:
-        """What robots have sent by their own word and is not here: to be asked of them."""
-        return [] if self.finished else self._intake.lacking(self._attendance)
+        """Requests for submaps that robots have announced and that no map can have yet."""
+        if self.finished:
+            return []
+        sent: dict[Stream, int] = {}
+        for robot in self.attendance.robots.values():
+            for each in (robot.progress, robot.done):
+                if each is not None:
+                    stream = (each.robot, each.incarnation)
+                    sent[stream] = max(sent.get(stream, 0), each.submaps)
+        return [
+            m.SubmapsRequest(
+                stamp_ns=self.attendance.now_ns, robot=robot, incarnation=incarnation, first=first
+            )
+            for (robot, incarnation), count in sorted(sent.items())
+            if (first := self.store.processed((robot, incarnation))) < count
+        ]
+
+    def answer_submaps(self, request: bytes) -> Iterable[bytes]:
+        """The answer to `SubmapsRequest`: a robot's members, its latest incarnation first."""
+        robot = decoded(request, m.SubmapsRequest).robot
+        return [encoded(message) for message in self.store.messages_of(robot)]
+
+    # Status.
+
+    @property
+    def landmarks(self) -> int:
+        """Number of landmarks in the newest map."""
+        return self.maps.fold.landmarks
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """The monitor's figures."""
+        return self.maps.fold.figures
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Warnings for readers of the map."""
+        return self.maps.fold.findings
 
     def status(self) -> m.Status:
         """The centre's status, for people."""
+        now_ns = self.attendance.now_ns
         figures = {
             "broadcasts": float(self._broadcasts),
-            "submaps": float(self._intake.submaps),
-            "landmarks": float(self._rule.landmarks),
-            "team_time_s": self._attendance.now_ns * 1e-9,
-            "refused": float(self._intake.refused + self._rule.not_folded),
+            "submaps": float(self.store.submaps),
+            "landmarks": float(self.landmarks),
+            "team_time_s": now_ns * 1e-9,
+            "refused": float(self.store.refused + self.maps.fold.not_folded),
         }
-        state = "done" if self.finished else "joining"
         given_up = [
             f"{robot} is given up: nobody waits for it, and the final map will be provisional"
-            for robot in self._attendance.given_up
+            for robot in self.attendance.given_up
         ]
         admitted = (
             (f"admitted, though not in the scenario: {', '.join(self._admitted)}",)
             if self._admitted
             else ()
         )
-        warnings = (
-            *given_up,
-            *admitted,
-            *self._rule.findings,
-            *self.warnings[-3:],
-        )
-        now_ns = self._attendance.now_ns
         return m.Status(
             stamp_ns=now_ns,
             node="central",
-            state=state,
-            figures=figures | dict(self._rule.figures),
-            warnings=warnings,
+            state="done" if self.finished else "joining",
+            figures=figures | dict(self.figures),
+            warnings=(*given_up, *admitted, *self.findings, *self.warnings[-3:]),
         )
+
+
+def _stream_of(member: m.Submap | m.SightingFactor) -> Stream:
+    return member.robot, member.incarnation
+
+
+def node_class(config: CentralConfig) -> type[CentralNode]:
+    """The node of the fusion rule that the configuration names; raises NotInstalledError."""
+    found: type[CentralNode] = loaded(
+        RULES[config.fusion].made_by, f"the fusion rule {config.fusion}"
+    )
+    return found
+
+
+def make_centre(
+    config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+) -> CentralNode:
+    """Make the node of the fusion rule that the configuration names; raises NotInstalledError."""
+    return node_class(config)(config, robots, admit=admit)

@@ -1,4 +1,4 @@
-"""The presence and progress of one robot, as the centre knows them."""
+"""The presence and progress of one robot at the centre."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -13,9 +13,9 @@ MOST_NOTED = 1_000
 
 @dataclass
 class Attendance:
-    """The progress and presence of one robot, as the centre knows them.
+    """The progress and presence of one robot at the centre.
 
-    done: the believed one of the `Done` messages; dones: all that have arrived. began: the latest
+    done: the accepted one of the `Done` messages; dones: all that have arrived. began: the latest
     incarnation that has begun; 0: none. head: the newest head of its driver, in a live team.
     driver: whether its driver is present; None: unknown.
     """

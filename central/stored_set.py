@@ -1,6 +1,6 @@
 """A centre's set on disk: the messages of robots and operators for it, as they were sent.
 
-The file is a peer's (`team.peers.store`). A centre that was killed reads it and continues: nothing
+The file is a peer's (`team.peers.set_file`). A centre that was killed continues from it: nothing
 of it has to be sent again, and the same set gives the same map.
 """
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from team.peers.members import CHANNELS, member_of
-from team.peers.store import Keeper
+from team.peers.set_file import Keeper
 from team.wire import channels as ch
 from team.wire.bus import Sample
 from team.wire.codec import WireError
@@ -18,7 +18,7 @@ _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTI
 
 
 class StoredSet:
-    """Keeps each member once. Raises StoreError where the file can not be used."""
+    """Keeps each member once. Raises SetFileError where the file can not be used."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -26,7 +26,7 @@ class EstimatorRow(NamedTuple):
 
 
 class RuleRow(NamedTuple):
-    """made_by: a `central.rule.FusionRule`. takes: its estimators, beside those that name it.
+    """made_by: a `central.node.CentralNode`. takes: its estimators, beside those that name it.
 
     feedback: the robots absorb its map again, in lockstep.
     """
@@ -41,8 +41,8 @@ COMPARISON_ROBOT = "sim.studies.robots.node:comparison_robot"
 """Makes the robot's node of a pair whose rule does not fuse submaps."""
 _RUNNING = "sim.studies.robots.running:running_estimator"
 _WHOLE = ("latest", "alone")
-_ROUNDS = "sim.studies.rules.feedback_rule:ExchangeRule"
-_SVD = "sim.studies.rules.svd_rule:SvdJoinRule"
+_ROUNDS = "sim.studies.rules.feedback_rule:RoundsCentre"
+_SVD = "sim.studies.rules.svd_rule:SvdCentre"
 _CHEAP = ("hybrid", "dead-reckoning")
 _PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")
 
@@ -60,18 +60,18 @@ ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(
 )
 RULES: Mapping[str, RuleRow] = MappingProxyType(
     {
-        "join": RuleRow("central.join_rule:JoinRule", "submap"),
+        "join": RuleRow("central.node:CentralNode", "submap"),
         "kalman": RuleRow(_ROUNDS, "own/map", feedback=True),
         "kalman-per-axis": RuleRow(_ROUNDS, "own/map", _PER_AXIS, feedback=True),
         "covariance-intersection": RuleRow(_ROUNDS, "own/map", feedback=True),
-        "latest": RuleRow("sim.studies.rules.map_rules:LatestRule", "own/map"),
-        "alone": RuleRow("sim.studies.rules.map_rules:AloneRule", "own/map"),
+        "latest": RuleRow("sim.studies.rules.map_rules:LatestCentre", "own/map"),
+        "alone": RuleRow("sim.studies.rules.map_rules:AloneCentre", "own/map"),
         "svd-join": RuleRow(_SVD, "submap"),
         "svd-join-spherical": RuleRow(_SVD, "submap"),
         "joint-fastslam": RuleRow(
-            "sim.studies.rules.joint_fastslam_rule:JointFastSlamRule", "measurements", _CHEAP
+            "sim.studies.rules.joint_fastslam_rule:JointFastSlamCentre", "measurements", _CHEAP
         ),
-        "batch": RuleRow("sim.studies.rules.batch_rule:BatchRule", "measurements", _CHEAP),
+        "batch": RuleRow("sim.studies.rules.batch_rule:BatchCentre", "measurements", _CHEAP),
     }
 )
 
@@ -83,7 +83,7 @@ PAIRS: Mapping[tuple[str, str], Channel] = MappingProxyType(
         if estimator in RULES[rule].takes or rule in row.feeds
     }
 )
-"""(estimator, rule) → what the centre subscribes to. Any other pair has no meaning: only
+"""(estimator, rule) → the inputs of the centre. Any other pair has no meaning: only
 `hybrid` makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis,
 and a robot that only localises has no map to fuse."""
 FEEDBACK = frozenset(rule for rule, row in RULES.items() if row.feedback)

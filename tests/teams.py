@@ -9,9 +9,7 @@ import msgspec
 import numpy as np
 
 from central.config import CentralConfig
-from central.intake import Instant
-from central.node import CentralNode
-from central.scheduler import Scheduler
+from central.node import make_centre
 from sim.publisher.node import WorldNode, expected_nodes
 from sim.world.streams import (
     Detections,
@@ -214,7 +212,7 @@ class Team:
             announced,
             tells_map=self.configs[0].estimator in NEEDS_MAP,
         )
-        self.centre = CentralNode(rule, names)
+        self.centre = make_centre(rule, names)
         self.robots = {c.id: robot_node(c, self.exchange) for c in self.configs}
         self.nodes = {"world": self.world, "central": self.centre}
         self.nodes |= {ch.robot_node(name): node for name, node in self.robots.items()}
@@ -309,8 +307,3 @@ class Team:
     def final(self) -> m.FusedMap:
         (final,) = self.sent[ch.FINAL_MAP.key()]
         return final
-
-
-def broadcasts(found: Scheduler, closed_ns: float, now_ns: int) -> list[Outgoing]:
-    """What a scheduler says when all that ends up to a time is closed."""
-    return found.at(Instant(now_ns, found.intake.inputs(closed_ns, now_ns)))

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import sim.publisher.node
 import team.robot.node
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import CentralNode, make_centre
 from sim.datasets.utias_writer import write_utias
 from sim.in_memory.team import final_map, run_team
 from sim.publisher.node import WorldNode
@@ -311,7 +311,7 @@ def test_no_node_listens_to_the_truth(node):
 @pytest.mark.parametrize("fusion", sorted({fusion for _, fusion in PAIRS}))
 def test_the_centre_listens_to_nothing_that_holds_the_truth_or_the_fused_map(fusion):
     fused = {ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.TEAM_POSE}
-    listens = set(CentralNode(CentralConfig(fusion=fusion), ["r1"]).listens)
+    listens = set(make_centre(CentralConfig(fusion=fusion), ["r1"]).listens)
     assert not {each for each in ch.CHANNELS if each.name.startswith("truth")} & listens
     assert not fused & listens
 

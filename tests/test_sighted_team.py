@@ -62,7 +62,7 @@ def samples():
 def test_the_robots_see_each_other_and_the_map_has_it(first):
     seen = [x for robot in SCENARIO.robots for x in first.sent[ch.SIGHTING_FACTOR.key(robot.id)]]
     assert len({x.robot for x in seen}) == 2
-    fold = first.centre._rule._ticks.fold
+    fold = first.centre.maps.fold._ticks.fold
     assert 0 < len(fold.main.graph.sightings) <= len(seen)
     assert len(fold.main.graph.sightings) + len(fold.waiting) == len(seen)
 
@@ -97,7 +97,7 @@ def test_a_submap_enters_the_map_when_its_last_sighting_has_come(first):
         centre.handle(submap, 0)
     for each in (whole, *mine[:-1]):
         centre.handle(each, 0)
-    before = centre._intake.count((robot, whole.incarnation))
+    before = centre.store.processed((robot, whole.incarnation))
     out = centre.handle(mine[-1], 0)
     assert before == whole.sequence
     assert [x.submaps for x in of(out, ch.CENTRAL_PROGRESS)] == [whole.sequence + 1]

@@ -12,5 +12,5 @@
 Calls go down only, and messages are returned. A measurement goes to the estimator; its submap goes
 into the set and out to the others; the fold reads the new members of the set and gives them to its
 own centre's node; the map goes out under the peer's name, and the prior goes to the estimator for
-`team/pose`. The three nodes do not know each other, except that the fold reads the set.
+`team/pose`. The three nodes are independent of each other, except that the fold reads the set.
 """

@@ -1,6 +1,6 @@
 """A centre among peers: it has no estimator, and keeps and folds the team's set as they do.
 
-It may join, leave and come back at any time: nobody waits for it, and it requests what it lacks
+It may join, leave and come back at any time: no robot waits for it, and it requests missing members
 from any peer. It publishes a centre's maps, which peers do not need.
 """
 
@@ -30,7 +30,7 @@ class PeerCentre(Peer):
         return self.fold.centre.begin()
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """A centre's maps and orders; nobody waits for its credit."""
+        """A centre's maps and orders; no robot needs its credit."""
         return [each for each in messages if each.channel is not ch.CENTRAL_PROGRESS]
 
     def status(self) -> m.Status:

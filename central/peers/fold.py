@@ -8,12 +8,10 @@ a robot that contradicts itself again and again does not keep its peers from the
 """
 
 import hashlib
-from collections.abc import Callable
 from typing import Literal
 
 from central.config import CentralConfig
 from central.node import CentralNode
-from central.robot_attendance import note
 from team.containment import Boundary
 from team.door import MOST_COUNT
 from team.peers.node import PeerNode
@@ -21,7 +19,6 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
-from team.wire.newer import further, later_end, later_head
 
 FoldWhen = Literal["always", "request", "end"]
 """When a peer folds: as the set grows; on request and once the set is complete; or only then."""
@@ -30,8 +27,8 @@ FoldWhen = Literal["always", "request", "end"]
 class PeerFold:
     """Folds the set of a `PeerNode`.
 
-    centre: the node that folds; it is made anew where the fold begins anew. final: the newest final
-    map; finals: number of final maps.
+    centre: the node that folds. restarts: how often it has begun anew. final: the newest final map;
+    finals: number of final maps.
     """
 
     def __init__(
@@ -40,68 +37,29 @@ class PeerFold:
         robots: tuple[str, ...],
         peer: PeerNode,
         when: FoldWhen = "always",
-        make: Callable[[CentralConfig, tuple[str, ...]], CentralNode] = CentralNode,
     ) -> None:
-        self._make, self._config, self._robots = make, config, robots
+        self._robots = robots
         self._peer = peer
         self.boundary = Boundary(peer.node)
-        self._end: m.End | None = None
-        self._ends: list[m.End] = []
-        self._progress: dict[str, m.Progress] = {}
-        self._alive: dict[str, bool] = {}
-        self._heads: dict[str, m.StreamHead] = {}
-        self._ordered: m.TeamEnd | None = None
+        self.centre = CentralNode(config, robots)
+        self.restarts = 0
         self.final: m.FusedMap | None = None
         self.finals = 0
         self._when = when
         self._waits = when != "always"
-        self._begin()
-
-    def _begin(self) -> None:
-        self.centre = self._make(self._config, self._robots)
-        for robot in self._robots:  # a robot that was never in reach counts as lost
-            for alive in (True, self._alive.get(robot, False)):
+        for robot in robots:  # a robot that was never in reach counts as lost
+            for alive in (True, False):
                 node = ch.robot_node(robot)
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
-        ends = (self._end, *self._ends, self._ordered)
-        known = (*self._heads.values(), *(e for e in ends if e is not None))
-        for message in (*known, *self._progress.values()):
-            self._give(message)
 
     def note(self, message: m.Message) -> list[Outgoing]:
         """Take a message that is no member: progress, liveliness, the end of the streams."""
-        refused = self.centre.refusal(message)
-        if refused is None and not self._stored(message):
+        if isinstance(message, m.Liveliness) and ch.robot_of(message.node) not in self._robots:
             return []
-        if isinstance(message, m.End):
-            note(message, self._ends)  # the robots' `Done` messages may confirm it
         out: list[Outgoing] = []
         if isinstance(message, m.End | m.TeamEnd) and self._peer.rebuild:
-            out += self._again()  # the final map may follow
+            out += self._restart()  # the final map may follow
         return [*out, *self._give(message), *self.grow()]
-
-    def _stored(self, message: m.Message) -> bool:
-        """Store a message for a fold that begins anew, unless it has a later one; returns whether
-        the message was of use.
-        """
-        match message:
-            case m.End():
-                self._end = later_end(message, self._end)
-            case m.StreamHead():
-                self._heads[message.robot] = later_head(message, self._heads.get(message.robot))
-            case m.TeamEnd():
-                self._ordered = message
-            case m.Progress():
-                known = self._progress.get(message.robot)
-                self._progress[message.robot] = further(message, known)
-            case m.Liveliness():
-                robot = ch.robot_of(message.node)
-                if robot not in self._robots:
-                    return False
-                self._alive[robot] = message.alive
-            case _:
-                return False
-        return True
 
     def _end_by_others(self) -> list[Outgoing]:
         """Infer from other peers' conclusions that all streams have ended, where the message was
@@ -109,7 +67,7 @@ class PeerFold:
         """
         stated = self._peer.replica.statements
         here = [r for r in stated if not {("given_up", 0), ("withdrawal", 0)} & stated[r].keys()]
-        if self._end is not None or not here:
+        if self.centre.attendance.world_end is not None or not here:
             return []
         if not set(here) <= self._peer.replica.concluded.keys():
             return []
@@ -121,8 +79,7 @@ class PeerFold:
                 incarnation, count = max(last)
                 end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
                 streams.append(end)
-        self._end = m.End(stamp_ns=0, streams=tuple(streams))
-        return self._give(self._end)
+        return self._give(m.End(stamp_ns=0, streams=tuple(streams)))
 
     def grow(self) -> list[Outgoing]:
         """Fold the new members of the set; returns the messages to publish."""
@@ -132,42 +89,43 @@ class PeerFold:
             self._waits = False
         out = self._end_by_others()
         if self._peer.rebuild and (self.centre.finished or self._whole):
-            return out + self._again()
+            return out + self._restart()
         for message in list(self._peer.new_messages()):
             if self.centre.finished and not isinstance(message, m.Concluded):
-                return out + self._again()
+                return out + self._restart()
             out += self._give(message)
         if self._peer.rebuild and self.centre.finished:
-            out += self._again()
+            out += self._restart()
         return out
 
-    def _again(self) -> list[Outgoing]:
+    def _restart(self) -> list[Outgoing]:
         """Fold the whole set from the beginning: as `Done` is given last, all of it is in the final
         map.
         """
-        self._peer.again()
-        self._begin()
+        self._peer.restart_fold()
+        self.centre.restart()
+        self.restarts += 1
         out: list[Outgoing] = []
         for message in list(self._peer.new_messages()):
             out += self._give(message)
         return out
 
     def ask(self) -> list[Outgoing]:
-        """Fold what is here now, without waiting; returns the messages to publish."""
+        """Fold the present set, without waiting; returns the messages to publish."""
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False
-        out = [*self._renewed(), *self.grow(), *self.centre.refresh()]
+        out = [*self._restart_if_changed(), *self.grow(), *self.centre.refresh()]
         self._waits = waits and self.final is None
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of everything that is here, if the last one lacks something."""
-        return [] if self._waits else [*self._renewed(), *self.centre.refresh()]
+        """A map of the whole set, if the last one lacks a member."""
+        return [] if self._waits else [*self._restart_if_changed(), *self.centre.refresh()]
 
-    def _renewed(self) -> list[Outgoing]:
+    def _restart_if_changed(self) -> list[Outgoing]:
         """Begin the fold anew if a folded member has changed."""
-        return self._again() if self._peer.rebuild else []
+        return self._restart() if self._peer.rebuild else []
 
     def _give(self, message: m.Message) -> list[Outgoing]:
         before = self.centre.finished
@@ -179,8 +137,8 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Whether everything that any node has announced is here."""
-        return any(self._is_here(end) for end in (self._end, *self._ends) if end is not None)
+        """Whether all members up to an announced end are in the set."""
+        return any(self._is_here(end) for end in self.centre.attendance.ends)
 
     def _is_here(self, end: m.End) -> bool:
         replica = self._peer.replica

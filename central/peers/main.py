@@ -14,7 +14,7 @@ from central.peers.robot import PeerRobot
 from team.config import Exchange, RobotConfig
 from team.peers.members import Member
 from team.peers.proofs import Signs
-from team.peers.store import Keeper
+from team.peers.set_file import Keeper
 from team.robot.main import SECOND_PATIENCE_S, RobotShell
 from team.shell import Shell
 from team.wire import channels as ch
@@ -22,8 +22,8 @@ from team.wire import messages as m
 from team.wire.bus import Bus, Tap
 
 LINGER_S = 5.0
-"""Time [s] for which a robot stays once it knows that all others have concluded, so that they learn
-it, too.
+"""Time [s] for which a robot stays once all others have concluded, so that they receive its own
+conclusion, too.
 """
 FRESH_SHARE = 0.2
 """Share of the time for maps that are not due: a robot has more to do than a centre."""
@@ -87,7 +87,7 @@ class PeerShell(RobotShell):
         self._alone = Alone()
 
     def run(self) -> None:
-        """Run until nobody needs this peer any more."""
+        """Run until no other peer needs this one."""
         try:
             super().run()
         finally:
@@ -151,7 +151,7 @@ class PeerShell(RobotShell):
             tap([member.as_sample(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
-        """Whether nobody needs this peer any more: all have concluded, or the world has left."""
+        """Whether no other peer needs this one: all have concluded, or the world has left."""
         if self._alone.since(now, alone=self._peer.is_left_alone):
             return True
         if self._peer.final is None:

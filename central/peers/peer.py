@@ -1,7 +1,7 @@
 """The common part of a robot without a centre and a centre among peers: the set and its fold.
 
 A peer takes members from any publisher, gives new ones to its own fold, and publishes the fold's
-messages under its own name. The rest (an estimator, say) is its subclass's.
+messages under its own name. A subclass adds the rest, such as an estimator.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,7 +17,7 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample, sound
 from team.wire.codec import decoded, encoded
 
-TALK = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
+SET_CHANNELS = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
 """Channels of the set, which its traffic figures count; requests count, too."""
 CENTRE = "central"
 """The node name of a centre."""
@@ -96,27 +96,27 @@ class Peer:
         """Take one message of a robot, a peer, the world or an operator."""
         found = ch.channel_of(sample.key)
         channel, name = (None, "") if found is None else found
-        if channel in TALK and channel.publisher(name) != self.name:
+        if channel in SET_CHANNELS and channel.publisher(name) != self.name:
             self.downlink += len(sample.payload)
-        answered = self._hear(message, sample)
+        answered = self._take_team_message(message, sample)
         return self._take(message, sample, channel, name) if answered is None else answered
 
-    def _hear(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
+    def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
         """Take a message about the set or the team's progress; None: it is another message."""
         match message:
             case m.Members():
                 self.carried += self.peer.take_carried(message)
-                return self.grown() + self.counted(self.peer.more_of(message.node))
+                return self.grown() + self.counted(self.peer.request_rest(message.node))
             case m.Signature():
                 found = ch.channel_of(sample.key)
                 if self.peer.proofs is not None and found is not None:
                     channel, name = found
                     operators = channel is ch.ORDER_SIGNATURE
                     if operators or channel.publisher(name) in self.peer.known:
-                        self.peer.proofs.hear(message, OPERATOR if operators else name)
+                        self.peer.proofs.take_signature(message, OPERATOR if operators else name)
                 return []
             case m.SetSummary():
-                return self.counted(self.peer.hear(message))
+                return self.counted(self.peer.take_summary(message))
             case m.Progress() | m.StreamHead() | m.TeamEnd() | m.End():
                 return self._from_fold(self.fold.note(message))
             case m.Liveliness(node="world"):
@@ -138,7 +138,7 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether the team has ended, and nobody is present who has the missing members.
+        """Whether the team has ended, and no node is present that has the missing members.
 
         It has ended where every other robot has announced its own end, but for those that an
         operator has given up or withdrawn.
@@ -174,7 +174,11 @@ class Peer:
 
     def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
         """The same messages, with those of the set's channels counted."""
-        talk = (each.message for each in out if each.channel in TALK or each.channel is ch.MEMBERS)
+        talk = (
+            each.message
+            for each in out
+            if each.channel in SET_CHANNELS or each.channel is ch.MEMBERS
+        )
         self.uplink += sum(len(encoded(message)) for message in talk)
         return list(out)
 

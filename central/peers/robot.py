@@ -127,7 +127,7 @@ class PeerRobot(Peer):
                 found += [each.message for parcel in parcels for each in parcel[:-1]]
         return found
 
-    def _hear(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
+    def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
         """Take a message about the set or the team's progress; those of its own stream go to the
         estimator, too.
         """
@@ -143,7 +143,7 @@ class PeerRobot(Peer):
             case m.Liveliness() if message.node == ch.source_node(self.robot):
                 return self._to_estimator(message, sample)
             case _:
-                return super()._hear(message, sample)
+                return super()._take_team_message(message, sample)
 
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str

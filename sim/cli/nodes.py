@@ -205,7 +205,7 @@ def _peer_shell(
     from central.peers.fold import FoldWhen
     from central.peers.main import PeerShell
     from sim.radio.bus import behind_radio
-    from team.peers.store import StoreError
+    from team.peers.set_file import SetFileError
 
     if fold not in get_args(FoldWhen):
         fail(f"--fold is always, request or end, not {fold!r}", WRONG_USE)
@@ -223,7 +223,7 @@ def _peer_shell(
             when=cast(FoldWhen, fold),
             signer=signer,
         )
-    except StoreError as error:
+    except SetFileError as error:
         fail(str(error), WRONG_USE)
 
 
@@ -259,7 +259,7 @@ def central(
 
     With --peers it is one more peer, which may join and leave at any time.
     """
-    from team.peers.store import StoreError
+    from team.peers.set_file import SetFileError
     from team.shell import process
 
     resolved = with_options(
@@ -277,7 +277,7 @@ def central(
         _connected(resolved, connect)
         try:
             _central_shell(bus, resolved, stop, store, patience, keys).run()
-        except StoreError as error:
+        except SetFileError as error:
             fail(str(error), WRONG_USE)
 
 

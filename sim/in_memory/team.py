@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import CentralNode, make_centre
 from sim.in_memory.links import Conditions, Link
 from sim.publisher.node import WorldNode, expected_nodes
 from sim.scenarios.scenario import Scenario
@@ -85,7 +85,7 @@ def run_team(
     scenario: Scenario,
     streams: WorldStreams,
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
-    central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
+    central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
     """Run the team to its final map; returns the samples that a recorder would record, in its
     order.
@@ -103,7 +103,7 @@ def run_nodes(
     world: World,
     conditions: Conditions | None = None,
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
-    central: Callable[[CentralConfig, list[str]], CentralNode] = CentralNode,
+    central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
     """Run the scenario's robots and centre in a world until no message is on its way.
 

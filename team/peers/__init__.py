@@ -1,3 +1,1 @@
-"""The team's set of members as every peer keeps it: what it holds, what peers request, and its
-file.
-"""
+"""The team's set of members at each peer: contents, exchange between peers, and file."""

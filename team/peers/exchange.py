@@ -26,11 +26,11 @@ BATCH_BYTES = 64 * 2**10
 """Bytes of members in one message of an answer."""
 
 
-def request_for(
+def make_request(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
-    """The request for what the summary's node has and this replica lacks; None where that is
-    nothing.
+    """The request for the members that the summary's node has and this replica lacks; None where
+    there are none.
 
     not_now: (stream, sequence) that were requested from another peer a moment ago. A stream of
     which both have the same sequences with different digests is requested whole: its robot has
@@ -84,7 +84,7 @@ def request_for(
     )
 
 
-def oversized(replica: Replica, summary: m.SetSummary) -> bool:
+def is_oversized(replica: Replica, summary: m.SetSummary) -> bool:
     """Whether a summary names more than any peer of this team can have."""
     return (
         len(summary.holdings) > MOST_STREAMS * len(replica.robots)
@@ -93,7 +93,7 @@ def oversized(replica: Replica, summary: m.SetSummary) -> bool:
     )
 
 
-def named(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
+def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
     """The (stream, sequence) of a request, as `not_now` takes them."""
     for each in request.requested:
         stream = each.robot, each.incarnation
@@ -118,7 +118,7 @@ Sign = Callable[[Member], bytes]
 """A member's signature by its author; empty where it has none."""
 
 
-def answered(
+def make_answer(
     replica: Replica, request: m.MembersRequest, node: str, sign: Sign | None = None
 ) -> list[m.Members]:
     """The requested members that are here, in portions; the statements first.

@@ -1,4 +1,4 @@
-"""The order in which a fold is given the set: orders, streams by time, `Done`, who was given up."""
+"""The order of members for a fold: orders, streams by time, `Done`, robots given up."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from team.peers.replica import Replica
 from team.wire import messages as m
 
 
-def turn(message: m.Message) -> int:
+def feed_order(message: m.Message) -> int:
     """Where a statement is given to a fold: before the streams (negative) or after them."""
     match message:
         case m.Withdrawal() | m.Verdict():

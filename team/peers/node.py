@@ -10,8 +10,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from team.peers.exchange import answered, named, oversized, request_for
-from team.peers.feed import new_of_streams, turn
+from team.peers.exchange import is_oversized, list_requested, make_answer, make_request
+from team.peers.feed import feed_order, new_of_streams
 from team.peers.given import GIVEN_BYTES, Given
 from team.peers.members import CHANNELS, Member, Stream, member_of
 from team.peers.proofs import Proofs
@@ -24,9 +24,9 @@ from team.wire.codec import WireError, decoded, encoded
 SUMMARY_S = 1.0
 """Least time [s] between two summaries."""
 LAST_S = 0.2
-"""… once all have concluded: peers leave soon, and need to know that their maps agree."""
+"""… once all have concluded: peers leave soon, and compare their maps before."""
 REPEAT_S = 10.0
-"""… and the longest: a node that has appeared unnoticed learns what is here."""
+"""… and the longest: a node that has appeared unnoticed receives a summary."""
 PATIENCE_S = 3.0
 """A request without an answer goes to another node after this time [s]."""
 FRESH_S = 25.0
@@ -48,7 +48,7 @@ class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
     known: the nodes that may have a set: the team's robots and a centre. proofs: checks members
-    that come over third nodes; None: there are no keys, and every node is believed. unsaved: new
+    that come over third nodes; None: there are no keys, and every node is trusted. unsaved: new
     members since it was last cleared. carried: traffic by node. refused: how many members were not
     kept; last_refused: why.
     """
@@ -148,17 +148,17 @@ class PeerNode:
 
     def new_messages(self) -> Iterator[m.Message]:
         """The messages that a fold can take now and has not yet been given, in order: operators'
-        orders first, since it may end with the last member of a stream, and what ends it last.
+        orders first, since it may end with the last member of a stream; `Done` messages last.
         """
         statements, self._new_messages = self._new_messages, []
-        statements.sort(key=turn)
-        orders = sum(turn(each) < 0 for each in statements)
+        statements.sort(key=feed_order)
+        orders = sum(feed_order(each) < 0 for each in statements)
         yield from statements[:orders]
         yield from new_of_streams(self.replica, self._fed)
         yield from statements[orders:]
 
-    def again(self) -> None:
-        """Give everything to the fold again, which begins anew."""
+    def restart_fold(self) -> None:
+        """Queue every stored member for a fold that begins anew."""
         self.rebuild = False
         self._fed.clear()
         self._new_messages = [
@@ -167,24 +167,24 @@ class PeerNode:
             for _, member in sorted(self.replica.statements[robot].items())
         ]
 
-    # Talk.
+    # Exchange.
 
-    def hear(self, summary: m.SetSummary) -> list[Outgoing]:
-        """Take another node's summary: request what it has more, and publish a summary where it
-        lacks members.
+    def take_summary(self, summary: m.SetSummary) -> list[Outgoing]:
+        """Take another node's summary: request members that are missing here, and publish a summary
+        where that node lacks members.
         """
         if summary.node == self.node:
             return []
         if summary.node not in self.known:
             self._refuse(f"a summary of {summary.node[:80]}, not in this team")
             return []
-        if oversized(self.replica, summary):
+        if is_oversized(self.replica, summary):
             self._refuse(f"a summary of {summary.node} with more than a team can have")
             return []
         self._summaries[summary.node] = self._now_s, summary
         if self._announced_digest is not None and summary.digest != self._announced_digest:
             self.greet()
-        return self._ask(summary)
+        return self._request_from(summary)
 
     def greet(self) -> None:
         """Publish a summary soon, for a node that has appeared."""
@@ -198,7 +198,7 @@ class PeerNode:
         by_trust = sorted(self._summaries, key=lambda node: self._failures.get(node, 0))
         for received_s, summary in [self._summaries[node] for node in by_trust]:
             if now_s - received_s < FRESH_S and summary.digest != self.replica.digest:
-                out += self._ask(summary)
+                out += self._request_from(summary)
         since_s = now_s - self._announced_s
         over = self.replica.concluded.keys() >= set(self.replica.robots)
         if since_s < (LAST_S if over else SUMMARY_S):
@@ -212,7 +212,7 @@ class PeerNode:
         return out
 
     def _note_arrival(self, message: m.Message) -> None:
-        """Forget the request of what has arrived."""
+        """Forget the request of a member that has arrived."""
         match message:
             case m.InitialPose():
                 self._close(((message.robot, message.incarnation), -1))
@@ -229,7 +229,7 @@ class PeerNode:
             self._open[asked[1]] -= 1
 
     def _forget_questions(self) -> None:
-        """Let requests expire; nodes that did not give what they have are asked last."""
+        """Let requests expire; nodes that did not send members that they have are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
         self._open.subtract(node for _, node in over.values())
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
@@ -239,19 +239,19 @@ class PeerNode:
     def _lacks(self, stream: Stream, sequence: int) -> bool:
         return sequence >= 0 and sequence not in self.replica.share_of(stream).complete
 
-    def more_of(self, node: str) -> list[Outgoing]:
+    def request_rest(self, node: str) -> list[Outgoing]:
         """Request the rest from a node that has answered."""
         received = self._summaries.get(node)
-        return [] if received is None else self._ask(received[1])
+        return [] if received is None else self._request_from(received[1])
 
-    def _ask(self, summary: m.SetSummary) -> list[Outgoing]:
+    def _request_from(self, summary: m.SetSummary) -> list[Outgoing]:
         if self._open[summary.node] >= MOST_OPEN:
             return []
-        request = request_for(self.replica, summary, self._asked)
+        request = make_request(self.replica, summary, self._asked)
         if request is None:
             return []
         until = self._now_s + PATIENCE_S, summary.node
-        for name in named(request):
+        for name in list_requested(request):
             self._close(name)
             self._asked[name] = until
             self._open[summary.node] += 1
@@ -279,7 +279,7 @@ class PeerNode:
 
     def _answered(self, request: m.MembersRequest) -> list[m.Members]:
         sign = None if self.proofs is None else self.proofs.of
-        return answered(self.replica, request, self.node, sign)
+        return make_answer(self.replica, request, self.node, sign)
 
     @property
     def agrees(self) -> dict[str, bool]:

@@ -6,12 +6,11 @@ orders (`operator/signature/r1`) with its certificate in front, so that robots o
 check them.
 
 A member is proven by any certificate of its author that the team's authority has issued, that is
-not revoked, and that had not ended at the member's stamp. That stamp is the author's own word, by
-its sensor's clock: whoever has stolen a key can date back what it signs, and only a revocation ends
-what a stolen key can sign. A certificate of a later generation proves that the earlier ones are
-revoked, since the authority issues it only then; a roster beside the own key names revocations
-without a successor. Certificates of revoked generations stay in the set, which is the same for all
-peers; they prove nothing.
+not revoked, and that had not ended at the member's stamp. That stamp is by the author's own
+clock: a stolen key can sign with an earlier date, and only its revocation ends that. A certificate
+of a later generation proves that the earlier ones are revoked, since the authority issues it only
+then; a roster beside the own key names revocations without a successor. Certificates of revoked
+generations stay in the set, which is the same for all peers; they prove nothing.
 """
 
 from collections.abc import Iterator
@@ -49,11 +48,11 @@ class Signs(Protocol):
         """The last generation that is known to be revoked; 0: none."""
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
-        """Whether a certificate's key has signed what the bytes name."""
+        """Whether a certificate's key has signed these bytes."""
 
 
 class Proofs:
-    """The signatures that one peer has; by them it decides which members it believes."""
+    """The signatures that one peer has, which decide on the members that it accepts."""
 
     def __init__(self, robot: str, signer: Signs) -> None:
         self._robot = robot
@@ -75,7 +74,7 @@ class Proofs:
             signature=signature,
         )
 
-    def hear(self, signature: m.Signature, publisher: str) -> None:
+    def take_signature(self, signature: m.Signature, publisher: str) -> None:
         """Keep a signature that a robot or an operator publishes on its own key, of its own
         members only.
         """
@@ -104,7 +103,7 @@ class Proofs:
         return member.signature or found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:
-        """Why a carried member is not believed, in words; None where it is."""
+        """Why a carried member is not accepted, in words; None where it is."""
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
             found = self._signer.issued(f"robot-{robot}", message.certificate)

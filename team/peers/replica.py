@@ -62,7 +62,7 @@ class StreamShare:
     def parcel(self, sequence: int) -> list[Member]:
         """A complete submap after the inter-robot measurements from it, in canonical order.
 
-        If there are more of these than the submap says, the first ones.
+        If there are more of these than the number in the submap, the first ones.
         """
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
@@ -96,7 +96,7 @@ class StreamShare:
 
 
 class Have(NamedTuple):
-    """How much of a robot is here: number of submaps, and the end of the newest [ns of team
+    """The stored share of a robot: number of submaps, and the end of the newest [ns of team
     time].
     """
 
@@ -204,7 +204,7 @@ class Replica:
         among[name] = member
         return "new" if there is None else "replaced"
 
-    # What is here.
+    # Contents.
 
     def share_of(self, stream: Stream) -> StreamShare:
         """The members of a stream that are here; empty where there are none."""
@@ -251,7 +251,7 @@ class Replica:
         for robot in self.robots:
             yield from (self.statements[robot][name] for name in sorted(self.statements[robot]))
 
-    # What others are told.
+    # Summaries.
 
     def holding(self, stream: Stream) -> m.Holding | None:
         """What is here of a stream, for a summary; None where nothing can be requested."""

@@ -33,7 +33,7 @@ class Looking:
     """An attendance, how many submaps of each robot are here, and who was asked about."""
 
     def __init__(self, robots: list[str]) -> None:
-        self.attendance = TeamAttendance.of(robots)
+        self.attendance = TeamAttendance.of(robots, self.dealt, self.count)
         self.here = dict.fromkeys(robots, 0)
         self.asked: list[str] = []
 
@@ -47,13 +47,13 @@ class Looking:
 
     @property
     def watermark_ns(self) -> float:
-        return self.attendance.watermark_ns(self.dealt, self.count)
+        return self.attendance.watermark_ns
 
     @property
     def watermark_anew_ns(self) -> float:
         least = float("inf")
         for name, robot in self.attendance.robots.items():
-            if robot.lost or self.attendance.settled(name, self.dealt):
+            if robot.lost or self.attendance.is_settled(name):
                 continue
             said = robot.progress
             if said is None or self.here[name] < said.submaps:
@@ -88,8 +88,8 @@ def test_watermark_and_end_are_those_of_a_look_at_every_robot() -> None:
             if draw.random() < 0.02:
                 team.attendance.withdrawn = frozenset(draw.sample(ROBOTS, 2))
             assert team.watermark_ns == team.watermark_anew_ns, (seed, at)
-            concluded = team.attendance.concluded(team.dealt)
-            settled = all(team.attendance.settled(r, team.dealt) for r in ROBOTS)
+            concluded = team.attendance.is_concluded()
+            settled = all(team.attendance.is_settled(r) for r in ROBOTS)
             whole = team.attendance.end is not None and settled
             assert concluded == whole
             ended += whole
@@ -113,5 +113,5 @@ def test_what_one_robot_says_costs_no_look_at_the_others() -> None:
     team.asked.clear()
     for k, robot in enumerate(robots):
         team.attendance.take(done(robot, 0))
-        assert team.attendance.concluded(team.dealt) == (k == len(robots) - 1)
+        assert team.attendance.is_concluded() == (k == len(robots) - 1)
     assert len(team.asked) < 12 * len(robots), "each was asked about a few times, not each time"

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from central.config import CentralConfig
-from central.join_rule import JoinRule
-from central.scheduler import Scheduler
+from central.map_publisher import MapPublisher
+from central.submap_fold import SubmapFold
 from team.config import UNNAMED
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_ids, ids
-from tests.teams import Submaps, broadcasts, of, published, stream
+from tests.teams import Submaps, of, published, stream
 
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 SUBMAPS = Submaps(list(STREAMS.values()))
@@ -30,21 +30,21 @@ def last_seen(robot: str, k: int) -> int:
     return int(ids(SUBMAPS[robot][k].ids, "ids")[-1])
 
 
-def rule(spoilt: set[tuple[str, int]], **options: object) -> Scheduler:
+def rule(spoilt: set[tuple[str, int]], **options: object) -> MapPublisher:
     """The submaps of both robots, some misread, joined."""
     config = CentralConfig(tick_s=3.0, broadcast_s=3.0, **options)
-    found = Scheduler(JoinRule(config, b"settings"))
+    found = MapPublisher(SubmapFold(config, b"settings"))
     for each in STREAMS.values():
-        found.intake.take_start(published(each)[0])
+        found.store.add_start(published(each)[0])
     for k in range(5):
         for name in STREAMS:
             submap = SUBMAPS[name][k]
-            found.intake.take_submap(misread(submap) if (name, k) in spoilt else submap)
+            found.store.add_submap(misread(submap) if (name, k) in spoilt else submap)
     return found
 
 
-def final(found: Scheduler) -> m.FusedMap:
-    return of(found.conclude(END_NS), ch.FINAL_MAP)[0]
+def final(found: MapPublisher) -> m.FusedMap:
+    return of(found.publish_final(END_NS), ch.FINAL_MAP)[0]
 
 
 def left_out(fused: m.FusedMap) -> list[str]:
@@ -87,7 +87,7 @@ def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
 
 def test_running_maps_and_priors_have_the_same_landmarks() -> None:
     found = rule({("r1", 3)}, landmark_submaps=2)
-    out = broadcasts(found, END_NS, END_NS)
+    out = found.publish_due(END_NS, END_NS)
     (fused,) = of(out, ch.FUSED_MAP)
     shown = ids(fused.ids, "ids").tolist()
     assert shown
@@ -113,8 +113,8 @@ def test_a_map_in_which_nothing_is_confirmed_yet_is_empty() -> None:
 
 
 def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_final_one() -> None:
-    found = Scheduler(JoinRule(CentralConfig(tick_s=3.0, broadcast_s=3.0), b"settings"))
-    found.intake.take_start(published(STREAMS["r1"])[0])
+    found = MapPublisher(SubmapFold(CentralConfig(tick_s=3.0, broadcast_s=3.0), b"settings"))
+    found.store.add_start(published(STREAMS["r1"])[0])
     for k in range(5):
         submap = SUBMAPS["r1"][k]
         if k == 2:
@@ -122,8 +122,8 @@ def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_fi
             named = from_ids(np.array([*seen[:-1], UNNAMED], np.uint32))
             two = from_ids(np.array([2], np.uint32))
             submap = msgspec.structs.replace(submap, ids=named, counts=two, seen=b"\1", keyframes=1)
-        found.intake.take_submap(submap)
-    (running,) = of(broadcasts(found, END_NS, END_NS), ch.FUSED_MAP)
+        found.store.add_submap(submap)
+    (running,) = of(found.publish_due(END_NS, END_NS), ch.FUSED_MAP)
     last = final(found)
     tentative, kept = (int(ids(each.ids, "ids")[-1]) for each in (running, last))
     assert tentative >= UNNAMED > kept

@@ -9,9 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.intake import Instant
-from central.join_rule import JoinRule
-from central.scheduler import Scheduler
+from central.map_publisher import MapPublisher
+from central.submap_fold import SubmapFold
 from central.withdrawal import convicted, disagreement
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario
@@ -182,21 +181,21 @@ def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:
 def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map() -> None:
     """All submaps are there, of which the first tick and a half is closed."""
     samples = run_with("r1", "still")
-    rule = Scheduler(JoinRule(scenario().central, bytes(8)))
+    rule = MapPublisher(SubmapFold(scenario().central, bytes(8)))
     for start in messages(samples, m.InitialPose):
-        rule.intake.take_start(start)
+        rule.store.add_start(start)
     for sighting in messages(samples, m.SightingFactor):
-        rule.intake.take_sighting(sighting)
+        rule.store.add_sighting(sighting)
     for submap in messages(samples, m.Submap):
-        rule.intake.take_submap(submap)
-    out = rule.at(Instant(10**11, rule.intake.inputs(15e9, 10**11)))
+        rule.store.add_submap(submap)
+    out = rule.publish_due(15e9, 10**11)
     (fused,) = (each.message for each in out if isinstance(each.message, m.FusedMap))
     assert fused.provisional
     assert fused.withdrawn == ("r1",)
     assert {each.robot for each in fused.members} == {"r2", "r3"}
-    assert [w for w in rule.rule.findings if w.startswith("r1 is left out of running maps")]
+    assert [w for w in rule.fold.findings if w.startswith("r1 is left out of running maps")]
     assert not [each for each in out if isinstance(each.message, m.Withdrawal)]
-    assert not rule._is_news(math.inf), "a map that leaves it out lacks nothing"
+    assert not rule._has_news(math.inf), "a map that leaves it out lacks nothing"
 
 
 def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:

@@ -117,11 +117,10 @@ def test_the_map_of_a_live_team_is_that_of_the_same_streams_of_a_world():
 
 def test_nothing_waits_for_a_robot_whose_driver_has_not_come_or_is_away():
     team = Live("r1", "r2", "r3").robot("r1", state="open")
-    attendance = team.centre._attendance
-    dealt, count = team.centre._intake.dealt, team.centre._intake.count
-    assert attendance.watermark_ns(dealt, count) == attendance.robots["r1"].progress.stamp_ns
+    attendance = team.centre.attendance
+    assert attendance.watermark_ns == attendance.robots["r1"].progress.stamp_ns
     team.tell(m.Liveliness(stamp_ns=0, node="source/r1", alive=False))
-    assert attendance.watermark_ns(dealt, count) == float("inf")
+    assert attendance.watermark_ns == float("inf")
 
 
 def robot_with(count):

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
@@ -54,7 +54,7 @@ class Centre:
     """A centre and everything that it has said."""
 
     def __init__(self, config=CONFIG, robots=("r1", "r2")):
-        self.node = CentralNode(config, robots)
+        self.node = make_centre(config, robots)
         self.said = self.node.begin()
 
     def hears(self, *messages):

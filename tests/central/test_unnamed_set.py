@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 
 from central.config import CentralConfig
-from central.join_rule import JoinRule
-from central.scheduler import Scheduler
-from central.submap_intake import SubmapInputs
-from central.unnamed_landmarks import verdict_of
+from central.map_publisher import MapPublisher
+from central.submap_fold import RecordedFields, SubmapFold
 from team import translate
 from team.association import AssociationProfile
 from team.wire import messages as m
 from team.wire.codec import encoded
 from tests.estimation.association.unnamed_worlds import circle, drive
-from tests.teams import broadcasts
 
 CONFIG = CentralConfig(association=AssociationProfile(recent=4), withdraw_above=None)
 RING = 20.0
@@ -47,13 +44,13 @@ def two_robots() -> dict[str, list[m.Submap]]:
     return found
 
 
-def _rule() -> Scheduler:
-    rule = Scheduler(JoinRule(CONFIG, bytes(8), ("r1", "r2")))
+def _rule() -> MapPublisher:
+    rule = MapPublisher(SubmapFold(CONFIG, bytes(8)))
     for robot in two_robots():
         start = m.InitialPose(
             stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
         )
-        rule.intake.take_start(start)
+        rule.store.add_start(start)
     return rule
 
 
@@ -70,8 +67,8 @@ def _verdict(same: bool = False, withdrawn: bool = False) -> m.Verdict:
     )
 
 
-def _final(rule: Scheduler) -> m.FusedMap:
-    final = rule.conclude(10**12)[-1].message
+def _final(rule: MapPublisher) -> m.FusedMap:
+    final = rule.publish_final(10**12)[-1].message
     assert isinstance(final, m.FusedMap)
     return final
 
@@ -81,7 +78,7 @@ def final() -> m.FusedMap:
     rule = _rule()
     for robot in two_robots():
         for submap in two_robots()[robot]:
-            rule.intake.take(submap, 0)
+            rule.store.add(submap)
     return _final(rule)
 
 
@@ -90,11 +87,11 @@ def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(
 ) -> None:
     rule = _rule()
     for k in range(8):
-        rule.intake.take(two_robots()["r2"][k], 0)
+        rule.store.add(two_robots()["r2"][k])
         if k % 3 == 2:
-            broadcasts(rule, two_robots()["r2"][k].stamp_ns, two_robots()["r2"][k].stamp_ns)
+            rule.publish_due(two_robots()["r2"][k].stamp_ns, two_robots()["r2"][k].stamp_ns)
     for submap in reversed(two_robots()["r1"]):
-        rule.intake.take(submap, 0)
+        rule.store.add(submap)
     assert encoded(_final(rule)) == encoded(final)
     assert final.memberships
     assert [each.kind for each in final.decisions if each.kind == "merge"] == ["merge"]
@@ -106,7 +103,7 @@ def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() 
         rule = _rule()
         for what in order[:3]:
             for message in [_verdict()] if what == "verdict" else two_robots()[what]:
-                rule.intake.take(message, 0)
+                rule.store.add(message)
         if order[0] == "r1":
             maps.append(_final(rule))
     assert len({encoded(each) for each in maps}) == 1
@@ -119,25 +116,20 @@ def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said
     for order in ((_verdict(), _verdict(withdrawn=True)), (_verdict(withdrawn=True), _verdict())):
         rule = _rule()
         for message in (*two_robots()["r1"], order[0], *two_robots()["r2"], order[1]):
-            rule.intake.take(message, 0)
+            rule.store.add(message)
         found = _final(rule)
         assert found.verdicts == ()
         assert (found.means, found.digest) == (final.means, final.digest)
 
 
 def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedMap) -> None:
-    rule = _rule()
-    starts = {
-        (robot, 1): m.InitialPose(
-            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
-        )
-        for robot in two_robots()
-    }
-    submaps = {(robot, 1): two_robots()[robot] for robot in two_robots()}
-    told = verdict_of(_verdict().judgement)
-    inputs = SubmapInputs(starts=starts, submaps=submaps, verdicts=(told,))
-    with_verdict = rule.rule.fuse(inputs, "final")[-1].message
-    without = rule.rule.fuse(SubmapInputs(starts=starts, submaps=submaps), "final")[-1].message
+    maps = []
+    for verdicts in ([_verdict()], []):
+        fold = _rule().fold
+        for message in (*verdicts, *two_robots()["r1"], *two_robots()["r2"]):
+            fold.store.add(message)
+        maps.append(fold.make_map("final", recorded=RecordedFields((), 0, ()))[-1].message)
+    with_verdict, without = maps
     assert isinstance(with_verdict, m.FusedMap)
     assert isinstance(without, m.FusedMap)
     assert with_verdict.digest != without.digest
@@ -149,7 +141,7 @@ def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been(
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
     alone = _rule()
     for submap in two_robots()["r1"]:
-        alone.intake.take(submap, 0)
+        alone.store.add(submap)
     wanted = _final(alone)
     maps = []
     for at in (0, 5, 16):
@@ -160,9 +152,9 @@ def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been(
             for each in pair
         ]
         for k, message in enumerate([*both[:at], order, *both[at:]]):
-            rule.intake.take(message, 0)
+            rule.store.add(message)
             if k % 6 == 5:
-                broadcasts(rule, message.stamp_ns, message.stamp_ns)
+                rule.publish_due(message.stamp_ns, message.stamp_ns)
         maps.append(_final(rule))
     assert len({encoded(each) for each in maps}) == 1
     assert (maps[0].means, maps[0].memberships) == (wanted.means, wanted.memberships)

@@ -13,9 +13,9 @@ from central.config import CentralConfig
 from central.desk.ledger import ledger
 from central.desk.verification.recorded import recorded
 from central.desk.verification.verification import verify
-from central.join_rule import JoinRule
+from central.map_publisher import MapPublisher
 from central.node import CentralNode
-from central.scheduler import Scheduler
+from central.submap_fold import SubmapFold
 from central.tick_fold import TickFold
 from central.withdrawal import convicted, disagreement
 from sim.in_memory.team import final_map, run_team
@@ -31,7 +31,6 @@ from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
 from tests.sim.reruns import written
-from tests.teams import broadcasts
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02))
@@ -146,19 +145,15 @@ def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was() -> None:
     assert bits(ticks) == bits(of_set(samples))
 
 
-def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> Scheduler:
-    rule = Scheduler(JoinRule(scenario(withdraw_above=None).central, bytes(8)))
+def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> MapPublisher:
+    rule = MapPublisher(SubmapFold(scenario(withdraw_above=None).central, bytes(8)))
     for message in (*messages(samples, m.InitialPose), *withdrawals):
-        take = (
-            rule.intake.take_start
-            if isinstance(message, m.InitialPose)
-            else rule.intake.take_withdrawal
-        )
+        take = rule.store.add_start if isinstance(message, m.InitialPose) else rule.withdraw
         take(message)
     for sighting in messages(samples, m.SightingFactor):
-        rule.intake.take_sighting(sighting)
+        rule.store.add_sighting(sighting)
     for submap in messages(samples, m.Submap):
-        rule.intake.take_submap(submap)
+        rule.store.add_submap(submap)
     return rule
 
 
@@ -168,7 +163,7 @@ def test_a_map_names_who_was_withdrawn_in_its_digest_too() -> None:
         m.Withdrawal(stamp_ns=k, robot="r3", by="operator", reason=f"reason {k}") for k in range(2)
     ]
     plain, once, twice = (rule_with(samples, *orders[:k]) for k in range(3))
-    maps = [rule.conclude(0)[-1].message for rule in (plain, once, twice)]
+    maps = [rule.publish_final(0)[-1].message for rule in (plain, once, twice)]
     assert [fused.withdrawn for fused in maps] == [(), ("r3",), ("r3",)]
     assert maps[1] == maps[2]
     assert maps[0].digest != maps[1].digest
@@ -228,21 +223,21 @@ OPERATOR = CentralConfig(tick_s=10.0, broadcast_s=10.0, withdraw_above=None)
 UNTIL_S = 40
 
 
-def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Scheduler, bytes]:
+def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[MapPublisher, bytes]:
     """A rule that takes messages in an order, is told a watermark [s] after so many, and ends."""
-    rule = Scheduler(JoinRule(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8)))
+    rule = MapPublisher(SubmapFold(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8)))
     for start in one_closes_windows_often():
         if isinstance(start, m.InitialPose):
-            rule.intake.take_start(start)
+            rule.store.add_start(start)
     out = []
     for k, message in enumerate(order):
         if isinstance(message, m.Submap):
-            rule.intake.take_submap(message)
+            rule.store.add_submap(message)
         else:
-            rule.intake.take_sighting(message)
+            rule.store.add_sighting(message)
         if k in watermarks:
-            out += broadcasts(rule, 1e9 * watermarks[k], round(1e9 * watermarks[k]))
-    out += rule.conclude(10**12)
+            out += rule.publish_due(1e9 * watermarks[k], round(1e9 * watermarks[k]))
+    out += rule.publish_final(10**12)
     return rule, encoded(out[-1].message)
 
 
@@ -251,7 +246,7 @@ def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() ->
     by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.InitialPose)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
     at_once, expected = delivered(by_time, {})
-    assert at_once.intake.withdrawn == ("r3",)
+    assert at_once.withdrawn == ("r3",)
     rng = np.random.default_rng(0)
     for _ in range(2):
         few = sorted(rng.choice(len(by_time), 6, replace=False).tolist())
@@ -384,24 +379,24 @@ def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
 
 
 def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
-    rule = Scheduler(JoinRule(CentralConfig(), bytes(8)))
+    rule = MapPublisher(SubmapFold(CentralConfig(), bytes(8)))
     samples = team_run()
     for message in (*messages(samples, m.InitialPose), *messages(samples, m.Submap)):
         if message.robot == "r1":
             take = (
-                rule.intake.take_start
+                rule.store.add_start
                 if isinstance(message, m.InitialPose)
-                else rule.intake.take_submap
+                else rule.store.add_submap
             )
             take(
                 msgspec.structs.replace(message, sightings=0)
                 if isinstance(message, m.Submap)
                 else message
             )
-    rule.intake.take_withdrawal(
+    rule.withdraw(
         m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="it fell into the pool")
     )
-    fused = rule.conclude(0)[-1].message
+    fused = rule.publish_final(0)[-1].message
     assert (fused.ids, fused.members, fused.withdrawn) == (b"", (), ("r1",))
 
 

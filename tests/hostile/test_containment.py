@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from central.attendance import TeamAttendance
 from central.desk.evaluation.evaluation import evaluate
 from central.desk.verification.verification import verify
 from central.main import CentralShell
+from central.map_publisher import MapPublisher
 from central.node import CentralNode
-from central.scheduler import Scheduler
-from central.submap_intake import SubmapIntake
 from sim.in_memory.team import final_map
 from team.containment import Boundary
 from team.estimation.hybrid_slam.pipeline import HybridSlam
@@ -23,6 +21,7 @@ from team.rejection import Rejection
 from team.robot.main import RobotShell
 from team.robot.node import RobotNode
 from team.shell import FaultyRunError, Shell
+from team.store import SubmapStore
 from team.wire import channels as ch
 from team.wire import logs
 from team.wire import messages as m
@@ -113,14 +112,14 @@ def submaps(out: list[Outgoing]) -> list[m.Message]:
 def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_in_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    whole = SubmapIntake.take_submap
+    whole = SubmapStore.add_submap
 
-    def take(self: SubmapIntake, of: m.Submap) -> int:
+    def add(self: SubmapStore, of: m.Submap) -> str | None:
         if (of.robot, of.sequence) == ("r1", 1):
             raise np.linalg.LinAlgError("singular")
         return whole(self, of)
 
-    monkeypatch.setattr(SubmapIntake, "take_submap", take)
+    monkeypatch.setattr(SubmapStore, "add_submap", add)
     samples = list(team_samples(thesis(90)))
     (fault,) = faults(samples)
     assert (fault.node, fault.message, fault.error) == ("central", "submap/1", "LinAlgError")
@@ -137,10 +136,10 @@ def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_i
 def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def conclude(self: Scheduler, now_ns: int) -> list[Outgoing]:
+    def conclude(self: MapPublisher, now_ns: int) -> list[Outgoing]:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(Scheduler, "conclude", conclude)
+    monkeypatch.setattr(MapPublisher, "publish_final", conclude)
     samples = list(team_samples(thesis(45)))
     final = final_map(samples)
     assert final.provisional
@@ -151,11 +150,11 @@ def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says
 def test_running_maps_that_raise_take_nothing_from_the_final_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def advance(self: Scheduler, attendance: TeamAttendance) -> list[Outgoing]:
+    def advance(self: MapPublisher, closed_ns: float, now_ns: int) -> list[Outgoing]:
         raise np.linalg.LinAlgError("singular")
 
     whole = final_map(list(team_samples(thesis(20))))
-    monkeypatch.setattr(Scheduler, "advance", advance)
+    monkeypatch.setattr(MapPublisher, "publish_due", advance)
     final = final_map(list(team_samples(thesis(20))))
     assert not final.provisional
     assert (final.means, final.covariance) == (whole.means, whole.covariance)

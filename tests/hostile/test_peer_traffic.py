@@ -6,7 +6,6 @@ import msgspec
 import pytest
 
 from central.config import CentralConfig
-from central.node import CentralNode
 from central.peers.centre import PeerCentre
 from central.peers.fold import PeerFold
 from team.door import MOST_LIVES
@@ -16,7 +15,7 @@ from team.peers.members import LARGEST_SIGNATURE
 from team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
 from team.peers.proofs import LARGEST_OF_ROBOT, Proofs
 from team.peers.replica import MOST_INTERVALS, MOST_STREAMS
-from team.peers.store import Store
+from team.peers.set_file import SetFile
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
@@ -65,18 +64,18 @@ def test_a_node_that_gives_nothing_is_not_asked_for_more_and_more() -> None:
     node = node_of()
     asked = 0
     for serial in range(100):
-        asked += asked_in(node.hear(summary_of(claim(), claim("r3"), serial=serial)))
-        asked += asked_in(node.more_of(LIAR))
+        asked += asked_in(node.take_summary(summary_of(claim(), claim("r3"), serial=serial)))
+        asked += asked_in(node.request_rest(LIAR))
     assert MOST_OPEN <= asked <= MOST_OPEN + MOST_ASKED
     node.tick(PATIENCE_S + 1.0)
-    assert asked_in(node.hear(summary_of(claim(), claim("r3")))) > 0
+    assert asked_in(node.take_summary(summary_of(claim(), claim("r3")))) > 0
 
 
 def test_what_has_arrived_is_not_counted_as_owed() -> None:
     node, honest = node_of(), PeerNode("robot/r2", ROBOTS)
     for each in (start("r2"), *(one for k in range(40) for one in parcel("r2", k, ["r3"]))):
         honest.take(each, "robot/r2")
-    (out,) = node.hear(honest.replica.summary("robot/r2", 0, 0))
+    (out,) = node.take_summary(honest.replica.summary("robot/r2", 0, 0))
     assert asked_in([out]) == 40
     for reply in honest.answer(encoded(out.message)):
         node.take_carried(decoded(reply, m.Members))
@@ -98,10 +97,10 @@ def test_a_summary_names_each_stream_once_and_no_more_than_a_team_can_have() -> 
     )
     node = node_of()
     for each in large:
-        assert node.hear(decoded(encoded(each), m.SetSummary)) == []
+        assert node.take_summary(decoded(encoded(each), m.SetSummary)) == []
         assert "more than a team can have" in node.last_refused
     assert node.tick(2.0)[0].channel is ch.SET_SUMMARY
-    assert asked_in(node.hear(summary_of(claim(incarnation=MOST_LIVES + 1)))) == 0
+    assert asked_in(node.take_summary(summary_of(claim(incarnation=MOST_LIVES + 1)))) == 0
 
 
 def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted() -> None:
@@ -131,10 +130,10 @@ def test_a_large_signature_is_refused_and_does_not_cut_the_file(tmp_path: Path) 
     for pose, signature in zip(poses, (b"", huge, b""), strict=True):
         node.take_carried(members_of(pose.key, payload=pose.payload, signature=signature))
     assert f"{len(huge)} bytes, {LARGEST_SIGNATURE} at most" in node.last_refused
-    store = Store(tmp_path / "r1.set")
+    store = SetFile(tmp_path / "r1.set")
     store.append(node.unsaved)
     store.close()
-    again = Store(tmp_path / "r1.set")
+    again = SetFile(tmp_path / "r1.set")
     again.close()
     assert [each.key for each in again.members] == [poses[0].key, poses[2].key]
 
@@ -160,7 +159,7 @@ def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one() -> None:
     pose = start("r3")
     for size, kept in ((LARGEST_OF_ROBOT + 1, b""), (72, bytes(72))):
         signature = m.Signature(stamp_ns=0, robot="r3", member=pose.hash, signature=bytes(size))
-        proofs.hear(signature, "r3")
+        proofs.take_signature(signature, "r3")
         assert proofs.of(member(ch.START, pose.message)) == kept
 
 
@@ -176,13 +175,7 @@ def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> Non
 def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold_as_often() -> None:
     team = ("r2",)
     node = PeerNode("robot/r1", team)
-    begun: list[CentralNode] = []
-
-    def make(config: CentralConfig, robots: tuple[str, ...]) -> CentralNode:
-        begun.append(CentralNode(config, robots))
-        return begun[-1]
-
-    fold = PeerFold(CentralConfig(), team, node, make=make)
+    fold = PeerFold(CentralConfig(), team, node)
     for each in (start("r2"), *parcel("r2", 0)):
         node.take(each, "robot/r2")
         fold.grow()
@@ -191,11 +184,11 @@ def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold
         node.take(member(ch.SUBMAP, msgspec.structs.replace(own, gated=gated)), "robot/r2")
         fold.grow()
     assert node.replica.replacements >= 3
-    assert len(begun) == 1
+    assert fold.restarts == 0
     fold.refresh()
-    assert len(begun) == 2
+    assert fold.restarts == 1
     fold.refresh()
-    assert len(begun) == 2, "it is begun anew for a change only"
+    assert fold.restarts == 1, "it is begun anew for a change only"
     last = build.done(stamp_ns=10**6, robot="r2", measurements=10, submaps=1)
     node.take(member(ch.ROBOT_DONE, last), "robot/r2")
     smallest = min(
@@ -205,7 +198,7 @@ def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold
     assert node.take(smallest, "robot/r2")
     end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r2", incarnation=1, measurements=10),))
     fold.note(end)
-    assert len(begun) == 3
+    assert fold.restarts == 2
     final = fold.final
     assert final is not None
     fresh = PeerFold(CentralConfig(), team, clean := PeerNode("robot/r1", team))

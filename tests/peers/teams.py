@@ -177,13 +177,13 @@ class Storm:
             case Member():
                 self.keep(to, what, ch.robot_node(sender))
             case m.SetSummary():
-                self.spread(to, node.hear(what))
+                self.spread(to, node.take_summary(what))
             case m.MembersRequest():
                 for reply in node.answer(encoded(what)):
                     self.send(to, sender, decoded(reply, m.Members))
             case m.Members():
                 self.disk[to] += node.take_carried(what)
-                self.spread(to, node.more_of(what.node))
+                self.spread(to, node.request_rest(what.node))
 
     def spread(self, name: str, out: Sequence[Outgoing]) -> None:
         for each in out:
@@ -194,5 +194,5 @@ class Storm:
 
     def fed(self, name: str) -> Iterator[m.Message]:
         """What a fold that begins now is handed."""
-        self.nodes[name].again()
+        self.nodes[name].restart_fold()
         return self.nodes[name].new_messages()

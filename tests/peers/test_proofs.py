@@ -47,7 +47,7 @@ def proofs_of(node: PeerNode) -> Proofs:
 
 
 def carried_to(node: PeerNode, carrier: PeerNode) -> list[Member]:
-    (out,) = node.hear(carrier.replica.summary(carrier.node, 0, 0)) or [None]
+    (out,) = node.take_summary(carrier.replica.summary(carrier.node, 0, 0)) or [None]
     if out is None:
         return []
     return [
@@ -68,9 +68,9 @@ def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(
         nodes["r1"].take(each, "robot/r1")
         nodes["r2"].take(each, "robot/r1")
         own = proofs_of(nodes["r1"]).signed(each)
-        proofs_of(nodes["r2"]).hear(own, "r1")
+        proofs_of(nodes["r2"]).take_signature(own, "r1")
         wrong = msgspec.structs.replace(own, robot="r3", signature=b"of somebody else")
-        proofs_of(nodes["r2"]).hear(wrong, "r3")
+        proofs_of(nodes["r2"]).take_signature(wrong, "r3")
     invented = parcel("r1", 2)[0]
     nodes["r2"].take(invented, "robot/r1")
     assert set(carried_to(nodes["r3"], nodes["r2"])) >= {certificate}
@@ -112,7 +112,7 @@ def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(
     assert nodes["r3"].take_carried(msgspec.structs.replace(batch, signatures=(b"",))) == []
     operator = Signer(credentials_of(folder, "operator", "t"))
     nodes["r2"].take(said, "operator")
-    proofs_of(nodes["r2"]).hear(signed_order(operator, said), OPERATOR)
+    proofs_of(nodes["r2"]).take_signature(signed_order(operator, said), OPERATOR)
     nodes["r3"].tick(20.0)
     news = carried_to(nodes["r3"], nodes["r2"])
     assert said.payload in [each.payload for each in news]
@@ -149,7 +149,7 @@ class Renewed:
         self.r2.take(member(ch.CERTIFICATE, proofs.certificate()), "robot/r1")
         for each in members:
             self.r2.take(each, "robot/r1")
-            proofs_of(self.r2).hear(proofs.signed(each), "r1")
+            proofs_of(self.r2).take_signature(proofs.signed(each), "r1")
 
     def submaps_of_r3(self) -> int:
         """The submaps of r1 at r3 after some exchanges with r2 alone."""
@@ -157,7 +157,7 @@ class Renewed:
             self.now_s += 10.0
             self.r2.tick(self.now_s)
             summary = self.r2.replica.summary(self.r2.node, 0, 0)
-            for out in (*self.r3.tick(self.now_s), *self.r3.hear(summary)):
+            for out in (*self.r3.tick(self.now_s), *self.r3.take_summary(summary)):
                 if out.channel is ch.MEMBERS:
                     for reply in self.r2.answer(encoded(out.message)):
                         self.r3.take_carried(decoded(reply, m.Members))
@@ -301,9 +301,9 @@ def test_a_robot_that_signs_anothers_member_does_not_take_the_others_signature(
 ) -> None:
     (of_r1,) = parcel("r1", 7)
     hearing = proofs_of(nodes["r2"])
-    hearing.hear(proofs_of(nodes["r1"]).signed(of_r1), "r1")
+    hearing.take_signature(proofs_of(nodes["r1"]).signed(of_r1), "r1")
     good = hearing.of(of_r1)
     junk = m.Signature(stamp_ns=0, robot="r3", member=of_r1.hash, signature=bytes(len(good)))
-    hearing.hear(junk, "r3")
+    hearing.take_signature(junk, "r3")
     assert good
     assert hearing.of(of_r1) == good

@@ -8,7 +8,7 @@ import pytest
 from central.config import CentralConfig
 from central.peers.fold import PeerFold
 from team.door import MOST_COUNT
-from team.peers.exchange import MOST_ASKED, answered, request_for
+from team.peers.exchange import MOST_ASKED, make_answer, make_request
 from team.peers.given import GIVEN_BYTES
 from team.peers.members import LARGEST_MEMBER, Member, member_of
 from team.peers.node import PeerNode
@@ -59,8 +59,8 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> Non
     )
     asked: list[str] = []
     for second in range(12):
-        out = [*node.hear(lie), *node.tick(float(second))]
-        out += node.hear(honest.replica.summary("robot/r2", second, 0))
+        out = [*node.take_summary(lie), *node.tick(float(second))]
+        out += node.take_summary(honest.replica.summary("robot/r2", second, 0))
         for each in out:
             if each.channel is ch.MEMBERS:
                 asked.append(each.name)
@@ -71,7 +71,7 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> Non
     assert asked[0] == "robot/r3"
     assert node.replica.submaps == 4
     stranger = msgspec.structs.replace(lie, node="robot/x9")
-    assert node.hear(stranger) == []
+    assert node.take_summary(stranger) == []
     assert "not in this team" in node.last_refused
 
 
@@ -154,10 +154,10 @@ def test_a_summary_names_gaps_and_what_is_asked_for_is_what_lacks() -> None:
     (holding,) = here.summary("", 0, 0).holdings
     assert holding.sequences == (0, 1, 4, 5, 8, 8)
     there = replica_of(*parcels[:7])
-    asked = request_for(here, there.summary("robot/r2", 0, 0))
+    asked = make_request(here, there.summary("robot/r2", 0, 0))
     assert asked is not None
     assert [(w.start, w.first, w.last) for w in asked.requested] == [(False, 2, 3), (False, 6, 6)]
-    back = request_for(there, here.summary("robot/r1", 0, 0))
+    back = make_request(there, here.summary("robot/r1", 0, 0))
     assert back is not None
     assert [(w.start, w.first, w.last) for w in back.requested] == [(True, 8, 8)]
 
@@ -169,8 +169,8 @@ def test_two_peers_that_ask_each_other_end_with_one_set() -> None:
     )
     for _ in range(3):
         for asker, answerer in ((one, other), (other, one)):
-            request = request_for(asker, answerer.summary("robot/r2", 0, 0))
-            for batch in [] if request is None else answered(answerer, request, "robot/r2"):
+            request = make_request(asker, answerer.summary("robot/r2", 0, 0))
+            for batch in [] if request is None else make_answer(answerer, request, "robot/r2"):
                 for key, payload in zip(batch.keys, batch.payloads, strict=True):
                     asker.add(member_of(key, payload))
     assert digest_of(one) == digest_of(other)
@@ -203,11 +203,11 @@ def test_what_is_asked_for_is_bounded_whatever_a_summary_claims() -> None:
     summary = m.SetSummary(
         stamp_ns=0, node="robot/r2", serial=0, digest=bytes(8), holdings=(claim,), statements=()
     )
-    asked = request_for(replica_of(), summary)
+    asked = make_request(replica_of(), summary)
     assert asked is not None
     assert sum(w.last - w.first + 1 for w in asked.requested) == MOST_ASKED
     strange = msgspec.structs.replace(claim, robot="r9")
-    assert request_for(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
+    assert make_request(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
 
 
 def test_what_is_no_member_is_refused_at_the_door() -> None:
@@ -249,4 +249,4 @@ def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() 
     one, other = replica_of(*told), replica_of(*reversed(told), told[0])
     assert digest_of(one) == digest_of(other)
     assert {each.payload for each in one.members()} == {each.payload for each in told}
-    assert request_for(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None
+    assert make_request(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None

@@ -1,10 +1,13 @@
-"""A fusion rule as docs/architecture.md says how to add one: one class with `fuse` in one file."""
+"""A fusion rule as docs/architecture.md says how to add one: one node in one file."""
+
+import math
 
 import numpy as np
 
 from central.fused import fused_message, version_entry
-from central.rule import FusionRule, Tail
-from central.submap_intake import SubmapInputs, SubmapIntake
+from central.join_messages import Tail
+from central.node import CentralNode
+from central.submap_fold import RecordedFields, SubmapFold
 from team import translate
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.geometry import transformed
@@ -14,17 +17,25 @@ from team.wire.codec import encoded
 from team.wire.digest import digest_of
 
 
-class FirstSubmaps(FusionRule[SubmapInputs]):
+class FirstSubmaps(SubmapFold):
     """The landmarks of each robot's first submap at its initial pose; of two, the first robot's."""
 
-    intake = SubmapIntake
+    def fold_until(self, closed_ns: float) -> None:
+        """Nothing is folded before a map is made."""
 
-    def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
+    def make_map(
+        self,
+        tail: Tail,
+        closed_ns: float = math.inf,
+        *,
+        ahead: bool = True,
+        recorded: RecordedFields | None = None,
+    ) -> list[Outgoing]:
         """A function of the set alone."""
         landmarks: dict[int, np.ndarray] = {}
-        heard = {stream: chain for stream, chain in sorted(inputs.submaps.items()) if chain}
+        heard = dict(sorted(self.store.chains.items()))
         for stream, chain in heard.items():
-            start = translate.start_of(inputs.starts[stream])
+            start = translate.start_of(self.store.start(stream))
             local = translate.local_map_of(chain[0])
             if start is not None:
                 for id_, mean in zip(local.ids.tolist(), local.landmarks, strict=True):
@@ -43,3 +54,9 @@ class FirstSubmaps(FusionRule[SubmapInputs]):
         )
         self.landmarks = len(ids)
         return [Outgoing(ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP, "", fused)]
+
+
+class FirstSubmapsCentre(CentralNode):
+    """The centre that makes its maps so."""
+
+    fold_class = FirstSubmaps

@@ -14,7 +14,7 @@ ROWS = {
         '"standing": EstimatorRow("tests.recipes.standing:Standing", ("alone",)),\n'
     ),
     "RULES: Mapping[str, RuleRow] = MappingProxyType(\n    {\n": (
-        '"first-submaps": RuleRow("tests.recipes.first_submaps:FirstSubmaps", "submap"),\n'
+        '"first-submaps": RuleRow("tests.recipes.first_submaps:FirstSubmapsCentre", "submap"),\n'
     ),
 }
 """What a user writes into team/pairs.py, by what it is written behind."""

@@ -1,25 +1,21 @@
 """Recomputes the centre's messages: each recorded map from the inputs that it names.
 
-The rule is the centre's own (`central.rule`); rules whose maps depend on earlier maps use the
-centre's scheduler, too. Fields that depend on more than the named inputs (`unnamed`) are taken from
-the recorded map.
+Maps of submaps are made by the centre's own fold (`central.submap_fold`), from a store with the
+submaps that a recorded map names. The centres of comparison methods recompute their maps themselves
+(`sim.studies.rules`). Fields that no named input gives are taken from the recorded map.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
-from central.attendance import TeamAttendance
 from central.desk.verification.recorded import Identity, Recorded, identity
-from central.intake import Inputs, MapInputs
-from central.rule import FusionRule, Tail, rule_of
-from central.scheduler import Scheduler
-from central.submap_intake import SubmapInputs
-from central.submap_set import SubmapSet
-from central.unnamed_landmarks import verdict_of
-from team.estimation.contribution import Stream
-from team.pairs import RULES, Channel
+from central.join_messages import Tail
+from central.node import node_class
+from central.submap_fold import RecordedFields, SubmapFold
+from team.pairs import RULES
+from team.store import Stream, SubmapStore
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -68,113 +64,103 @@ def _recomputed(
     if not maps and not finals:
         return
     config, digest = log.central_config()
-    announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
-    rule = rule_of(config, digest, sorted(announced.union(log.robots)))
-    if RULES[config.fusion].consumes == "measurements":
-        yield from _from_measurements(log, Scheduler(rule))
-        return
-    inputs = _LogInputs(log, RULES[config.fusion].consumes)
+    kind = node_class(config)
+    if RULES[config.fusion].consumes == "submap":
+        out = _from_submaps(log, kind.fold_class, (*maps, *finals))
+    else:
+        announced = {n.removeprefix("robot/") for n in log.configured if n.startswith("robot/")}
+        centre: Any = kind(config, sorted(announced.union(log.robots)))
+        centre.config_digest = digest
+        out = centre.recomputed(log, maps, finals)
     lost = finals[-1].lost if finals else ()
-    for fused in (*sorted(maps, key=lambda f: f.exchange), *finals):
-        named = inputs.of(fused)
-        for out in [] if named is None else rule.fuse(named, _tail(fused)):
-            message = _as_known(out.message, fused, rule)
-            if lost and isinstance(message, m.FusedMap) and message.final:  # no input says it
-                message = msgspec.structs.replace(message, provisional=True, lost=lost)
-            yield Outgoing(out.channel, out.name, message)
+    for each in out:
+        message = each.message
+        if lost and isinstance(message, m.FusedMap) and message.final:  # no input gives it
+            message = msgspec.structs.replace(message, provisional=True, lost=lost)
+        yield Outgoing(each.channel, each.name, message)
 
 
-def _tail(fused: m.FusedMap) -> Tail:
-    return "final" if fused.final else "provisional" if fused.provisional else "closed"
+def _from_submaps(
+    log: Recorded, kind: type[SubmapFold], maps: Sequence[m.FusedMap]
+) -> Iterator[Outgoing]:
+    """The messages of maps whose inputs are submaps."""
+    recorded = _RecordedSet(log)
+    config, digest = log.central_config()
+    fold: SubmapFold | None = None
+    for fused in maps:
+        chains = recorded.chains(fused)
+        if chains is None:
+            continue
+        if fold is None or not _extends(fold.store, chains, fused):
+            fold = kind(config, digest, convicts=False)
+        recorded.copy(fold.store, chains, fused)
+        tail: Tail = "final" if fused.final else "provisional" if fused.provisional else "closed"
+        yield from fold.make_map(tail, recorded=recorded.fields(fused))
 
 
-def _as_known(message: m.Message, fused: m.FusedMap, rule: FusionRule[Any]) -> m.Message:
-    """The message with the fields of `fused` that depend on more than the named inputs."""
-    if isinstance(message, m.FusedMap | m.Prior):
-        fields = set(rule.unnamed) & set(message.__struct_fields__)
-        return msgspec.structs.replace(message, **{name: getattr(fused, name) for name in fields})
-    return message
-
-
-def _from_measurements(log: Recorded, scheduler: Scheduler) -> Iterator[Outgoing]:
-    """The messages of a rule on raw measurements, from the whole stream, since each map changes the
-    next.
-    """
-    for message in _inputs_in_order(log):
-        scheduler.intake.take(message, 0)
-    yield from scheduler.advance(TeamAttendance.of(scheduler.rule.team))
-    if log.published:
-        yield from scheduler.conclude(0)
-
-
-def _inputs_in_order(log: Recorded) -> Iterator[m.Message]:
-    """The robots' models, every measurement by stream and counter, the end of the streams."""
-    for node in sorted(log.configured):
-        if node.startswith("robot/"):
-            yield log.configured[node]
-    for stream in sorted(log.measurements):
-        measurements = log.measurements[stream]
-        yield from (measurements[counter] for counter in sorted(measurements))
-    ends = tuple(
-        m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
-        for (robot, incarnation), count in log.published.items()
+def _extends(
+    store: SubmapStore, chains: Mapping[Stream, Sequence[m.Submap]], fused: m.FusedMap
+) -> bool:
+    """Whether the set of a map contains the stored one."""
+    return (
+        store.withdrawals.keys() <= {*fused.withdrawn}
+        and store.verdicts <= {*fused.verdicts}
+        and all(len(chains.get(s, ())) >= len(chain) for s, chain in store.chains.items())
     )
-    if ends:
-        yield m.End(stamp_ns=0, streams=ends)
 
 
-class _LogInputs:
-    """Collects from a log the inputs that a map names."""
+class _RecordedSet:
+    """The set of a log, and the parts of it that its maps name."""
 
-    def __init__(self, log: Recorded, consumed: Channel) -> None:
-        self._consumed = consumed
-        self._set = SubmapSet()
+    def __init__(self, log: Recorded) -> None:
+        self._store = SubmapStore()
         sightings = log.sightings()
         for stream, submaps in log.submaps().items():
             for sequence in sorted(submaps):
-                self._set.admit(submaps[sequence])
+                self._store.add_submap(submaps[sequence])
                 for each in sightings.get((*stream, sequence), ()):
-                    self._set.admit_sighting(each)
-        starts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
-        self._starts = {s: start for s, start in starts.items() if isinstance(start, m.InitialPose)}
+                    self._store.add_sighting(each)
+        for measurements in log.measurements.values():
+            start = measurements.get(0)
+            if isinstance(start, m.InitialPose):
+                self._store.add_start(start)
         self._priors_of: dict[bytes, set[Stream]] = {}
         for prior in (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR)):
             if isinstance(prior, m.Prior):
                 stream = (prior.robot, prior.incarnation)
                 self._priors_of.setdefault(prior.digest, set()).add(stream)
-        own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
-        self._maps = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
 
-    def of(self, fused: m.FusedMap) -> Inputs | None:
-        """The inputs of a map; None where the log lacks a submap of its version vector, or its
-        initial pose or factors.
+    def chains(self, fused: m.FusedMap) -> Mapping[Stream, Sequence[m.Submap]] | None:
+        """The submaps that a map names; None where the log lacks one, or its initial pose or
+        inter-robot measurements.
         """
+        stored = self._store.chains
         vector = {(x.robot, x.incarnation): x.sequence for x in fused.members}
-        if self._consumed == "own/map":
-            named = ((*stream, k, fused.exchange) for stream, k in vector.items())
-            maps = [self._maps[name] for name in named if name in self._maps]
-            return MapInputs(
-                recorded=True,
-                maps=maps,
-                starts=self._starts,
-                exchange=fused.exchange,
-                now_ns=fused.stamp_ns,
-            )
-        chains = {stream: self._set.chain(stream)[: last + 1] for stream, last in vector.items()}
-        if any(
-            len(chains[stream]) <= last or stream not in self._starts
-            for stream, last in vector.items()
-        ):
+        if any(len(stored.get(stream, ())) <= last for stream, last in vector.items()):
             return None
-        return SubmapInputs(
-            recorded=True,
-            starts=self._starts,
-            submaps=chains,
-            sightings=self._set.sightings,
-            withdrawn=fused.withdrawn,
-            verdicts={verdict_of(each) for each in fused.verdicts},
-            missing=fused.missing,
-            arrived=fused.heard,
-            priors_of=self._priors_of.get(fused.digest, set()),
-            now_ns=fused.stamp_ns,
-        )
+        return {stream: stored[stream][: last + 1] for stream, last in vector.items()}
+
+    def copy(
+        self, store: SubmapStore, chains: Mapping[Stream, Sequence[m.Submap]], fused: m.FusedMap
+    ) -> None:
+        """Copy the members of a map's set that a store lacks."""
+        for stream, chain in chains.items():
+            store.add_start(self._store.start(stream))
+            for submap in chain[len(store.chain(stream)) :]:
+                for member in (*self._store.sightings(submap), submap):
+                    store.add(member)
+        for robot in fused.withdrawn:
+            order = m.Withdrawal(stamp_ns=fused.stamp_ns, robot=robot, by="log", reason="")
+            store.add(order)
+        for each in fused.verdicts:
+            store.add(_verdict_on(each, fused.stamp_ns))
+
+    def fields(self, fused: m.FusedMap) -> RecordedFields:
+        """The fields of a map that do not follow from its set."""
+        priors_of = self._priors_of.get(fused.digest, set())
+        return RecordedFields(fused.missing, fused.heard, priors_of)
+
+
+def _verdict_on(judgement: m.Judgement, stamp_ns: int) -> m.Verdict:
+    robot = judgement.first.robot
+    return m.Verdict(stamp_ns=stamp_ns, robot=robot, judgement=judgement, by="log", reason="")

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from central.config import CentralConfig
 from central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
-from central.node import CentralNode
+from central.node import CentralNode, node_class
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import Scenario, loads, with_options
 from sim.scenarios.source import streams_of
@@ -131,7 +132,7 @@ class TimedRun:
         """
         measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
-        for sample in run_team(scenario, measurements, *self._nodes()):
+        for sample in run_team(scenario, measurements, *self._nodes(scenario.central)):
             self._steps += sample.key in odometry
             self._fusions += sample.key == ch.FUSED_MAP.key()
             yield sample
@@ -146,7 +147,7 @@ class TimedRun:
         }
 
     def _nodes(
-        self,
+        self, config: CentralConfig
     ) -> tuple[Callable[[RobotConfig, Exchange], RobotNode], type[CentralNode]]:
         """The makers of nodes that measure the time of handling a message."""
         robots, centre = self._robots, self._centre
@@ -162,10 +163,11 @@ class TimedRun:
             node.handle = timed  # type: ignore[method-assign]
             return node
 
-        class TimedCentre(CentralNode):
+        class TimedCentre(node_class(config)):  # type: ignore[misc]
             def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
                 with centre:
-                    return super().handle(message, now_ns)
+                    out: list[Outgoing] = super().handle(message, now_ns)
+                    return out
 
         return timed_robot, TimedCentre
 

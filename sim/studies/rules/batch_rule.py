@@ -13,7 +13,7 @@ from sim.studies.batch_reference import growing as batch
 from sim.studies.batch_reference.graph import load_gtsam
 from sim.studies.batch_reference.growing import GrowingBatch, UnsolvableError
 from sim.studies.estimators.robot_step import RobotStep
-from sim.studies.rules.measurement_rules import MapContent, MeasurementRule
+from sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from sim.studies.rules.team_keyframes import RobotKeyframe
 from team import translate
 from team.config import RobotConfig
@@ -31,7 +31,7 @@ FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 """The same for the final map, which has a warning if the iterations do not suffice."""
 
 
-class BatchRule(MeasurementRule):
+class BatchCentre(MeasurementCentre):
     """Every pose of every robot at its keyframes and all landmarks, solved anew at each broadcast.
 
     Each robot's newest pose is published with the map, and the whole paths with the final map.
@@ -40,8 +40,10 @@ class BatchRule(MeasurementRule):
 
     _batch: GrowingBatch
 
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
-        super().__init__(config, digest, robots)
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
+        super().__init__(config, robots, admit=admit)
         load_gtsam()
         self._waiting: list[RobotStep] = []
         self._newest: dict[str, RobotKeyframe] = {}
@@ -145,7 +147,7 @@ class BatchRule(MeasurementRule):
                 poses = np.array([each.mean for each in moved])
                 covariances = np.array([each.covariance for each in moved])
             message = translate.trajectory_message(
-                stamps[-1], robot, incarnation, self.digest, stamps, poses[1:], covariances[1:]
+                stamps[-1], robot, incarnation, self.set_digest, stamps, poses[1:], covariances[1:]
             )
             outgoing.append(Outgoing(ch.TRAJECTORY, robot, message))
         return outgoing

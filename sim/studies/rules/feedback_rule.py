@@ -6,15 +6,13 @@ same measurements are counted again and again, and the covariance has no meaning
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.intake import Instant, Intake, MapInputs
-from central.rule import FusionRule, Tail
-from central.submap_set import SubmapSet
+from sim.studies.rules.centre import ComparisonCentre, recorded_maps
 from sim.studies.rules.map_fusion import (
     covariance_intersection,
     fused_totally,
@@ -22,12 +20,14 @@ from sim.studies.rules.map_fusion import (
     kalman_per_axis,
 )
 from team import translate
-from team.estimation.contribution import Stream
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.digest import digest_of
+
+if TYPE_CHECKING:
+    from central.desk.verification.recorded import Recorded
 
 RULES: Mapping[str, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian]] = {
     "kalman": kalman,
@@ -37,82 +37,64 @@ RULES: Mapping[str, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian]] = 
 _NOT_VALID = "this rule counts measurements more than once: its covariance is not valid"
 
 
-class Rounds(Intake[MapInputs]):
-    """Every robot's map of a round, and its submaps, for the robots' next processes."""
+class RoundsCentre(ComparisonCentre):
+    """Fuses the maps of each round in the order of the robots' names; a round names those before.
 
-    listens = (ch.START, ch.SUBMAP, ch.OWN_MAP)
-    due = "now"
+    It stores the robots' submaps for their next processes.
+    """
 
-    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
-        super().__init__(config, robots)
+    inputs = (ch.START, ch.SUBMAP, ch.OWN_MAP)
+
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
+        super().__init__(config, robots, admit=admit)
         self._rounds: dict[int, dict[str, m.MapEstimate]] = {}
         self._next = 1
-        self._set = SubmapSet()
-        self._starts: dict[Stream, m.InitialPose] = {}
+        self._fused: m.FusedMap | None = None
 
-    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def file(self, message: m.Message) -> list[Outgoing]:
         """File a map under the round that it names."""
-        match message:
-            case m.InitialPose():
-                self._starts.setdefault((message.robot, message.incarnation), message)
-            case m.Submap():
-                self._set.admit(message)
-            case m.MapEstimate() if message.exchange >= self._next:
+        if isinstance(message, m.MapEstimate):
+            if message.exchange >= self._next:
                 self._rounds.setdefault(message.exchange, {})[message.robot] = message
-            case _:
-                pass
+        elif isinstance(message, m.InitialPose | m.Submap):
+            self.store.add(message)
         return []
 
-    def inputs(self, closed_ns: float, now_ns: int) -> MapInputs:
-        """No maps: those of a round are in its own instant."""
-        return MapInputs(now_ns=now_ns)
-
-    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MapInputs]]:
-        """Every round that has the maps of all robots that may still send one.
+    def publish_due(self) -> list[Outgoing]:
+        """The map of every round that has the maps of all robots that may still send one.
 
         A centre that was started again continues with the present round.
         """
-
-        def complete(number: int) -> bool:
-            maps = self._rounds.get(number, {})
-            return bool(maps) and all(
-                r in maps or not attendance.takes_part(r) for r in attendance.robots
-            )
-
         later = min(self._rounds, default=self._next)
-        if complete(later):
+        if self._is_complete(later):
             self._next = later
-        while complete(self._next):
+        out = []
+        while self._is_complete(self._next):
             maps = self._rounds.pop(self._next)
-            inputs = MapInputs(
-                now_ns=attendance.now_ns, maps=[maps[r] for r in sorted(maps)], exchange=self._next
-            )
+            out.append(self._fuse(self._next, [maps[robot] for robot in sorted(maps)]))
             self._next += 1
-            yield Instant(attendance.now_ns, inputs)
+        return out
 
-    def stored_messages(self, robot: str) -> Sequence[m.Message]:
-        """The initial pose of the robot's latest incarnation and its submaps without a gap."""
-        incarnations = [incarnation for name, incarnation in self._set.streams if name == robot]
-        submaps = self._set.chain((robot, max(incarnations))) if incarnations else []
-        start = self._starts.get((robot, submaps[0].incarnation)) if submaps else None
-        return () if start is None else (start, *submaps)
+    def publish_final(self) -> list[Outgoing]:
+        """The last round's map as the final one."""
+        return [Outgoing(ch.FINAL_MAP, "", self._final(self.attendance.now_ns))]
 
+    def recomputed(
+        self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
+    ) -> Iterator[Outgoing]:
+        """Recompute the rounds in their order, each from the recorded maps that it names."""
+        for fused in sorted(maps, key=lambda each: each.exchange):
+            yield self._fuse(fused.exchange, recorded_maps(log, fused))
+        for fused in finals:
+            yield Outgoing(ch.FINAL_MAP, "", self._final(fused.stamp_ns))
 
-class ExchangeRule(FusionRule[MapInputs]):
-    """Fuses the maps of a round in the order of the robots' names; a round names those before."""
-
-    intake = Rounds
-
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
-        super().__init__(config, digest, robots)
-        self._fused: m.FusedMap | None = None
-
-    def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
-        """A round's map from the maps that it names; the last round's is the final one."""
-        if tail == "final":
-            return [Outgoing(ch.FINAL_MAP, "", self._final(inputs.now_ns))]
-        self._fused = self._fuse(inputs.exchange, inputs.maps)
-        return [Outgoing(ch.FUSED_MAP, "", self._fused)]
+    def _is_complete(self, number: int) -> bool:
+        maps = self._rounds.get(number, {})
+        return bool(maps) and all(
+            r in maps or not self.attendance.takes_part(r) for r in self.robots
+        )
 
     def _final(self, now_ns: int) -> m.FusedMap:
         last = self._fused
@@ -122,7 +104,8 @@ class ExchangeRule(FusionRule[MapInputs]):
         reasons = (*last.reasons, *([_NOT_VALID] if counted_often else []))
         return msgspec.structs.replace(last, final=True, reasons=reasons)
 
-    def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> m.FusedMap:
+    def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> Outgoing:
+        """The fused map of a round."""
         values = {
             x.robot: LandmarkGaussian(
                 *translate.landmarks_of(x), translate.landmark_covariance_of(x)
@@ -139,7 +122,8 @@ class ExchangeRule(FusionRule[MapInputs]):
         payload = b"".join(x.ids + x.means + x.covariance for x in maps)
         previous = b"" if self._fused is None else self._fused.digest
         stamp_ns = max(x.stamp_ns for x in maps)
-        return self._message(number, stamp_ns, members, value, payload + previous, refused)
+        self._fused = self._message(number, stamp_ns, members, value, payload + previous, refused)
+        return Outgoing(ch.FUSED_MAP, "", self._fused)
 
     def _message(
         self,

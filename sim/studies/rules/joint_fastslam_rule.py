@@ -9,7 +9,7 @@ from central.config import CentralConfig
 from sim.studies.estimators import joint_fastslam
 from sim.studies.estimators.joint_fastslam import JointFastSlam
 from sim.studies.estimators.robot_step import RobotStep
-from sim.studies.rules.measurement_rules import MapContent, MeasurementRule
+from sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from sim.studies.rules.team_keyframes import RobotKeyframe
 from team.config import RobotConfig
 from team.estimation import dense
@@ -27,7 +27,7 @@ differ.
 """
 
 
-class JointFastSlamRule(MeasurementRule):
+class JointFastSlamCentre(MeasurementCentre):
     """One particle filter over all robots' paths and one map.
 
     The particles are those of FastSLAM 1.0, `particles` of them.
@@ -35,8 +35,10 @@ class JointFastSlamRule(MeasurementRule):
 
     _state: JointFastSlam
 
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
-        super().__init__(config, digest, robots)
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
+        super().__init__(config, robots, admit=admit)
         self._generator = generator(0, "team", 0, 0)
 
     @property

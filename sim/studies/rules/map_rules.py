@@ -1,33 +1,43 @@
 """The rules on robots' whole maps that no robot absorbs: fused once, or not at all."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from central.attendance import TeamAttendance
+import msgspec
+
 from central.config import CentralConfig
 from central.fused import fused_message
-from central.intake import Instant, Intake, MapInputs
-from central.rule import FusionRule, Tail
+from sim.studies.rules.centre import ComparisonCentre, recorded_maps
 from sim.studies.rules.map_fusion import fused_totally, kalman
 from team import translate
-from team.estimation.contribution import Stream
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from team.store import Stream
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.digest import digest_of
 
+if TYPE_CHECKING:
+    from central.desk.verification.recorded import Recorded
 
-class NewestMaps(Intake[MapInputs]):
-    """The newest map of every robot, and the initial poses of the streams."""
 
-    listens = (ch.START, ch.OWN_MAP)
+class NewestMapsCentre(ComparisonCentre):
+    """Stores the newest map of every robot, and the initial poses of the streams.
 
-    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
-        super().__init__(config, robots)
+    names_inputs: whether a map follows from the maps that it names alone.
+    """
+
+    inputs = (ch.START, ch.OWN_MAP)
+    names_inputs = True
+
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
+        super().__init__(config, robots, admit=admit)
         self._maps: dict[str, m.MapEstimate] = {}
         self._starts: dict[Stream, m.InitialPose] = {}
 
-    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def file(self, message: m.Message) -> list[Outgoing]:
         """Store an initial pose, or a map that is newer than the robot's last one."""
         match message:
             case m.InitialPose():
@@ -40,22 +50,8 @@ class NewestMaps(Intake[MapInputs]):
                 pass
         return []
 
-    def inputs(self, closed_ns: float, now_ns: int) -> MapInputs:
-        """The maps by robot."""
-        maps = [self._maps[robot] for robot in sorted(self._maps)]
-        return MapInputs(now_ns=now_ns, maps=maps, starts=self._starts)
-
-    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MapInputs]]:
-        """One instant, now."""
-        yield Instant(attendance.now_ns, self.inputs(float("inf"), attendance.now_ns))
-
-    def members(self, until_ns: float) -> Mapping[Stream, int]:
-        """The maps in the team's frame."""
-        placed = (each for each in self._maps.values() if is_placed(each, self._starts))
-        return {(each.robot, each.incarnation): each.sequence for each in placed}
-
-    def dealt(self, done: m.Done) -> bool:
-        """True once the robot's last map and the initial pose of its stream have arrived."""
+    def has_received(self, done: m.Done) -> bool:
+        """Whether the robot's last map and the initial pose of its stream have arrived."""
         found = self._maps.get(done.robot)
         last = (done.incarnation, done.last_map)
         return done.last_map < 0 or (
@@ -64,14 +60,43 @@ class NewestMaps(Intake[MapInputs]):
             and (done.robot, done.incarnation) in self._starts
         )
 
+    def publish_due(self) -> list[Outgoing]:
+        """No running map."""
+        return []
 
-def is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
-    """Whether a map is in the team's frame: its stream's initial pose is known."""
-    start = starts.get((estimate.robot, estimate.incarnation))
-    return start is not None and bool(start.pose)
+    def publish_final(self) -> list[Outgoing]:
+        """The map of the newest maps by robot."""
+        maps = [self._maps[robot] for robot in sorted(self._maps)]
+        final = self.fuse(maps, self._starts, self.attendance.now_ns, final=True)
+        return [Outgoing(ch.FINAL_MAP, "", final)]
+
+    def fuse(
+        self,
+        maps: Sequence[m.MapEstimate],
+        starts: Mapping[Stream, m.InitialPose],
+        now_ns: int,
+        *,
+        final: bool,
+    ) -> m.FusedMap:
+        """The fused map of these maps."""
+        raise NotImplementedError
+
+    def recomputed(
+        self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
+    ) -> Iterator[Outgoing]:
+        """Recompute each map from the recorded maps that it names; the reasons name others, too."""
+        firsts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
+        starts = {s: start for s, start in firsts.items() if isinstance(start, m.InitialPose)}
+        for channel, recorded in ((ch.FUSED_MAP, maps), (ch.FINAL_MAP, finals)):
+            for each in recorded:
+                own, final = recorded_maps(log, each), channel is ch.FINAL_MAP
+                fused = self.fuse(own, starts, each.stamp_ns, final=final)
+                if not self.names_inputs:
+                    fused = msgspec.structs.replace(fused, reasons=each.reasons)
+                yield Outgoing(channel, "", fused)
 
 
-class LatestRule(FusionRule[MapInputs]):
+class LatestCentre(NewestMapsCentre):
     """The latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
 
     Each map rests on its own robot's measurements alone, so the maps are independent and no
@@ -79,57 +104,93 @@ class LatestRule(FusionRule[MapInputs]):
     pose is not known has its map in a frame of its own and is left out.
     """
 
-    intake = NewestMaps
-    unnamed = ("reasons",)
+    names_inputs = False
 
-    def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
-        """The fusion of these maps."""
-        maps = [each for each in inputs.maps if is_placed(each, inputs.starts)]
-        values = {x.robot: _value(x) for x in maps}
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
+        super().__init__(config, robots, admit=admit)
+        self._published: Mapping[Stream, int] = {}
+        self._published_ns: int | None = None
+
+    def publish_due(self) -> list[Outgoing]:
+        """A map broadcast_s of team time after the last one, if there is a newer map of a robot."""
+        last_ns, now_ns = self._published_ns, self.attendance.now_ns
+        if last_ns is not None and now_ns - last_ns < self.config.broadcast_s * 1e9:
+            return []
+        return self.publish_newest()
+
+    def publish_newest(self) -> list[Outgoing]:
+        """A map at once, if there is a newer map of a robot than in the last one."""
+        maps = [self._maps[robot] for robot in sorted(self._maps)]
+        named = {(x.robot, x.incarnation): x.sequence for x in maps if is_placed(x, self._starts)}
+        if all(self._published.get(stream, -1) >= last for stream, last in named.items()):
+            return []
+        self._published, self._published_ns = named, self.attendance.now_ns
+        fused = self.fuse(maps, self._starts, self.attendance.now_ns, final=False)
+        return [Outgoing(ch.FUSED_MAP, "", fused)]
+
+    def fuse(
+        self,
+        maps: Sequence[m.MapEstimate],
+        starts: Mapping[Stream, m.InitialPose],
+        now_ns: int,
+        *,
+        final: bool,
+    ) -> m.FusedMap:
+        """The fusion of the maps in the team's frame."""
+        placed = [each for each in maps if is_placed(each, starts)]
+        values = {x.robot: _value(x) for x in placed}
         value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
-        away = sorted({x.robot for x in inputs.maps} - {x.robot for x in maps})
+        away = sorted({x.robot for x in maps} - {x.robot for x in placed})
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
         self.landmarks = len(value.ids)
-        final = tail == "final"
-        fused = fused_message(
+        return fused_message(
             self.config,
-            _digest(self.config_digest, maps),
+            _digest(self.config_digest, placed),
             value,
-            _members(maps),
-            stamp_ns=max((x.stamp_ns for x in maps), default=0),
+            _members(placed),
+            stamp_ns=max((x.stamp_ns for x in placed), default=0),
             final=final,
             reasons=reasons,
         )
-        return [Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]
 
 
-class AloneRule(FusionRule[MapInputs]):
+class AloneCentre(NewestMapsCentre):
     """No fusion: publishes a final map for single-robot teams only."""
 
-    intake = NewestMaps
-
-    def fuse(self, inputs: MapInputs, tail: Tail) -> list[Outgoing]:
+    def fuse(
+        self,
+        maps: Sequence[m.MapEstimate],
+        starts: Mapping[Stream, m.InitialPose],
+        now_ns: int,
+        *,
+        final: bool,
+    ) -> m.FusedMap:
         """The map of the one robot; of several robots a map without landmarks, with the reason."""
-        if tail != "final":
-            return []
-        maps, reason = inputs.maps, ""
+        reason = ""
         if not maps:
             reason = "no fusion, and this estimator makes no map"
-        elif len(self.team) != 1:
+        elif len(self.robots) != 1:
             reason = "no fusion: each robot has its own map"
         value = NO_LANDMARKS if reason else _value(maps[0])
         self.landmarks = len(value.ids)
-        fused = fused_message(
+        return fused_message(
             self.config,
             _digest(self.config_digest, maps),
             value,
             _members(maps),
-            stamp_ns=max((x.stamp_ns for x in maps), default=inputs.now_ns),
+            stamp_ns=max((x.stamp_ns for x in maps), default=now_ns),
             final=True,
             joint=not maps or maps[0].joint,
             reasons=(reason,) if reason else (),
         )
-        return [Outgoing(ch.FINAL_MAP, "", fused)]
+
+
+def is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
+    """Whether a map is in the team's frame: its stream's initial pose is known."""
+    start = starts.get((estimate.robot, estimate.incarnation))
+    return start is not None and bool(start.pose)
 
 
 def _name(estimate: m.MapEstimate) -> tuple[int, int]:

@@ -1,18 +1,17 @@
-"""The common part of rules on raw measurements: the team's keyframes in, poses and the map out."""
+"""The common part of centres on raw measurements: keyframes of the team in, poses and map out."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
-from central.attendance import TeamAttendance
 from central.config import CentralConfig
 from central.fused import START_POSES, fused_message
-from central.intake import Inputs, Instant, Intake
-from central.rule import FusionRule, Tail
 from sim.studies.estimators.robot_step import RobotStep
+from sim.studies.rules.centre import ComparisonCentre
 from sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from team import translate
 from team.config import RobotConfig
@@ -24,6 +23,9 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.digest import NO_MAP, digest_of
+
+if TYPE_CHECKING:
+    from central.desk.verification.recorded import Recorded
 
 
 @dataclass(frozen=True)
@@ -39,98 +41,22 @@ class MapContent:
     before: tuple[Outgoing, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasurementInputs(Inputs):
-    """The team's keyframes, those of one team time as one step; they grow.
-
-    starts: the models and the initial pose of each robot, once all are here. broken: robots whose
-    stream began anew.
-    """
-
-    starts: Mapping[str, tuple[RobotConfig, m.InitialPose]] = field(default_factory=dict)
-    steps: Sequence[Sequence[RobotKeyframe]] = ()
-    broken: Sequence[str] = ()
-
-
-class MeasurementIntake(Intake[MeasurementInputs]):
-    """Collects raw measurements and the models that the robots announce; the keyframes are the
-    clock.
-    """
-
-    listens = (*ch.SENSORS, ch.ROBOT_CONFIG)
-    due = "period"
-
-    def __init__(self, config: CentralConfig, robots: Sequence[str]) -> None:
-        super().__init__(config, robots)
-        self._keyframes = TeamKeyframes(robots)
-        self._starts: Mapping[str, tuple[RobotConfig, m.InitialPose]] = {}
-        self._steps: list[Sequence[RobotKeyframe]] = []
-
-    def take(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """File a measurement, a robot's models or the last counters."""
-        match message:
-            case m.Measurement():
-                self._keyframes.put(message)
-            case m.Configuration() if message.node.startswith("robot/"):
-                self._configure(message)
-            case m.End():
-                self._keyframes.end(message)
-            case _:
-                pass
-        return []
-
-    def _configure(self, message: m.Configuration) -> None:
-        try:
-            config = msgspec.json.decode(message.configuration, type=RobotConfig)
-        except msgspec.DecodeError as error:
-            self.warnings.append(f"{message.node} runs another version: {error}")
-        else:
-            self._keyframes.configure(config.id, config)
-
-    @property
-    def complete(self) -> bool:
-        """True once every measurement of every stream has been used."""
-        return self._keyframes.complete
-
-    def inputs(self, closed_ns: float, now_ns: int) -> MeasurementInputs:
-        """All steps that are complete."""
-        return MeasurementInputs(
-            now_ns=now_ns,
-            starts=self._starts,
-            steps=self._steps,
-            broken=self._keyframes.broken,
-        )
-
-    def instants(self, attendance: TeamAttendance) -> Iterator[Instant[MeasurementInputs]]:
-        """An instant before every complete step, when a map may be due, and one after the last."""
-        self._starts = self._starts or self._keyframes.starts or {}
-        if not self._starts:
-            return
-        for step in self._keyframes.steps():
-            now_ns = step[0].stamp_ns
-            since_ns = self._steps[0][0].stamp_ns if self._steps else now_ns
-            yield Instant(now_ns, self.inputs(now_ns, now_ns), since_ns)
-            self._steps.append(step)
-            yield Instant(now_ns, self.inputs(now_ns, now_ns), since_ns)
-
-    def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
-        """Requests for measurements that the link has lost."""
-        return self._keyframes.requests(now_ns)
-
-
-class MeasurementRule(FusionRule[MeasurementInputs]):
+class MeasurementCentre(ComparisonCentre):
     """An estimate over all robots' raw measurements at the centre.
 
-    The keyframes of one team time are one step. The robots announce their models. A robot with an
-    unknown initial pose is left out; where no initial pose is known the first robot's is the frame.
-    A map's members name each robot's last measurement in it.
+    The keyframes of one team time are one step; they are the clock of the maps. The robots announce
+    their models. A robot with an unknown initial pose is left out; where no initial pose is known
+    the first robot's is the frame. A map's members name each robot's last measurement in it.
     """
 
-    intake = MeasurementIntake
+    inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)
 
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str]) -> None:
-        super().__init__(config, digest, robots)
-        self._taken = 0
+    def __init__(
+        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    ) -> None:
+        super().__init__(config, robots, admit=admit)
+        self._keyframes = TeamKeyframes(robots)
+        self._map_ns: int | None = None
         self.models: dict[str, RobotConfig] = {}
         self.members: dict[str, m.VersionEntry] = {}
         self._pose_ns: dict[str, int] = {}
@@ -152,22 +78,71 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
     def _content(self, *, final: bool) -> MapContent:
         """The map of all steps so far."""
 
-    def fuse(self, inputs: MeasurementInputs, tail: Tail) -> list[Outgoing]:
-        """The map of all steps, after their poses."""
-        return [*self.take(inputs), *self._map_messages(inputs.broken, final=tail == "final")]
+    def file(self, message: m.Message) -> list[Outgoing]:
+        """File a measurement, a robot's models or the last counters."""
+        match message:
+            case m.Measurement():
+                self._keyframes.put(message)
+            case m.Configuration() if message.node.startswith("robot/"):
+                self._configure(message)
+            case m.End():
+                self._keyframes.end(message)
+            case _:
+                pass
+        return []
 
-    def take(self, inputs: MeasurementInputs) -> list[Outgoing]:
-        """Process the new steps; returns the poses to publish."""
-        if not self.models and inputs.starts:
-            self._begin(inputs.starts)
+    def _configure(self, message: m.Configuration) -> None:
+        try:
+            config = msgspec.json.decode(message.configuration, type=RobotConfig)
+        except msgspec.DecodeError as error:
+            self.warnings.append(f"{message.node} runs another version: {error}")
+        else:
+            self._keyframes.configure(config.id, config)
+
+    @property
+    def has_all_measurements(self) -> bool:
+        """Whether every measurement of every stream has been used."""
+        return self._keyframes.complete
+
+    def requests(self) -> list[m.MeasurementsRequest]:
+        """Requests for measurements that the link has lost."""
+        return [] if self.finished else self._keyframes.requests(self.attendance.now_ns)
+
+    def publish_due(self) -> list[Outgoing]:
+        """Process the complete steps; broadcast_s of team time after the last map, one before the
+        next step.
+        """
+        if not self.models and not self._begin():
+            return []
         out: list[Outgoing] = []
-        for step in inputs.steps[self._taken :]:
-            self._taken += 1
+        for step in self._keyframes.steps():
+            step_ns = step[0].stamp_ns
+            self._map_ns = step_ns if self._map_ns is None else self._map_ns
+            if step_ns - self._map_ns >= self.config.broadcast_s * 1e9:
+                out += self._publish_map(final=False)
+                self._map_ns = step_ns
             out += self._take_step([each for each in step if each.robot in self.models])
         return out
 
-    def _begin(self, starts: Mapping[str, tuple[RobotConfig, m.InitialPose]]) -> None:
-        """Place the robots' initial poses in one frame."""
+    def publish_final(self) -> list[Outgoing]:
+        """The map of all steps, after their poses."""
+        return self._publish_map(final=True)
+
+    def recomputed(
+        self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
+    ) -> Iterator[Outgoing]:
+        """Recompute everything from the whole stream, since each map changes the next."""
+        for message in _inputs_in_order(log):
+            self.file(message)
+        yield from self.publish_due()
+        if log.published:
+            yield from self.publish_final()
+
+    def _begin(self) -> bool:
+        """Place the robots' initial poses in one frame; False while one is missing."""
+        starts = self._keyframes.starts
+        if not starts:
+            return False
         placed = {name: start for name, (_, start) in starts.items() if self._is_placed(start)}
         if not placed:
             name = min(starts)
@@ -190,6 +165,7 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
                 for name, (pose, covariance) in known.items()
             }
         )
+        return True
 
     def _sensors_start(
         self, robot: str, pose: Pose, covariance: Matrix | None
@@ -256,19 +232,19 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
     @property
-    def digest(self) -> bytes:
+    def set_digest(self) -> bytes:
         """The name of the set of measurements so far."""
         members = (self.members[robot] for robot in sorted(self.members))
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return digest_of(self.config_digest, named)
 
-    def _map_messages(self, broken: Sequence[str], *, final: bool) -> list[Outgoing]:
+    def _publish_map(self, *, final: bool) -> list[Outgoing]:
         content = self._content(final=final) if self.models else MapContent()
         self.landmarks = len(content.landmarks.ids)
-        lost = [f"{robot}: its stream began anew" for robot in broken]
+        lost = [f"{robot}: its stream began anew" for robot in self._keyframes.broken]
         fused = fused_message(
             self.config,
-            self.digest,
+            self.set_digest,
             content.landmarks,
             tuple(self.members[robot] for robot in sorted(self.members)),
             stamp_ns=self.now_ns,
@@ -278,3 +254,19 @@ class MeasurementRule(FusionRule[MeasurementInputs]):
             reasons=(*self._reasons, *lost, *self.findings) if final else (),
         )
         return [*content.before, Outgoing(ch.FINAL_MAP if final else ch.FUSED_MAP, "", fused)]
+
+
+def _inputs_in_order(log: "Recorded") -> Iterator[m.Message]:
+    """The robots' models, every measurement by stream and counter, the end of the streams."""
+    for node in sorted(log.configured):
+        if node.startswith("robot/"):
+            yield log.configured[node]
+    for stream in sorted(log.measurements):
+        measurements = log.measurements[stream]
+        yield from (measurements[counter] for counter in sorted(measurements))
+    ends = tuple(
+        m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+        for (robot, incarnation), count in log.published.items()
+    )
+    if ends:
+        yield m.End(stamp_ns=0, streams=ends)

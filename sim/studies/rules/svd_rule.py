@@ -6,6 +6,7 @@ over the common landmarks, and the landmarks are joined (section 4.3). The initi
 robot fixes the frame; those of the others have no influence.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -14,8 +15,9 @@ import numpy as np
 
 from central.config import CentralConfig
 from central.fused import fused_message, version_entry
-from central.rule import FusionRule, Tail
-from central.submap_intake import SubmapInputs, SubmapIntake
+from central.join_messages import Tail
+from central.node import CentralNode
+from central.submap_fold import RecordedFields, SubmapFold
 from sim.studies.estimators import svd_joining
 from sim.studies.estimators.svd_joining import (
     NO_PAIRS,
@@ -26,12 +28,13 @@ from sim.studies.estimators.svd_joining import (
 )
 from team import translate
 from team.estimation import dense, elementwise
-from team.estimation.contribution import Stream, named
+from team.estimation.contribution import named
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from team.estimation.geometry import Pose
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.plausible import start_beyond, submap_beyond
 from team.estimation.submap import LocalMap
+from team.store import Stream, SubmapStore
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
@@ -54,27 +57,42 @@ class _Joined:
     refused: str = ""
 
 
-class SvdJoinRule(FusionRule[SubmapInputs]):
+class SvdFold(SubmapFold):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
     A later incarnation of a robot is a stream of its own, in a frame of its own. A running map
     contains everything that has arrived; a later one may place any of it elsewhere.
     """
 
-    intake = SubmapIntake
-
-    def __init__(self, config: CentralConfig, digest: bytes, robots: Sequence[str] = ()) -> None:
-        super().__init__(config, digest, robots)
+    def __init__(
+        self,
+        config: CentralConfig,
+        digest: bytes,
+        store: SubmapStore | None = None,
+        *,
+        convicts: bool = True,
+    ) -> None:
+        super().__init__(config, digest, store, convicts=convicts)
         self._weighting: Weighting = "full" if config.fusion == "svd-join" else "identity"
         self._joined: dict[Stream, _Joined] = {}
 
-    def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
-        """The map of these submaps: a function of them and of the initial poses alone."""
-        channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
-        return [Outgoing(channel, "", self._fused(inputs, final=tail == "final"))]
+    def fold_until(self, closed_ns: float) -> None:
+        """Do nothing: each map is made of the whole set."""
 
-    def _fused(self, inputs: SubmapInputs, *, final: bool) -> m.FusedMap:
-        chains = {stream: chain for stream, chain in inputs.submaps.items() if chain}
+    def make_map(
+        self,
+        tail: Tail,
+        closed_ns: float = math.inf,
+        *,
+        ahead: bool = True,
+        recorded: RecordedFields | None = None,
+    ) -> list[Outgoing]:
+        """The map of the stored set: a function of it alone."""
+        channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
+        return [Outgoing(channel, "", self._fused(final=tail == "final"))]
+
+    def _fused(self, *, final: bool) -> m.FusedMap:
+        chains = self.store.chains
         if not chains:
             return fused_message(
                 self.config,
@@ -85,7 +103,7 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
                 final=final,
                 frame="",
             )
-        initial = {stream: self._believed(inputs.starts[stream]) for stream in chains}
+        initial = {stream: self._believed(self.store.start(stream)) for stream in chains}
         joined = {s: self._extended(s, chains[s], initial[s], final) for s in chains}
         states = {s: x.state for s, x in joined.items() if x.state.fold.contributions}
         first = min(states or chains, key=lambda s: (initial[s] is None, s))
@@ -141,6 +159,12 @@ class SvdJoinRule(FusionRule[SubmapInputs]):
         self._joined[stream] = _Joined(len(chain), state, digest, refused)
         solution = _solution(state) if final else state
         return _Joined(len(chain), solution, digest, refused)
+
+
+class SvdCentre(CentralNode):
+    """The centre that makes its maps by `SvdFold`."""
+
+    fold_class = SvdFold
 
 
 def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:

@@ -72,7 +72,7 @@ class _Stream:
                 self.segmenter = Segmenter(config.motion, config.sensor, keyframe_s)
                 self.judge = StreamJudge(config.bounds)
             case m.InitialPose():
-                self.broken = True  # a later life of the stream begins who knows where
+                self.broken = True  # a later incarnation begins at an unknown pose
             case m.Observations() | m.Points() if self.segmenter is not None:
                 scan = translate.scan_of(measurement)
                 near = self.judge.near(scan.ranges)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from sim.scenarios.scenario import load, with_options
 from sim.studies.batch_reference.reference import batch_map
 from sim.studies.rules import batch_rule
@@ -62,7 +62,7 @@ MEASUREMENTS = {"r1": published(stream("r1", 9)), "r2": published(stream("r2", 7
 
 def heard(configs, **options):
     """A team's measurements at the centre, one after the other."""
-    node = CentralNode(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
+    node = make_centre(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
     out = []
     for name, told in configs.items():
         out += node.handle(configured(ch.robot_node(name), 0, 0, told), 0)
@@ -152,5 +152,5 @@ def test_a_robust_scale_is_that_of_the_configuration():
 
 
 def test_before_the_starts_there_is_nothing_to_tell():
-    node = CentralNode(CentralConfig(fusion="batch"), ["r1"])
+    node = make_centre(CentralConfig(fusion="batch"), ["r1"])
     assert "poses" not in node.status().figures

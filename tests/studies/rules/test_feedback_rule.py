@@ -5,10 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.attendance import TeamAttendance
 from central.config import CentralConfig
-from central.scheduler import Scheduler
-from sim.studies.rules.feedback_rule import RULES, ExchangeRule
+from sim.studies.rules.feedback_rule import RULES, RoundsCentre
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -20,8 +18,13 @@ from tests.teams import of
 ROBOTS = ["r1", "r2", "r3"]
 
 
-def rule(name="kalman"):
-    return Scheduler(ExchangeRule(CentralConfig(fusion=name), b"settings", ROBOTS))
+def centre(name="kalman", robots=ROBOTS):
+    return RoundsCentre(CentralConfig(fusion=name), robots)
+
+
+def give_up(found, robot):
+    order = m.GivenUp(stamp_ns=0, node=f"robot/{robot}", by="operator", reason="lost")
+    return found.handle(order, 0)
 
 
 def estimate(robot, number, at=0.0):
@@ -39,24 +42,15 @@ def estimate(robot, number, at=0.0):
     )
 
 
-def team(robots=ROBOTS, without=()):
-    """The attendance of a team in which some have ended."""
-    attendance = TeamAttendance.of(robots)
-    for robot in without:
-        attendance.robots[robot].given_up = True
-    return attendance
-
-
 @settings(deadline=None, max_examples=40)
 @given(st.permutations(ROBOTS * 3))
 def test_each_round_is_fused_once_in_its_turn_when_nobody_is_missing(order):
     """A robot's own maps keep their order."""
-    found, out, sent = rule(), [], set()
+    found, out, sent = centre(), [], set()
     for i, robot in enumerate(order):
         number = order[: i + 1].count(robot)
-        found.intake.take(estimate(robot, number, at=float(robot[1:])), 0)
         sent.add((robot, number))
-        new = of(found.advance(team()), ch.FUSED_MAP)
+        new = of(found.handle(estimate(robot, number, at=float(robot[1:])), 0), ch.FUSED_MAP)
         for fused in new:
             assert all((r, fused.exchange) in sent for r in ROBOTS)
         out += new
@@ -65,61 +59,57 @@ def test_each_round_is_fused_once_in_its_turn_when_nobody_is_missing(order):
 
 
 def _in_order():
-    found, out = rule(), []
+    found, out = centre(), []
     for number in (1, 2, 3):
         for robot in ROBOTS:
-            found.intake.take(estimate(robot, number, at=float(robot[1:])), 0)
-        out += of(found.advance(team()), ch.FUSED_MAP)
-    return [encoded(fused) for fused in out]
+            out += found.handle(estimate(robot, number, at=float(robot[1:])), 0)
+    return [encoded(fused) for fused in of(out, ch.FUSED_MAP)]
 
 
 def test_who_takes_no_part_is_not_waited_for():
-    found = rule()
-    found.intake.take(estimate("r1", 1), 0)
-    assert found.advance(team()) == []
-    (fused,) = of(found.advance(team(without=("r2", "r3"))), ch.FUSED_MAP)
+    found = centre()
+    assert found.handle(estimate("r1", 1), 0) == []
+    assert give_up(found, "r2") == []
+    (fused,) = of(give_up(found, "r3"), ch.FUSED_MAP)
     assert [member.robot for member in fused.members] == ["r1"]
 
 
 def test_a_centre_that_was_started_again_goes_on_where_the_robots_are():
-    found = rule()
-    found.intake.take(estimate("r1", 7), 0)
-    found.intake.take(estimate("r2", 7), 0)
-    assert found.advance(team()) == []
-    found.intake.take(estimate("r3", 7), 0)
-    (fused,) = of(found.advance(team()), ch.FUSED_MAP)
+    found = centre()
+    assert found.handle(estimate("r1", 7), 0) == []
+    assert found.handle(estimate("r2", 7), 0) == []
+    (fused,) = of(found.handle(estimate("r3", 7), 0), ch.FUSED_MAP)
     assert fused.exchange == 7
 
 
 def test_the_last_map_of_one_who_ended_is_still_fused():
-    found = rule()
-    found.intake.take(estimate("r1", 1, at=8.0), 0)
-    found.intake.take(estimate("r2", 1), 0)
-    (fused,) = of(found.advance(team(["r1", "r2"], without=("r1",))), ch.FUSED_MAP)
+    found = centre(robots=["r1", "r2"])
+    found.handle(estimate("r1", 1, at=8.0), 0)
+    give_up(found, "r1")
+    (fused,) = of(found.handle(estimate("r2", 1), 0), ch.FUSED_MAP)
     assert [member.robot for member in fused.members] == ["r1", "r2"]
     assert translate.landmarks_of(fused)[1][0, 0] > 0.0
 
 
 def test_a_map_for_a_round_that_is_over_is_not_taken():
-    found = rule()
+    found, out = centre(), []
     for robot in ROBOTS:
-        found.intake.take(estimate(robot, 1), 0)
-    found.advance(team())
-    found.intake.take(estimate("r1", 1, at=99.0), 0)
+        found.handle(estimate(robot, 1), 0)
+    found.handle(estimate("r1", 1, at=99.0), 0)
     for robot in ROBOTS:
-        found.intake.take(estimate(robot, 2), 0)
-    (fused,) = of(found.advance(team()), ch.FUSED_MAP)
+        out += found.handle(estimate(robot, 2), 0)
+    (fused,) = of(out, ch.FUSED_MAP)
     assert fused.exchange == 2
 
 
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_the_final_map_is_the_last_rounds(name):
-    found = rule(name)
+    found, out = centre(name), []
     for number in (1, 2):
         for robot in ROBOTS:
-            found.intake.take(estimate(robot, number, at=float(number)), 0)
-    last = of(found.advance(team()), ch.FUSED_MAP)[-1]
-    (final,) = of(found.conclude(0), ch.FINAL_MAP)
+            out += found.handle(estimate(robot, number, at=float(number)), 0)
+    last = of(out, ch.FUSED_MAP)[-1]
+    (final,) = of(found.publish_final(), ch.FINAL_MAP)
     assert final.final
     assert (final.exchange, final.digest, final.means, final.covariance) == (
         2,
@@ -134,7 +124,7 @@ def test_the_final_map_is_the_last_rounds(name):
 
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_without_any_map_the_final_one_is_empty(name):
-    (final,) = of(rule(name).conclude(7), ch.FINAL_MAP)
+    (final,) = of(centre(name).publish_final(), ch.FINAL_MAP)
     assert (final.final, final.ids, final.members) == (True, b"", ())
     assert decoded(encoded(final)) == final
 
@@ -142,8 +132,8 @@ def test_without_any_map_the_final_one_is_empty(name):
 def test_the_digest_names_the_maps_and_every_round_before():
     digests = set()
     for first, second in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-        found = rule()
+        found, out = centre(robots=["r1"]), []
         for number, at in ((1, first), (2, second)):
-            found.intake.take(estimate("r1", number, at), 0)
-        digests.add(of(found.advance(team(["r1"])), ch.FUSED_MAP)[-1].digest)
+            out += found.handle(estimate("r1", number, at), 0)
+        digests.add(of(out, ch.FUSED_MAP)[-1].digest)
     assert len(digests) == 3

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from sim.studies.rules.map_fusion import kalman
 from team import translate
 from team.estimation.consistency import chi2_interval, nees
@@ -77,7 +77,7 @@ def value(message):
 
 
 def heard(rule, messages, robots=("r1", "r2"), **options):
-    node, out = CentralNode(CentralConfig(fusion=rule, **options), robots), []
+    node, out = make_centre(CentralConfig(fusion=rule, **options), robots), []
     for message in messages:
         out += node.handle(message, 0)
     return node, out

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from sim.studies.estimators import joint_fastslam
 from sim.studies.estimators.robot_step import RobotStep
 from sim.studies.rules.joint_fastslam_rule import RESAMPLE_BELOW
@@ -52,7 +52,7 @@ def end(measurements=MEASUREMENTS):
 
 
 def heard(fusion, messages, robots=("r1", "r2")):
-    node = CentralNode(CentralConfig(fusion=fusion, particles=PARTICLES, broadcast_s=4.0), robots)
+    node = make_centre(CentralConfig(fusion=fusion, particles=PARTICLES, broadcast_s=4.0), robots)
     out: list[Outgoing] = []
     for message in messages:
         out += node.handle(message, 0)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from central.config import CentralConfig
-from central.node import CentralNode
+from central.node import make_centre
 from sim.studies.estimators import svd_joining
 from sim.studies.estimators.svd_joining import PointPairs
 from sim.studies.rules.svd_rule import tied
@@ -54,7 +54,7 @@ def messages(submaps=SUBMAPS, starts=STARTS):
 
 
 def final(heard, rule):
-    node, out = CentralNode(CentralConfig(fusion=rule, broadcast_s=4.0), ["r1", "r2"]), []
+    node, out = make_centre(CentralConfig(fusion=rule, broadcast_s=4.0), ["r1", "r2"]), []
     for message in heard:
         out += node.handle(message, 0)
     (found,) = of(out, ch.FINAL_MAP)

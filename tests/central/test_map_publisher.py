@@ -1,4 +1,4 @@
-"""The rule `join`: when it broadcasts, what it says of its set, and what it refuses."""
+"""Maps of submaps: when they are published, the set that they name, and refused submaps."""
 
 from itertools import pairwise
 
@@ -6,15 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.attendance import TeamAttendance
 from central.config import CentralConfig
-from central.join_rule import JoinRule
-from central.scheduler import Scheduler
+from central.map_publisher import MapPublisher
+from central.submap_fold import SubmapFold
 from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
-from tests.teams import Submaps, broadcasts, of, published, stream
+from tests.teams import Submaps, of, published, stream
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=6.0)
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
@@ -24,38 +23,38 @@ END_NS = 15_000_000_000
 
 
 def rule(config=CONFIG, starts=("r1", "r2")):
-    found = Scheduler(JoinRule(config, b"settings"))
+    found = MapPublisher(SubmapFold(config, b"settings"))
     for name in starts:
-        found.intake.take_start(STARTS[name])
+        found.store.add_start(STARTS[name])
     return found
 
 
 def whole(config=CONFIG):
     found = rule(config)
     for submap in SUBMAPS.every():
-        found.intake.take_submap(submap)
+        found.store.add_submap(submap)
     return found
 
 
 def final(found):
-    return of(found.conclude(END_NS), ch.FINAL_MAP)[0]
+    return of(found.publish_final(END_NS), ch.FINAL_MAP)[0]
 
 
 def test_submaps_wait_for_the_start_of_their_stream():
     found = rule(starts=("r2",))
     for submap in SUBMAPS["r1"]:
-        found.intake.take_submap(submap)
-    assert found.intake.count(("r1", 1)) == 0
-    found.intake.take_start(STARTS["r1"])
-    assert found.intake.count(("r1", 1)) == len(SUBMAPS["r1"])
+        found.store.add_submap(submap)
+    assert found.store.processed(("r1", 1)) == 0
+    found.store.add_start(STARTS["r1"])
+    assert found.store.processed(("r1", 1)) == len(SUBMAPS["r1"])
     for submap in SUBMAPS["r2"]:
-        found.intake.take_submap(submap)
+        found.store.add_submap(submap)
     assert encoded(final(found)) == encoded(final(whole()))
 
 
 def test_a_second_start_of_the_same_stream_says_nothing_new():
     found = whole()
-    found.intake.take_start(msgspec.structs.replace(STARTS["r1"], pose=b""))
+    found.store.add_start(msgspec.structs.replace(STARTS["r1"], pose=b""))
     assert encoded(final(found)) == encoded(final(whole()))
 
 
@@ -63,9 +62,9 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
     found, maps, priors = rule(), [], []
     for k in range(5):
         for name in ("r1", "r2"):
-            found.intake.take_submap(SUBMAPS[name][k])
+            found.store.add_submap(SUBMAPS[name][k])
         now_ns = (k + 1) * 3_000_000_000
-        out = broadcasts(found, now_ns, now_ns)
+        out = found.publish_due(now_ns, now_ns)
         maps += of(out, ch.FUSED_MAP)
         priors += of(out, ch.PRIOR)
     assert [each.stamp_ns // 10**9 for each in maps] == [3, 9, 15]
@@ -89,8 +88,8 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
     for k in range(3):
         for name, behind_ns in (("r1", 3_000_000_000), ("r2", 0)):
             submap = SUBMAPS[name][k]
-            found.intake.take_submap(submap)
-            said = of(broadcasts(found, submap.stamp_ns - behind_ns, submap.stamp_ns), ch.FUSED_MAP)
+            found.store.add_submap(submap)
+            said = of(found.publish_due(submap.stamp_ns - behind_ns, submap.stamp_ns), ch.FUSED_MAP)
             assert bool(said) == (name == "r2"), "r1's waits for r2's, nothing is said twice"
             maps += said
     assert [each.members for each in maps] == [
@@ -102,7 +101,7 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
     ]
     assert not any(each.provisional for each in maps)
     for submap in SUBMAPS.every():
-        found.intake.take_submap(submap)
+        found.store.add_submap(submap)
     config = CentralConfig(tick_s=100.0, broadcast_s=3.0)
     assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
 
@@ -110,17 +109,16 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
 def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
     """What r1 has just closed is out though r2 is a window behind, and no broadcast is due."""
     config = CentralConfig(tick_s=100.0, broadcast_s=100.0)
-    found, attendance = rule(config), TeamAttendance.of(["r1", "r2"])
-    said = []
+    found, said = rule(config), []
     for name, k in (("r1", 0), ("r2", 0), ("r1", 1)):
-        found.intake.take_submap(SUBMAPS[name][k])
-        said.append(found.refresh(attendance))
-        assert not found.refresh(attendance)
+        found.store.add_submap(SUBMAPS[name][k])
+        said.append(found.publish_newest(float("-inf"), 0))
+        assert not found.publish_newest(float("-inf"), 0)
     maps = [of(out, ch.FUSED_MAP)[0] for out in said]
     assert [sum(each.sequence + 1 for each in fused.members) for fused in maps] == [1, 2, 3]
     assert all(fused.provisional for fused in maps)
     for submap in SUBMAPS.every():
-        found.intake.take_submap(submap)
+        found.store.add_submap(submap)
     assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
 
 
@@ -128,14 +126,14 @@ def test_no_map_has_less_than_the_one_before_it():
     """r2 is slow: a map goes ahead of the watermark, then r2 comes, two windows behind r1."""
     found, maps = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0)), []
     for k in range(5):
-        found.intake.take_submap(SUBMAPS["r1"][k])
-        maps += of(broadcasts(found, 0.0, SUBMAPS["r1"][k].stamp_ns), ch.FUSED_MAP)
+        found.store.add_submap(SUBMAPS["r1"][k])
+        maps += of(found.publish_due(0.0, SUBMAPS["r1"][k].stamp_ns), ch.FUSED_MAP)
     assert [each.provisional for each in maps] == [True]
     ahead = {each.robot: each.sequence for each in maps[-1].members}
     for k in range(5):
-        found.intake.take_submap(SUBMAPS["r2"][k])
+        found.store.add_submap(SUBMAPS["r2"][k])
         end_ns = SUBMAPS["r2"][k].stamp_ns
-        maps += of(broadcasts(found, end_ns, END_NS + end_ns), ch.FUSED_MAP)
+        maps += of(found.publish_due(end_ns, END_NS + end_ns), ch.FUSED_MAP)
     assert ahead["r1"] > 0
     assert len(maps) > 3
     for before, after in pairwise(maps):
@@ -143,8 +141,8 @@ def test_no_map_has_less_than_the_one_before_it():
         assert all(now[each.robot, each.incarnation] >= each.sequence for each in before.members)
     assert not maps[-1].provisional
     withdrawal = m.Withdrawal(stamp_ns=END_NS, robot="r1", by="operator", reason="a test")
-    found.intake.take_withdrawal(withdrawal)
-    (last,) = of(found.conclude(END_NS), ch.FINAL_MAP)
+    found.withdraw(withdrawal)
+    (last,) = of(found.publish_final(END_NS), ch.FINAL_MAP)
     assert {each.robot for each in last.members} == {"r2"}
 
 
@@ -152,26 +150,26 @@ def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_on
     found = rule()
     out = []
     for submap in SUBMAPS["r1"]:
-        found.intake.take_submap(submap)
-        out += of(broadcasts(found, float("-inf"), submap.stamp_ns), ch.FUSED_MAP)
+        found.store.add_submap(submap)
+        out += of(found.publish_due(float("-inf"), submap.stamp_ns), ch.FUSED_MAP)
     assert not out, "not before three broadcasts would have been due"
     late_ns = SUBMAPS["r1"][0].stamp_ns + 18_000_000_000
-    (fused,) = of(broadcasts(found, float("-inf"), late_ns), ch.FUSED_MAP)
+    (fused,) = of(found.publish_due(float("-inf"), late_ns), ch.FUSED_MAP)
     assert fused.provisional
     assert fused.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
-    assert broadcasts(found, float("-inf"), late_ns + 1) == []
-    assert broadcasts(found, float("-inf"), 10 * late_ns) == [], "there is nothing new to say"
+    assert found.publish_due(float("-inf"), late_ns + 1) == []
+    assert found.publish_due(float("-inf"), 10 * late_ns) == [], "there is nothing new to say"
     assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
 
 
 def _completed(found):
     for submap in SUBMAPS["r2"]:
-        found.intake.take_submap(submap)
+        found.store.add_submap(submap)
     return found
 
 
 def test_nothing_is_broadcast_before_there_is_anything():
-    assert broadcasts(rule(), float("-inf"), 10**18) == []
+    assert rule().publish_due(float("-inf"), 10**18) == []
 
 
 def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
@@ -179,8 +177,8 @@ def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
     for name, submaps in SUBMAPS.items():
         for submap in submaps:
             if (name, submap.sequence) != ("r2", 2):
-                found.intake.take_submap(submap)
-    assert found.intake.count(("r2", 1)) == 2
+                found.store.add_submap(submap)
+    assert found.store.processed(("r2", 1)) == 2
     fused = final(found)
     assert fused.missing == (m.VersionEntry(robot="r2", incarnation=1, sequence=2),)
     assert fused.members == (
@@ -192,56 +190,57 @@ def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
 def test_a_refused_submap_changes_no_bit_and_says_why():
     found = rule()
     for submap in SUBMAPS.every():
-        found.intake.take_submap(submap)
+        found.store.add_submap(submap)
         other = msgspec.structs.replace(submap, mean=submap.mean[:-8] + bytes(8))
-        assert found.intake.take_submap(other) == submap.sequence + 1
-    assert found.intake.refused == 10
-    assert "differs" in found.warnings[-1]
+        assert "differs" in found.store.add_submap(other)
+        assert found.store.acknowledged((submap.robot, 1)) == submap.sequence + 1
+    assert found.store.refused == 10
     assert encoded(final(found)) == encoded(final(whole()))
 
 
 def sequences(found, robot):
     """The submaps that are kept for a robot which starts again."""
-    return [
-        each.sequence for each in found.intake.stored_messages(robot) if isinstance(each, m.Submap)
-    ]
+    return [each.sequence for each in found.store.messages_of(robot) if isinstance(each, m.Submap)]
 
 
 def test_nobody_need_wait_for_what_was_refused_and_what_follows_it():
     found = rule()
-    found.intake.take_submap(SUBMAPS["r1"][0])
+    found.store.add_submap(SUBMAPS["r1"][0])
     torn = msgspec.structs.replace(SUBMAPS["r1"][1], first_measurement=0)
-    assert found.intake.take_submap(torn) == 2
-    assert found.intake.take_submap(SUBMAPS["r1"][2]) == 3
-    assert found.intake.count(("r1", 1)) == 3
+    assert "overlap" in found.store.add_submap(torn)
+    assert found.store.acknowledged(("r1", 1)) == 2
+    found.store.add_submap(SUBMAPS["r1"][2])
+    assert found.store.acknowledged(("r1", 1)) == 3
+    assert found.store.processed(("r1", 1)) == 3
     assert sequences(found, "r1") == [0]
     assert final(found).members == (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
-    assert found.intake.take_submap(SUBMAPS["r1"][1]) == 3, "the right one may still come"
+    assert found.store.add_submap(SUBMAPS["r1"][1]) is None, "the right one may still come"
+    assert found.store.acknowledged(("r1", 1)) == 3
     assert sequences(found, "r1") == [0, 1, 2]
 
 
 def test_the_digest_names_the_set_and_the_settings():
     one = final(whole())
     assert final(whole()).digest == one.digest
-    other = Scheduler(JoinRule(CONFIG, b"other set"))
+    other = MapPublisher(SubmapFold(CONFIG, b"other set"))
     less = rule()
     for name, submaps in SUBMAPS.items():
-        other.intake.take_start(STARTS[name])
+        other.store.add_start(STARTS[name])
         for submap in submaps:
-            other.intake.take_submap(submap)
+            other.store.add_submap(submap)
             if submap.sequence < 4 or name == "r1":
-                less.intake.take_submap(submap)
+                less.store.add_submap(submap)
     assert len({one.digest, final(other).digest, final(less).digest}) == 3
 
 
 def test_the_final_map_comes_with_the_paths_and_its_cost():
     found = whole()
-    out = found.conclude(END_NS)
+    out = found.publish_final(END_NS)
     fused = out[-1].message
     assert fused.final
     assert fused.joint
     assert fused.dof > 0
-    assert found.rule.finding.figures["joint_cost_per_dof"] == pytest.approx(
+    assert found.fold.finding.figures["joint_cost_per_dof"] == pytest.approx(
         fused.chi2 / fused.dof, rel=0.05
     )
     paths = {t.robot: translate.trajectory_of(t) for t in of(out, ch.TRAJECTORY)}
@@ -255,7 +254,7 @@ def test_the_final_map_comes_with_the_paths_and_its_cost():
 
 
 def test_without_a_submap_the_final_map_is_empty():
-    (only,) = rule().conclude(0)
+    (only,) = rule().publish_final(0)
     fused = only.message
     assert (fused.final, fused.ids, fused.members, fused.frame) == (True, b"", (), "")
     assert decoded(encoded(fused)) == fused

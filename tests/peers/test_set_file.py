@@ -13,7 +13,7 @@ import pytest
 
 from team.peers.members import member_of
 from team.peers.replica import Replica
-from team.peers.store import MAGIC, Keeper, Store, StoreError, record_of
+from team.peers.set_file import MAGIC, Keeper, SetFile, SetFileError, record_of
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import encoded
@@ -24,22 +24,22 @@ MEMBERS = [each for occasion in said("r1", 4, "r2") for each in occasion]
 
 def kept_in(path: Path, content: bytes) -> int:
     path.write_bytes(content)
-    store = Store(path)
+    store = SetFile(path)
     store.close()
     return len(store.members)
 
 
 def test_what_was_appended_is_there_again_and_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "r1.set"
-    store = Store(path)
+    store = SetFile(path)
     store.append(MEMBERS[:3])
     store.close()
-    again = Store(path)
+    again = SetFile(path)
     assert again.members == MEMBERS[:3]
     again.append(MEMBERS[3:])
     again.close()
     found = Replica(["r1", "r2"])
-    last = Store(path)
+    last = SetFile(path)
     last.close()
     for each in last.members:
         found.add(each)
@@ -71,14 +71,14 @@ def touched(first: int, last: int) -> set[int]:
     return {k for k in range(len(RECORDS)) if ENDS[k] <= last and first < ENDS[k + 1]}
 
 
-def check_recovered(path: Path, content: bytes, lost: set[int]) -> Store:
+def check_recovered(path: Path, content: bytes, lost: set[int]) -> SetFile:
     """Every intact record is found, the loss is named once, and the file goes on."""
     path.write_bytes(content)
-    store = Store(path)
+    store = SetFile(path)
     assert store.members == [each for k, each in enumerate(MEMBERS) if k not in lost]
     store.append([MEMBERS[0]])
     store.close()
-    again = Store(path)
+    again = SetFile(path)
     again.close()
     assert again.members == [*store.members, MEMBERS[0]]
     assert not again.lost
@@ -91,7 +91,7 @@ def test_truncated_at_any_byte_a_set_has_every_whole_record(tmp_path: Path) -> N
         cut = max(sum(end <= size for end in ENDS) - 1, 0)
         path = tmp_path / "set"
         path.write_bytes(WHOLE[:size])
-        store = Store(path)
+        store = SetFile(path)
         store.close()
         assert store.members == MEMBERS[:cut]
         if size % 20 == 0:
@@ -160,7 +160,7 @@ def test_a_record_within_a_damaged_one_is_not_taken(tmp_path: Path) -> None:
     outer[8 + 3] ^= 1
     path = tmp_path / "r1.set"
     path.write_bytes(MAGIC + bytes(outer) + RECORDS[0])
-    store = Store(path)
+    store = SetFile(path)
     store.close()
     assert store.members == [MEMBERS[0]]
 
@@ -180,7 +180,7 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
         return pwrite(file, data[: max(taken // 2, 1)], at)  # in pieces, too
 
     monkeypatch.setattr(os, "pwrite", into_room)
-    monkeypatch.setattr("team.peers.store.RETRY_S", 0.0)
+    monkeypatch.setattr("team.peers.set_file.RETRY_S", 0.0)
     keeper = Keeper(path)
     several = [MEMBERS[k % len(MEMBERS)] for k in range(60)]
     for each in several[:50]:
@@ -196,7 +196,7 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
         keeper.append([each])
     assert not keeper.warnings
     keeper.close()
-    again = Store(path)
+    again = SetFile(path)
     again.close()
     assert again.members == several
 
@@ -204,6 +204,6 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
 def test_another_file_is_not_overwritten(tmp_path: Path) -> None:
     other = tmp_path / "notes.txt"
     other.write_text("something of the user's")
-    with pytest.raises(StoreError, match="is no set of a peer: give --set another file"):
-        Store(other)
+    with pytest.raises(SetFileError, match="is no set of a peer: give --set another file"):
+        SetFile(other)
     assert other.read_text() == "something of the user's"

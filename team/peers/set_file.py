@@ -1,6 +1,6 @@
 """A peer's or a centre's set on disk: an append-only file, from which it continues after a restart.
 
-After eight bytes that say what it is come records: length and CRC-32 of the body, four bytes each,
+Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A record that a crash has
 truncated is cut off when the file is opened again. Behind a damaged record reading continues at the
 next one whose CRC fits; the file is then written anew without the damage, which is named. Lost
@@ -39,8 +39,8 @@ _LOG = logging.getLogger("teamslam")
 _LARGEST = LARGEST_MEMBER + 2**16
 
 
-class StoreError(RuntimeError):
-    """The file can not be used; the text says why and what to do."""
+class SetFileError(RuntimeError):
+    """The file can not be used; the text gives the reason and the remedy."""
 
 
 class Record(NamedTuple):
@@ -121,8 +121,8 @@ def missing_in(members: Iterable[Member]) -> list[str]:
     return texts
 
 
-class Store:
-    """The file of one peer. Raises StoreError.
+class SetFile:
+    """The file of one peer. Raises SetFileError.
 
     members: those in it when it was opened. torn: bytes of an incomplete record at its end, cut
     off. lost: what else was damaged, in words; empty if nothing was.
@@ -134,11 +134,11 @@ class Store:
             content = path.read_bytes() if path.exists() else b""
             found = list(records_in(content))
             if _is_foreign(content) and not found:
-                raise StoreError(f"{path} is no set of a peer: give --set another file")
+                raise SetFileError(f"{path} is no set of a peer: give --set another file")
             self.members = [each.member for each in found if each.member is not None]
             self._open(content, found)
         except OSError as error:
-            raise StoreError(f"{path} can not be written: {error}") from error
+            raise SetFileError(f"{path} can not be written: {error}") from error
 
     def _open(self, content: bytes, found: Sequence[Record]) -> None:
         self.torn, self.lost = 0, ""
@@ -161,13 +161,13 @@ class Store:
             self._write(MAGIC, 0)
 
     def append(self, members: Iterable[Member]) -> None:
-        """Append members, all or none. Raises StoreError."""
+        """Append members, all or none. Raises SetFileError."""
         records = b"".join(record_of(member) for member in members)
         if records:
             try:
                 self._write(records, self._size)
             except OSError as error:
-                raise StoreError(f"{self.path} can not be written: {error}") from error
+                raise SetFileError(f"{self.path} can not be written: {error}") from error
             self._size += len(records)
 
     def _write(self, data: bytes, at: int) -> None:
@@ -227,12 +227,12 @@ class Keeper:
     """Keeps a set in its file; without a path nowhere.
 
     members: those in it when it was opened. A file that can not be written is named; its members
-    are kept in memory and written once that is possible. Raises StoreError where the file can not
+    are kept in memory and written once that is possible. Raises SetFileError where the file can not
     be used.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._store = None if path is None else Store(path)
+        self._store = None if path is None else SetFile(path)
         self.members = [] if self._store is None else self._store.members
         self._waiting: list[Member] = []
         self._failure = ""
@@ -261,7 +261,7 @@ class Keeper:
         assert self._store is not None
         try:
             self._store.append(self._waiting)
-        except StoreError as error:
+        except SetFileError as error:
             if not self._failure:
                 _LOG.error("the set is not kept: %s; trying again every %g s", error, RETRY_S)
             self._failure = str(error)
@@ -272,7 +272,7 @@ class Keeper:
         self._waiting, self._failure, self._retry_s = [], "", 0.0
 
     def close(self) -> None:
-        """Write what is not written yet, and close the file."""
+        """Write the members that are not written yet, and close the file."""
         if self._store is not None:
             self._write()
             if self._waiting:

@@ -1,0 +1,186 @@
+"""When the centre publishes a map, and which robots it announces as withdrawn.
+
+Team time is cut into ticks, whose submaps are folded together, and into broadcasts. A running map
+is *closed* where every submap up to its time has arrived, else *provisional*; the *final* one comes
+at the end.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Collection, Mapping
+
+from central.join_messages import Tail
+from central.submap_fold import SubmapFold
+from team.store import Stream
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+PATIENCE = 3.0
+"""Number of broadcasts, or of ticks where these are longer, after which a provisional map is
+published although a robot has stalled."""
+
+
+class MapPublisher:
+    """Folds what is closed and publishes the maps that are due.
+
+    warnings: failures, refusals and withdrawals in words, the newest last.
+    """
+
+    def __init__(self, fold: SubmapFold) -> None:
+        self.fold = fold
+        self.store = fold.store
+        self.warnings = fold.warnings
+        config = fold.config
+        self._tick_ns = round(config.tick_s * 1e9)
+        self._period_ns = config.broadcast_s * 1e9
+        self._patience_ns = PATIENCE * 1e9 * max(config.broadcast_s, config.tick_s)
+        self._published_ns: int | None = None
+        self._quiet_ns: int | None = None
+        self._published: Mapping[Stream, int] = {}
+        self._announced: dict[str, str] = {}
+
+    @property
+    def withdrawn(self) -> tuple[str, ...]:
+        """The robots withdrawn by an order or by the fold."""
+        return tuple(sorted(self.store.withdrawals.keys() | self._announced.keys()))
+
+    # Maps.
+
+    def publish_due(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
+        """Fold the closed ticks; publish a map if one is due.
+
+        closed_ns: every submap that ends up to here has arrived.
+        """
+        self.fold.fold_until(closed_ns)
+        withdrawals = self._announce_withdrawals(now_ns)
+        if withdrawals or self._is_due(closed_ns, now_ns):
+            return [*withdrawals, *self._publish_closed(closed_ns, now_ns)]
+        if self.store.chains:
+            if self._quiet_ns is None:
+                self._quiet_ns = now_ns
+            if now_ns - self._quiet_ns >= self._patience_ns and self._has_news(math.inf):
+                return self._publish("provisional", closed_ns, now_ns)
+        return []
+
+    def publish_newest(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
+        """Publish a map of the whole set at once, if the last one lacks a submap.
+
+        The map waits for no tick's end and no teammate; submaps ahead of the watermark make it
+        provisional.
+        """
+        if not self._has_news(math.inf):
+            return []
+        self.fold.fold_until(closed_ns)
+        return self._publish_whole(closed_ns, now_ns)
+
+    def publish_final(self, now_ns: int) -> list[Outgoing]:
+        """The last messages, the final map after all others."""
+        return self._publish("final", math.inf, now_ns)
+
+    def _is_due(self, closed_ns: float, now_ns: int) -> bool:
+        last_ns = self._published_ns
+        if last_ns is not None and now_ns - last_ns < self._period_ns:
+            return False
+        return self._has_news(closed_ns)
+
+    def _publish_closed(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
+        """Publish the map of the closed ticks, or of the whole set if that is more.
+
+        A teammate's new submap is worth most to robots that measure the same landmarks, so it does
+        not wait for the end of its tick. And no map has less than the one before it: submaps ahead
+        of the watermark are in a provisional map and not yet in a closed one.
+        """
+        ticks_end_ns = closed_ns
+        if math.isfinite(closed_ns):  # a tick has the submaps that end in (a, b]
+            ticks_end_ns = closed_ns // self._tick_ns * self._tick_ns
+        whole, left_out = self._members(ticks_end_ns), self._left_out
+        published = {s: last for s, last in self._published.items() if s[0] not in left_out}
+        if _lacks(whole, published) or _lacks(whole, self._members(closed_ns)):
+            return self._publish_whole(closed_ns, now_ns)
+        return self._publish("closed", closed_ns, now_ns, ahead=False)
+
+    def _publish_whole(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
+        """Publish the map of the whole set, closed if nothing of it is ahead of the watermark."""
+        is_ahead = _lacks(self._members(closed_ns), self._members(math.inf))
+        return self._publish("provisional" if is_ahead else "closed", closed_ns, now_ns)
+
+    def _publish(
+        self, tail: Tail, closed_ns: float, now_ns: int, *, ahead: bool = True
+    ) -> list[Outgoing]:
+        """A map and its accompanying messages, after the withdrawals that it causes."""
+        out = self.fold.make_map(tail, closed_ns, ahead=ahead)
+        self._published_ns = self._quiet_ns = now_ns
+        for each in out:
+            if isinstance(each.message, m.FusedMap):
+                members = each.message.members
+                self._published = {(x.robot, x.incarnation): x.sequence for x in members}
+        return [*self._announce_withdrawals(now_ns), *out]
+
+    # Version vectors.
+
+    def _members(self, until_ns: float) -> Mapping[Stream, int]:
+        """The last submap of each stream that ends up to a time, without the robots left out."""
+        left_out = self._left_out
+        lasts = (
+            (stream, bisect_right(chain, until_ns, key=_end_ns) - 1)
+            for stream, chain in self.store.chains.items()
+            if stream[0] not in left_out
+        )
+        return {stream: last for stream, last in lasts if last >= 0}
+
+    def _has_news(self, until_ns: float) -> bool:
+        """Whether a submap that ends up to this time is missing in the last map."""
+        left_out = self._left_out
+        for stream, chain in self.store.chains.items():
+            following = self._published.get(stream, -1) + 1
+            if len(chain) <= following or stream[0] in left_out:
+                continue
+            if chain[following].stamp_ns <= until_ns:
+                return True
+        return False
+
+    @property
+    def _left_out(self) -> Collection[str]:
+        """The robots that maps are without: withdrawn and suspended ones."""
+        return {*self.store.withdrawals, *self._announced, *self.fold.suspended}
+
+    # Withdrawals.
+
+    def withdraw(self, order: m.Withdrawal) -> bool:
+        """Withdraw a robot by an order; False if it was withdrawn before.
+
+        Its submaps are still stored, since others may request them.
+        """
+        is_new = order.robot not in self.withdrawn
+        self.store.add(order)
+        if is_new:
+            self.warnings.append(f"{order.robot} withdrawn by {order.by}: {order.reason}")
+        return is_new
+
+    def _announce_withdrawals(self, now_ns: int) -> list[Outgoing]:
+        """Publish the withdrawals by the fold since the last call; late submaps may revoke one."""
+        found = self.fold.convicted
+        for robot in sorted(self._announced.keys() - found.keys()):
+            del self._announced[robot]
+            self.warnings.append(f"{robot} is withdrawn no more: what came late speaks for it")
+        new = [robot for robot in found if robot not in self._announced]
+        self._announced |= found
+        self.warnings += [f"{robot} withdrawn by central: {found[robot]}" for robot in new]
+        return [
+            Outgoing(
+                ch.WITHDRAWAL,
+                robot,
+                m.Withdrawal(stamp_ns=now_ns, robot=robot, by="central", reason=found[robot]),
+            )
+            for robot in new
+        ]
+
+
+def _lacks(members: Mapping[Stream, int], of: Mapping[Stream, int]) -> bool:
+    """Whether the first version vector lacks a submap of the other."""
+    return any(members.get(stream, -1) < last for stream, last in of.items())
+
+
+def _end_ns(submap: m.Submap) -> int:
+    return submap.stamp_ns

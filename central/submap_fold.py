@@ -1,0 +1,238 @@
+"""The fold of the stored set, and the messages of a map: the map itself, priors and paths.
+
+The map is a pure function of the set (law 2). The centre, a peer and the verification run this
+class: a recorded map comes out again from the set that it names.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+from central.config import CentralConfig
+from central.fused import receivable
+from central.join_messages import (
+    PRIOR_LANDMARKS,
+    Tail,
+    priors,
+    reasons,
+    shown_landmarks,
+    team_map,
+    trajectories,
+)
+from central.monitor import NOTHING, finding
+from central.sent_priors import SentPriors
+from central.tick_fold import TickFold
+from central.unnamed_landmarks import verdict_of
+from team import translate
+from team.estimation.map_joining import marginals
+from team.estimation.map_joining.joining import Fold
+from team.store import Stream, SubmapStore
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+from team.wire.codec import encoded, unsound
+from team.wire.digest import digest_of
+
+
+class RecordedFields(NamedTuple):
+    """The fields of a recorded map, and its priors, that do not follow from the set it names."""
+
+    missing: tuple[m.VersionEntry, ...]
+    arrived: int
+    priors_of: Collection[Stream]
+
+
+class SubmapFold:
+    """Folds the stored set tick by tick and makes the messages of its maps.
+
+    warnings: failures in words, the newest last. landmarks: number in the newest map. not_folded:
+    number of its inputs that it refused. finding: of the monitor, on the newest map. reasons: why
+    robots are not joined, and warnings about the newest map.
+    """
+
+    def __init__(
+        self,
+        config: CentralConfig,
+        digest: bytes,
+        store: SubmapStore | None = None,
+        *,
+        convicts: bool = True,
+    ) -> None:
+        """Fold a store. convicts: False for a recorded set: no further robot is withdrawn."""
+        self.config = config
+        self.config_digest = digest
+        self.store = SubmapStore() if store is None else store
+        self.warnings: list[str] = []
+        self.landmarks = 0
+        self.not_folded = 0
+        self.finding = NOTHING
+        self.reasons: tuple[str, ...] = ()
+        self._ticks = TickFold(config)
+        self._ticks.convicts = self._ticks.convicts and convicts
+        self._filed: dict[Stream, int] = {}
+        self._judged = 0
+        self._without: set[str] = set()
+        self._accused: Mapping[str, str] = {}
+        self._sent_priors = SentPriors(PRIOR_LANDMARKS)
+
+    def fold_until(self, closed_ns: float) -> None:
+        """Fold the ticks that end at this time or before."""
+        self._file_members()
+        self._ticks.take_until(closed_ns)
+
+    def make_map(
+        self,
+        tail: Tail,
+        closed_ns: float = math.inf,
+        *,
+        ahead: bool = True,
+        recorded: RecordedFields | None = None,
+    ) -> list[Outgoing]:
+        """Make a map of the stored set and the messages that accompany it.
+
+        The final map is the full solution, and the last message. Other maps have the ticks that end
+        at `closed_ns` or before and, with `ahead`, everything after them.
+        """
+        self._file_members()
+        ticks, self._accused = self._ticks, {}
+        if tail == "final":
+            return self._messages(ticks, ticks.solved(), tail, recorded)
+        ticks.take_until(closed_ns)
+        fold = ticks.fold
+        if ahead:
+            fold = ticks.provisional()
+            self._accused = ticks.accused(fold)
+        if self._accused:
+            ticks = ticks.without(self._accused, math.inf)
+            fold = ticks.fold
+        return self._messages(ticks, fold, tail, recorded)
+
+    def _file_members(self) -> None:
+        """Give the new members of the store to the ticks; a folded tick is folded again with
+        them.
+        """
+        store, ticks = self.store, self._ticks
+        for robot in sorted(store.withdrawals.keys() - self._without):
+            ticks.withdraw(robot)
+            self._without.add(robot)
+        if store.judged != self._judged:
+            self._judged = store.judged
+            ticks.judge({verdict_of(each) for each in store.verdicts})
+        chains = store.chains
+        for stream in sorted(
+            s for s, chain in chains.items() if len(chain) > self._filed.get(s, 0)
+        ):
+            filed = self._filed.get(stream, 0)
+            start = translate.start_of(store.start(stream))
+            if not filed and start is not None:
+                ticks.know_start(start)
+            for submap in chains[stream][filed:]:
+                sightings = store.sightings(submap)
+                ticks.add(submap, digest_of(*map(encoded, (submap, *sightings))), sightings)
+                self._filed[stream] = submap.sequence + 1
+
+    @property
+    def convicted(self) -> Mapping[str, str]:
+        """The robots that the fold has withdrawn, with the reason in words."""
+        return self._ticks.convicted
+
+    @property
+    def suspended(self) -> Mapping[str, str]:
+        """The robots that the newest map leaves out until they are tested again."""
+        return {**self._ticks.suspended, **self._accused}
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """The monitor's figures."""
+        return self.finding.figures
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The monitor's warnings, why robots are not joined, and warnings about the map, in
+        words.
+        """
+        suspended = (
+            f"{robot} is left out of running maps: {why}"
+            for robot, why in sorted(self.suspended.items())
+        )
+        least_m, least_rad = self.config.least_sigma
+        raised = (
+            f"{robot}: {count} submaps claim to be surer than {least_m:g} m and {least_rad:g} rad; "
+            "taken as no surer than that"
+            for robot, count in self._ticks.raised.items()
+        )
+        undecided = (self._ticks.undecided,) if self._ticks.undecided else ()
+        return (*self.finding.warnings, *suspended, *undecided, *raised, *self.reasons)
+
+    def _messages(
+        self, ticks: TickFold, fold: Fold, tail: Tail, recorded: RecordedFields | None
+    ) -> list[Outgoing]:
+        """The messages of a fold: the map, with priors or, at the end, the whole paths."""
+        final = tail == "final"
+        digest = ticks.digest(fold, self.config_digest, tail.encode())
+        agreement = ticks.agreement(fold) if fold.contributions else None
+        biases = marginals.bias_estimates(fold)
+        found = (
+            NOTHING
+            if agreement is None
+            else finding(agreement, self.config.normal_scale, final=final)
+        )
+        self.finding = found.with_biases(biases)
+        shown = shown_landmarks(fold, self.config, tail)
+        self.reasons = (
+            *(map(str, ticks.carried_off(fold)) if final else ()),
+            *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
+        )
+        store = self.store
+        fused = team_map(
+            fold,
+            tail,
+            shown.ids,
+            digest=digest,
+            members=ticks.members(fold),
+            withdrawn=ticks.withdrawn,
+            missing=store.missing() if recorded is None else recorded.missing,
+            arrived=store.arrived if recorded is None else recorded.arrived,
+            cost=(0.0, 0.0) if agreement is None else (agreement.chi2, agreement.dof),
+            covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
+            biases=biases,
+            reasons=self.findings if final else self.reasons,
+        )
+        self.landmarks = len(shown.ids)
+        self.not_folded = len(fold.refused) + len(fold.set_aside)
+        streams = (
+            self._streams_for_priors(fold, fused, shown.ids)
+            if recorded is None
+            else recorded.priors_of
+        )
+        of_robots = self._receivable(priors(fold, shown.ids, fused, streams))
+        if final:
+            paths = self._receivable(trajectories(fold, digest, store.chains))
+            return [*of_robots, *paths, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
+        return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *of_robots]
+
+    def _streams_for_priors(
+        self, fold: Fold, fused: m.FusedMap, shown: Sequence[int]
+    ) -> Collection[Stream]:
+        """The streams whose priors are published with a map: of each robot the latest one, if there
+        is news for it.
+        """
+        withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
+        latest: dict[str, int] = {}
+        for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
+            latest[robot] = max(latest.get(robot, 0), incarnation)
+        streams = sorted(latest.items())
+        if fused.final:
+            return self._sent_priors.void(fold, streams)
+        return self._sent_priors.worth(fold, streams, shown)
+
+    def _receivable(self, out: Sequence[Outgoing]) -> list[Outgoing]:
+        """The messages that every receiver accepts; others are withheld with a warning."""
+        accepted = []
+        for each in out:
+            why = unsound(each.message)
+            if why is None:
+                accepted.append(each)
+            else:
+                self.warnings.append(f"withheld: {each.key}, {why}")
+        return accepted

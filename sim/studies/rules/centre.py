@@ -1,0 +1,61 @@
+"""The common part of the comparison centres whose inputs are no submaps.
+
+Such a centre is a node like the product's (`central.node.CentralNode`): attendance, the end of the
+streams and the conclusion are the product's, the inputs and the maps are its own.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from central.node import CentralNode
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import Outgoing
+
+if TYPE_CHECKING:
+    from central.desk.verification.recorded import Recorded
+
+
+class ComparisonCentre(CentralNode):
+    """A centre that acknowledges no submaps and waits for none.
+
+    landmarks: number in its newest map.
+    """
+
+    landmarks = 0
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Figures for people."""
+        return {}
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Warnings for readers of the map."""
+        return ()
+
+    def publish_newest(self) -> list[Outgoing]:
+        """No map: maps follow the method's own clock."""
+        return []
+
+    def has_received(self, done: m.Done) -> bool:
+        """True: no submap is awaited."""
+        return True
+
+    def lacking(self) -> list[m.SubmapsRequest]:
+        """No requests: no submap is awaited."""
+        return []
+
+    def recomputed(
+        self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
+    ) -> Iterator[Outgoing]:
+        """Recompute the messages of recorded maps from the inputs that these name."""
+        raise NotImplementedError
+
+
+def recorded_maps(log: "Recorded", fused: m.FusedMap) -> list[m.MapEstimate]:
+    """The robots' own maps in a log that a recorded map names."""
+    own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
+    by_name = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
+    names = ((x.robot, x.incarnation, x.sequence, fused.exchange) for x in fused.members)
+    return [by_name[name] for name in names if name in by_name]

@@ -1,0 +1,275 @@
+"""The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
+
+The set holds submaps, the inter-robot measurements from them, initial poses, orders that withdraw a
+robot, and an operator's verdicts on landmarks. A submap is complete when the inter-robot
+measurements from it, of which it gives the number, are stored too. Admission enforces law 1: a
+submap whose measurements overlap another's, or that differs from a stored one of the same name, is
+refused with the reason. The centre, a peer's fold and the verification fold the same class.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+
+from team.wire import messages as m
+
+Stream = tuple[str, int]
+"""(robot, incarnation)."""
+
+
+@dataclass
+class StoredStream:
+    """The members of one incarnation of a robot.
+
+    submaps: by sequence. sightings: inter-robot measurements by sequence, then by (stamp,
+    teammate). chain: the complete submaps from sequence 0 on, without a gap; it only grows. used:
+    the (measurement, teammate) pairs in an inter-robot measurement. refused: sequences of refused
+    submaps, and of those with a refused inter-robot measurement.
+    """
+
+    start: m.InitialPose | None = None
+    submaps: dict[int, m.Submap] = field(default_factory=dict)
+    sightings: dict[int, dict[tuple[int, str], m.SightingFactor]] = field(default_factory=dict)
+    chain: list[m.Submap] = field(default_factory=list)
+    used: set[tuple[int, str]] = field(default_factory=set)
+    refused: set[int] = field(default_factory=set)
+
+    def extend_chain(self) -> None:
+        """Append the submaps that are complete and continue the chain."""
+        while (submap := self.submaps.get(len(self.chain))) is not None:
+            if len(self.sightings.get(submap.sequence, ())) < submap.sightings:
+                break
+            self.chain.append(submap)
+
+    def processed(self, count: int) -> int:
+        """`count`, unless the next submap was refused: then all later ones count, too, since none
+        of them can enter the map.
+        """
+        if count not in self.refused:
+            return count
+        return max(*self.refused, *self.submaps, count) + 1
+
+
+_EMPTY = StoredStream()
+
+
+class SubmapStore:
+    """The members of the team's set, each in one place.
+
+    chains: the submaps that a map can have, those of the streams with an initial pose; they grow
+    in place. withdrawals: the first order on each robot that an operator has withdrawn. verdicts:
+    those in force, with their landmarks in order. refused: number of refused members.
+    """
+
+    def __init__(self) -> None:
+        self.streams: dict[Stream, StoredStream] = {}
+        self.chains: dict[Stream, Sequence[m.Submap]] = {}
+        self.withdrawals: dict[str, m.Withdrawal] = {}
+        self.verdicts: set[m.Judgement] = set()
+        self.refused = 0
+        self._revoked: set[m.Judgement] = set()
+        self._with_gap: set[Stream] = set()
+
+    # Admission.
+
+    def add(self, message: m.Message) -> str | None:
+        """Add a member of any kind; returns the reason if it is refused."""
+        match message:
+            case m.InitialPose():
+                self.add_start(message)
+            case m.Submap():
+                return self.add_submap(message)
+            case m.SightingFactor():
+                return self.add_sighting(message)
+            case m.Withdrawal():
+                self.withdrawals.setdefault(message.robot, message)
+            case m.Verdict():
+                self.add_verdict(message)
+            case _:
+                pass
+        return None
+
+    def add_start(self, start: m.InitialPose) -> None:
+        """Add the initial pose of a stream; a second one is ignored."""
+        key = start.robot, start.incarnation
+        stream = self._stream(key)
+        stream.start = stream.start or start
+        self._note_chain(key)
+
+    def add_submap(self, submap: m.Submap) -> str | None:
+        """Add a submap; returns the reason if it is refused. A stored submap is accepted again."""
+        return self._settle(submap, self._refusal_of_submap(submap))
+
+    def add_sighting(self, sighting: m.SightingFactor) -> str | None:
+        """Add an inter-robot measurement; returns the reason if it is refused."""
+        return self._settle(sighting, self._refusal_of_sighting(sighting))
+
+    def add_verdict(self, verdict: m.Verdict) -> None:
+        """Add an operator's verdict that two unnamed landmarks are one or two, or revoke it."""
+        judgement = _in_order(verdict.judgement)
+        if verdict.withdrawn:
+            self._revoked.add(judgement)
+            self.verdicts.discard(judgement)
+        elif judgement not in self._revoked:
+            self.verdicts.add(judgement)
+
+    def refuse(self, member: m.Submap | m.SightingFactor) -> None:
+        """Mark the submap of a member as refused: it may never be in the map."""
+        self.refused += 1
+        self._stream((member.robot, member.incarnation)).refused.add(member.sequence)
+
+    def _stream(self, stream: Stream) -> StoredStream:
+        found = self.streams.get(stream)
+        if found is None:
+            found = self.streams[stream] = StoredStream()
+        return found
+
+    def _settle(self, member: m.Submap | m.SightingFactor, reason: str | None) -> str | None:
+        """Mark a refused member, or extend the chain by a stored one; returns the reason."""
+        if reason is not None:
+            self.refuse(member)
+        else:
+            self._note_chain((member.robot, member.incarnation))
+        return reason
+
+    def _note_chain(self, key: Stream) -> None:
+        stream = self._stream(key)
+        stream.extend_chain()
+        if stream.start is not None and stream.chain:
+            self.chains[key] = stream.chain
+
+    def _refusal_of_submap(self, submap: m.Submap) -> str | None:
+        """Store a submap, or return why it can not be in the set.
+
+        Law 1: each measurement is used once. The nearest submaps in sequence bound those of this
+        one.
+        """
+        key = submap.robot, submap.incarnation
+        stream = self._stream(key)
+        submaps = stream.submaps
+        name = f"submap {submap.sequence} of {submap.robot}, incarnation {submap.incarnation}"
+        stored = submaps.get(submap.sequence)
+        if stored is not None:
+            return None if stored == submap else f"{name} differs from the one in the set"
+        is_next = len(stream.chain) == len(submaps) == submap.sequence
+        nearest = (submap.sequence - 1, None) if is_next else _nearest(submaps, submap.sequence)
+        for sequence in nearest if submaps else ():
+            if sequence is None:
+                continue
+            other = submaps[sequence]
+            first, second = sorted((submap, other), key=lambda s: s.sequence)
+            if second.first_measurement <= first.last_measurement:
+                return (
+                    f"{name} uses measurements "
+                    f"{submap.first_measurement}-{submap.last_measurement}, which "
+                    f"overlap submap {sequence}'s "
+                    f"{other.first_measurement}-{other.last_measurement}"
+                )
+            is_adjacent = second.sequence == first.sequence + 1
+            ends, begins = first.last_measurement + 1, second.first_measurement
+            continues = (ends, first.stamp_ns) == (begins, second.start_ns)
+            if not (continues if is_adjacent else first.stamp_ns <= second.start_ns):
+                return f"{name} does not continue submap {sequence}"
+        submaps[submap.sequence] = submap
+        self._with_gap.add(key)
+        return None
+
+    def _refusal_of_sighting(self, sighting: m.SightingFactor) -> str | None:
+        """Store an inter-robot measurement, or return why it can not be in the set."""
+        teammate = sighting.teammate
+        stream = self._stream((sighting.robot, sighting.incarnation))
+        from_submap = stream.sightings.setdefault(sighting.sequence, {})
+        name = f"a sighting of {teammate} by {sighting.robot}, incarnation {sighting.incarnation}"
+        stored = from_submap.get((sighting.stamp_ns, teammate))
+        if stored is not None:
+            return None if stored == sighting else f"{name} differs from the one in the set"
+        submap = stream.submaps.get(sighting.sequence)
+        if submap is not None and len(from_submap) >= submap.sightings:
+            return f"{name} is one more than submap {sighting.sequence} has"
+        twice = next((n for n in sighting.measurements if (n, teammate) in stream.used), None)
+        if twice is not None:
+            return f"{name} uses measurement {twice}, which another one has used"
+        from_submap[sighting.stamp_ns, teammate] = sighting
+        stream.used |= {(measurement, teammate) for measurement in sighting.measurements}
+        return None
+
+    # Contents.
+
+    def chain(self, stream: Stream) -> Sequence[m.Submap]:
+        """The complete submaps of a stream from sequence 0 on; the sequence grows with the set."""
+        return self.streams.get(stream, _EMPTY).chain
+
+    def start(self, stream: Stream) -> m.InitialPose:
+        """The initial pose of a stream of `chains`."""
+        start = self.streams[stream].start
+        assert start is not None
+        return start
+
+    def sightings(self, submap: m.Submap) -> list[m.SightingFactor]:
+        """The inter-robot measurements from a submap, by stamp and teammate."""
+        stream = self.streams.get((submap.robot, submap.incarnation), _EMPTY)
+        found = stream.sightings.get(submap.sequence, {})
+        return [found[key] for key in sorted(found)]
+
+    def acknowledged(self, stream: Stream) -> int:
+        """Number of submaps of a stream that its robot need not send again: stored or refused."""
+        found = self.streams.get(stream, _EMPTY)
+        return found.processed(len(found.chain))
+
+    def processed(self, stream: Stream) -> int:
+        """Number of submaps of a stream that a map can have, or will never have."""
+        found = self.streams.get(stream, _EMPTY)
+        return found.processed(0 if found.start is None else len(found.chain))
+
+    @property
+    def submaps(self) -> int:
+        """Number of submaps that a map can have, or will never have."""
+        return sum(self.processed(stream) for stream in self.streams)
+
+    @property
+    def arrived(self) -> int:
+        """Number of submaps that a map can have, orders, verdicts and revocations."""
+        return sum(map(len, self.chains.values())) + len(self.withdrawals) + self.judged
+
+    @property
+    def judged(self) -> int:
+        """Number of verdicts and of revocations; it grows whenever `verdicts` changes."""
+        return len(self.verdicts | self._revoked) + len(self._revoked)
+
+    def missing(self) -> tuple[m.VersionEntry, ...]:
+        """The first missing submap of each stream with later ones."""
+        gaps = []
+        for robot, incarnation in sorted(self._with_gap):
+            stream = self.streams[robot, incarnation]
+            first = len(stream.chain)
+            if len(stream.submaps) > first:
+                gaps.append(m.VersionEntry(robot=robot, incarnation=incarnation, sequence=first))
+            else:
+                self._with_gap.discard((robot, incarnation))
+        return tuple(gaps)
+
+    def messages_of(self, robot: str) -> Iterator[m.Message]:
+        """The messages from which a robot's next process continues, the latest incarnation first.
+
+        These are the initial pose, the chain and the inter-robot measurements from it.
+        """
+        for key in sorted((key for key in self.streams if key[0] == robot), reverse=True):
+            stream = self.streams[key]
+            if stream.chain and stream.start is not None:
+                yield stream.start
+                yield from stream.chain
+                for submap in stream.chain:
+                    yield from self.sightings(submap)
+
+
+def _nearest(submaps: Mapping[int, m.Submap], sequence: int) -> tuple[int | None, int | None]:
+    """The stored sequences next below and above this one."""
+    below = max((s for s in submaps if s < sequence), default=None)
+    return below, min((s for s in submaps if s > sequence), default=None)
+
+
+def _in_order(judgement: m.Judgement) -> m.Judgement:
+    """A judgement with the smaller landmark first."""
+    first, second = sorted((judgement.first, judgement.second), key=msgspec.structs.astuple)
+    return m.Judgement(first=first, second=second, same=judgement.same)
