@@ -56,7 +56,7 @@ class JoinRule(FusionRule[SubmapInputs]):
     def take(self, inputs: SubmapInputs) -> list[Outgoing]:
         """Fold the ticks that are closed."""
         self._file(inputs)
-        self._ticks.take_until(inputs.closed_ns)
+        self._ticks.fold_until(inputs.closed_ns)
         return []
 
     def fuse(self, inputs: SubmapInputs, tail: Tail) -> list[Outgoing]:
@@ -64,14 +64,14 @@ class JoinRule(FusionRule[SubmapInputs]):
         self._file(inputs)
         ticks, self._accused = self._ticks, {}
         if tail == "final":
-            return self._messages(inputs, ticks, ticks.solved(), tail)
-        ticks.take_until(inputs.closed_ns)
+            return self._messages(inputs, ticks, ticks.solve(), tail)
+        ticks.fold_until(inputs.closed_ns)
         fold = ticks.fold
         if inputs.ahead:
-            fold = ticks.provisional()
-            self._accused = ticks.accused(fold)
+            fold = ticks.fold_ahead()
+            self._accused = ticks.accuse(fold)
         if self._accused:
-            ticks = ticks.without(self._accused, math.inf)
+            ticks = ticks.leave_out(self._accused, math.inf)
             fold = ticks.fold
         return self._messages(inputs, ticks, fold, tail)
 
@@ -90,20 +90,20 @@ class JoinRule(FusionRule[SubmapInputs]):
         reached = inputs.reached[self._seen :] if known else submaps
         ticks.convicts = ticks.convicts and not inputs.recorded
         for robot in sorted({*inputs.withdrawn} - self._gone):
-            ticks.withdraw(robot)
+            ticks.withdraw_robot(robot)
             self._gone.add(robot)
-        ticks.judge(inputs.verdicts)
+        ticks.set_verdicts(inputs.verdicts)
         for stream in sorted(set(reached)):
             chain = submaps[stream]
             filed = self._filed.get(stream, 0)
             if not filed and chain:
                 start = translate.start_of(inputs.starts[stream])
                 if start is not None:
-                    ticks.know_start(start)
+                    ticks.add_start(start)
             for submap in chain[filed:]:
                 sightings = inputs.sightings(submap)
                 messages = (submap, *sightings)
-                ticks.add(submap, digest_of(*map(encoded, messages)), sightings)
+                ticks.add_submap(submap, digest_of(*map(encoded, messages)), sightings)
                 self._filed[stream] = submap.sequence + 1
         if inputs.reached:
             self._source, self._seen = submaps, len(inputs.reached)
@@ -157,7 +157,7 @@ class JoinRule(FusionRule[SubmapInputs]):
         self.finding = found.with_biases(biases)
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = (
-            *(map(str, ticks.carried_off(fold)) if final else ()),
+            *(map(str, ticks.find_carried_off(fold)) if final else ()),
             *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
         )
         fused = team_map(

@@ -343,6 +343,8 @@ def _merged(
     stays, goes = sorted(
         (key, other_key), key=lambda at: (at != fold.main_key, min(renamed[at].graph.streams))
     )
+    if renamed[goes].graph.condensed is not None:
+        return fold  # its factor is linearised in a frame of its own
     place = two_from_one if stays == other_key else inverse(two_from_one)
     both, waiting = placed(renamed[stays], renamed[goes], place, fold.waiting)
     try:
