@@ -12,7 +12,7 @@ from central.members import Members
 from team.estimation.association.landmark_sets import Verdict
 from team.estimation.contribution import Contribution, Stream, named
 from team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
-from team.estimation.map_joining.relinearising import relinearised
+from team.estimation.map_joining.relinearising import restore_submaps
 from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
 from team.wire.digest import digest_of
 from team.wire.messages import SightingFactor, Submap
@@ -29,20 +29,20 @@ class FoldInputs:
         self._verdicts: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
 
-    def know_start(self, start: InitialPoseFactor) -> None:
-        """Take a stream's initial pose, before its first submap is added."""
+    def add_start(self, start: InitialPoseFactor) -> None:
+        """Add a stream's initial pose, before its first submap."""
         self._starts[(start.robot, start.incarnation)] = start
 
-    def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """File a submap with the inter-robot measurements from it, which `digest` names, too;
-        returns its tick.
+    def add_submap(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
+        """Add a submap with the inter-robot measurements from it, all of which `digest` names;
+        return its tick.
         """
         tick = self._members.add(submap, digest, sightings)
         self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
         return tick
 
-    def judge(self, verdicts: Collection[Verdict]) -> float:
-        """Replace the verdicts; returns the first tick that has both landmarks of a changed one,
+    def set_verdicts(self, verdicts: Collection[Verdict]) -> float:
+        """Replace the verdicts; return the first tick that has both landmarks of a changed one,
         infinity if there is none.
         """
         changed = self._verdicts.symmetric_difference(verdicts)
@@ -65,7 +65,7 @@ class FoldInputs:
         ticks = self._members.behind(-math.inf)
         return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
 
-    def ticks_behind(self, last: float, without: Collection[str]) -> list[int]:
+    def ticks_after(self, last: float, without: Collection[str]) -> list[int]:
         """The ticks after this one with a submap of any other robot, ascending."""
         ticks = self._members.behind(last)
         return [tick for tick in ticks if self._members.has(tick, without)]
@@ -127,17 +127,13 @@ class FoldInputs:
         )
         return Tick(submaps, sightings, starts, outside, tuple(set_aside), tuple(verdicts))
 
-    def relinearised(self, fold: Fold, last: float, without: Collection[str]) -> Fold:
-        """A fold up to a tick, solved again from its own solution with nothing condensed."""
-        keys = [
-            key
-            for tick in self._members.behind(-math.inf, last)
-            for key in self._members.keys(tick, without)
-            if fold.home.get(key[1:3]) == fold.main_key
-        ]
-        submaps = [self._members.contribution(key) for key in keys]
-        seen = (each for key in keys for each in self._members.sightings(key))
-        return relinearised(fold, submaps, [s for s in seen if s.teammate not in without])
+    def restore_submaps(self, fold: Fold, last: float, without: Collection[str]) -> Fold:
+        """Restore the condensed submaps of a fold of the ticks up to the last."""
+        if not fold.condensed_count:
+            return fold
+        ticks = [self.tick(tick, without) for tick in self._members.behind(-math.inf, last)]
+        submaps = [each for tick in ticks for each in tick.contributions]
+        return restore_submaps(fold, submaps, [each for tick in ticks for each in tick.sightings])
 
     def digest(
         self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]

@@ -145,7 +145,7 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
         return Shown()
     if tail != "final":
         return Shown(marginals.confirmed(fold, config.landmark_submaps))
-    most = len(fold.main.graph.submaps) + fold.departed
+    most = len(fold.main.graph.submaps) + fold.condensed_count
     ids = marginals.confirmed(fold, config.landmark_submaps, min(CONFIRMED_BY, most))
     unnamed = [id_ for id_ in ids if id_ >= UNNAMED]
     if not unnamed:

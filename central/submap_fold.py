@@ -78,7 +78,7 @@ class SubmapFold:
     def fold_until(self, closed_ns: float) -> None:
         """Fold the ticks that end at this time or before."""
         self._file_members()
-        self._ticks.take_until(closed_ns)
+        self._ticks.fold_until(closed_ns)
 
     def make_map(
         self,
@@ -96,14 +96,14 @@ class SubmapFold:
         self._file_members()
         ticks, self._accused = self._ticks, {}
         if tail == "final":
-            return self._messages(ticks, ticks.solved(), tail, recorded)
-        ticks.take_until(closed_ns)
+            return self._messages(ticks, ticks.solve(), tail, recorded)
+        ticks.fold_until(closed_ns)
         fold = ticks.fold
         if ahead:
-            fold = ticks.provisional()
-            self._accused = ticks.accused(fold)
+            fold = ticks.fold_ahead()
+            self._accused = ticks.accuse(fold)
         if self._accused:
-            ticks = ticks.without(self._accused, math.inf)
+            ticks = ticks.leave_out(self._accused, math.inf)
             fold = ticks.fold
         return self._messages(ticks, fold, tail, recorded)
 
@@ -113,11 +113,11 @@ class SubmapFold:
         """
         store, ticks = self.store, self._ticks
         for robot in sorted(store.withdrawals.keys() - self._without):
-            ticks.withdraw(robot)
+            ticks.withdraw_robot(robot)
             self._without.add(robot)
         if store.judged != self._judged:
             self._judged = store.judged
-            ticks.judge({verdict_of(each) for each in store.verdicts})
+            ticks.set_verdicts({verdict_of(each) for each in store.verdicts})
         chains = store.chains
         for stream in sorted(
             s for s, chain in chains.items() if len(chain) > self._filed.get(s, 0)
@@ -125,10 +125,10 @@ class SubmapFold:
             filed = self._filed.get(stream, 0)
             start = translate.start_of(store.start(stream))
             if not filed and start is not None:
-                ticks.know_start(start)
+                ticks.add_start(start)
             for submap in chains[stream][filed:]:
                 sightings = store.sightings(submap)
-                ticks.add(submap, digest_of(*map(encoded, (submap, *sightings))), sightings)
+                ticks.add_submap(submap, digest_of(*map(encoded, (submap, *sightings))), sightings)
                 self._filed[stream] = submap.sequence + 1
 
     @property
@@ -180,7 +180,7 @@ class SubmapFold:
         self.finding = found.with_biases(biases)
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = (
-            *(map(str, ticks.carried_off(fold)) if final else ()),
+            *(map(str, ticks.find_carried_off(fold)) if final else ()),
             *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
         )
         store = self.store

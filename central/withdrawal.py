@@ -16,7 +16,7 @@ them contradicts itself when alone.
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 from team.estimation.map_joining.marginals import Agreement
@@ -50,6 +50,46 @@ class Trial:
     robot: str | None = None
     reason: str = ""
     undecided: str = ""
+
+
+@dataclass(frozen=True)
+class Suspension:
+    """Why a robot is left out of running maps.
+
+    retried: the number of submaps of the set from which the robot is tested again.
+    """
+
+    reason: str
+    retried: float
+
+
+@dataclass(frozen=True)
+class Conviction:
+    """The robots that a fold leaves out by itself.
+
+    withdrawn: the reason by robot, in words. suspended: left out until they are tested again. at:
+    the last tick that all this is based on. tested_from: the first tick that is tested under it.
+    """
+
+    withdrawn: Mapping[str, str] = field(default_factory=dict)
+    suspended: Mapping[str, Suspension] = field(default_factory=dict)
+    at: float = -math.inf
+    tested_from: float = -math.inf
+
+    def withdraw(self, robot: str, reason: str, at: float) -> "Conviction":
+        """The conviction with one more robot withdrawn."""
+        without = self.acquit(robot, at, -math.inf)
+        return replace(without, withdrawn={**self.withdrawn, robot: reason})
+
+    def suspend(self, robot: str, suspension: Suspension, at: float) -> "Conviction":
+        """The conviction with one more robot suspended."""
+        suspended = {**self.suspended, robot: suspension}
+        return Conviction(self.withdrawn, suspended, max(self.at, at))
+
+    def acquit(self, robot: str, at: float, tested_from: float) -> "Conviction":
+        """The conviction under which a suspended robot is tested again."""
+        suspended = {each: why for each, why in self.suspended.items() if each != robot}
+        return Conviction(self.withdrawn, suspended, max(self.at, at), tested_from)
 
 
 def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:

@@ -26,7 +26,7 @@ from team.estimation.geometry import compose
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.window import Window
-from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.auditing import fold_tick
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -121,7 +121,7 @@ def fold_of(
     unnamed = any(len(each.local.unnamed.counts) for each in contributions)
     for tick in sorted(ticks):
         if unnamed:
-            fold = taken(fold, Tick(ticks[tick]), settings)
+            fold = fold_tick(fold, Tick(ticks[tick]), settings)
         else:
             fold = folded(fold, ticks[tick], settings)
     return converged(fold, settings)

@@ -8,7 +8,7 @@ its covariance grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,9 @@ from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import information
 from team.estimation.geometry import Pose, inverse, transformed, wrapped
 from team.estimation.models import NEAREST_M, Increment, noise
+
+SightingKey: TypeAlias = tuple[int, str, int, str]
+"""(stamp, robot, incarnation, teammate): an inter-robot measurement's place in the order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +47,7 @@ class InterRobotFactor:
         return (self.robot, self.incarnation)
 
     @property
-    def key(self) -> tuple[int, str, int, str]:
+    def key(self) -> SightingKey:
         """Place in the canonical order: (stamp, robot, incarnation, teammate)."""
         return (self.stamp_ns, self.robot, self.incarnation, self.teammate)
 

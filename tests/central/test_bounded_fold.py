@@ -1,22 +1,19 @@
 """The running fold of a long run: bounded, a pure function of the set, and the final map is not."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from central import tick_fold
+from central import checkpoints, tick_fold
 from central.checkpoints import NEAR, Checkpoint, thinned
 from central.config import CentralConfig
 from central.tick_fold import TickFold
 from team import translate
-from team.estimation.map_joining import landmark_view, marginals
-from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining import landmark_view, marginals, refusal
+from team.estimation.map_joining.condensing import Limits
 from team.estimation.map_joining.joining import EMPTY_FOLD
-from team.estimation.map_joining.relinearising import is_due
 from team.wire.arrays import floats, from_floats
 from team.wire.codec import encoded
 from team.wire.digest import digest_of
@@ -26,25 +23,22 @@ CONFIG = CentralConfig(tick_s=4.0)
 SUBMAPS = Submaps([stream(name, 40, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _small():
-    """Two submaps of each stream stay raw, and it begins with five; at 9 and at 13 it is again.
-    Landmarks rest from the first one on."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tick_fold, "condensed", partial(condensed, lag=2, begin=5, first=1))
-        patch.setattr(tick_fold, "is_due", partial(is_due, begin=6))
-        yield
+SMALL = Limits(begin=6, lag=2, first=1)
+"""Two submaps of each stream stay raw, beyond six in all; at 9 and at 13 all is linearised again.
+Landmarks rest from the first one on."""
+LATER_NS = 40_000_000_000
+"""End of the streams; a robot that appears then."""
 
 
 def fresh(bounded=True):
-    ticks = TickFold(CONFIG, bounded)
+    ticks = TickFold(CONFIG, SMALL if bounded else None)
     for name, y in (("r1", 0.0), ("r2", 1.0)):
-        ticks.know_start(translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None))
+        ticks.add_start(translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None))
     return ticks
 
 
 def add(ticks, submap):
-    ticks.add(submap, digest_of(encoded(submap)))
+    ticks.add_submap(submap, digest_of(encoded(submap)))
 
 
 def bits(fold):
@@ -61,14 +55,14 @@ def straight(bounded=True):
     ticks = fresh(bounded)
     for each in SUBMAPS.every():
         add(ticks, each)
-    ticks.take_until(float("inf"))
+    ticks.fold_until(float("inf"))
     return ticks
 
 
 @pytest.fixture(scope="module")
 def expected():
     fold = straight().fold
-    assert fold.departed > 0.5 * len(SUBMAPS.every())
+    assert fold.condensed_count > 0.5 * len(SUBMAPS.every())
     assert len(landmark_view.resting_of(fold.main).ids) > 1
     return bits(fold)
 
@@ -83,9 +77,9 @@ def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(expect
     for robot in order:
         add(ticks, waiting[robot].pop(0))
         if random.random() < 0.3:
-            ticks.take_until(random.choice([8e9, 16e9, 24e9, float("inf")]))
-    assert bits(ticks.provisional()) == expected
-    ticks.take_until(float("inf"))
+            ticks.fold_until(random.choice([8e9, 16e9, 24e9, float("inf")]))
+    assert bits(ticks.fold_ahead()) == expected
+    ticks.fold_until(float("inf"))
     assert bits(ticks.fold) == expected
 
 
@@ -94,24 +88,34 @@ def test_what_a_late_submap_does_not_change_is_condensed_once(monkeypatch):
     *all_but_one, last = SUBMAPS.every()
     for each in all_but_one:
         add(ticks, each)
-    ticks.take_until(float("inf"))
-    condense = tick_fold.condensed
-    monkeypatch.setattr(tick_fold, "condensed", lambda fold: made.append(fold) or condense(fold))
+    ticks.fold_until(float("inf"))
+    condense = checkpoints.condense_submaps
+
+    def noted(fold, limits):
+        made.append(fold)
+        return condense(fold, limits)
+
+    monkeypatch.setattr(checkpoints, "condense_submaps", noted)
     add(ticks, last)
-    ticks.take_until(float("inf"))
+    ticks.fold_until(float("inf"))
     assert not made
     assert bits(ticks.fold) == bits(straight().fold)
-    assert sum(each.ahead is not None for each in ticks.checkpoints.taken) <= NEAR
+    assert sum(each.ahead is not None for each in ticks.checkpoints.kept) <= NEAR
 
 
-def test_the_full_solution_is_that_of_the_raw_set_and_takes_no_tick_again(monkeypatch):
+def test_the_full_solution_is_that_of_the_raw_set_and_folds_no_tick_again(monkeypatch):
     bounded, full = straight(), straight(bounded=False)
-    assert bounded.fold.departed > full.fold.departed == 0
+    assert bounded.fold.condensed_count > full.fold.condensed_count == 0
     assert bounded.digest(bounded.fold) == full.digest(full.fold)
     assert bounded.members(bounded.fold) == full.members(full.fold)
-    monkeypatch.delattr(tick_fold, "taken")
-    one, other = bounded.solved(), full.solved()
-    assert one.departed == 0
+    monkeypatch.delattr(tick_fold, "fold_tick")
+    one, other = bounded.solve(), full.solve()
+    assert_same_solution(one, other)
+
+
+def assert_same_solution(one, other):
+    """The same raw submaps, and the same map up to the iterations of the solver."""
+    assert one.condensed_count == other.condensed_count == 0
     assert one.main.graph.streams.keys() == other.main.graph.streams.keys()
     assert [c.key for c in one.contributions] == [c.key for c in other.contributions]
     maps = [marginals.landmark_map(fold) for fold in (one, other)]
@@ -119,39 +123,92 @@ def test_the_full_solution_is_that_of_the_raw_set_and_takes_no_tick_again(monkey
     assert np.allclose(maps[0].covariance, maps[1].covariance, rtol=1e-5)
 
 
-def test_where_a_submap_is_refused_the_full_solution_takes_the_ticks_again():
-    *members, last = SUBMAPS.every()
-    turned = floats(last.mean, "mean").copy()
+def test_a_refused_submap_is_not_restored(monkeypatch):
+    """The heading of r2's submap 11 is beyond a full turn: its chain ends there."""
+    members = SUBMAPS.every()
+    at = next(k for k, each in enumerate(members) if (each.robot, each.sequence) == ("r2", 11))
+    turned = floats(members[at].mean, "mean").copy()
     turned[2] = 7.0
-    members.append(replace(last, mean=from_floats(turned)))
+    members[at] = replace(members[at], mean=from_floats(turned))
     bounded, full = fresh(), fresh(bounded=False)
     for each in members:
         add(bounded, each)
         add(full, each)
-    one, other = bounded.solved(), full.solved()
-    assert bounded.fold.departed > 0
-    assert len(one.refused) == 1
-    assert bits(one) == bits(other)
+    full.fold_until(float("inf"))
+    bounded.fold_until(float("inf"))
+    assert bounded.fold.condensed_count > 0
+    monkeypatch.delattr(tick_fold, "fold_tick")
+    one, other = bounded.solve(), full.solve()
+    assert len(one.refused) == len(other.refused) == 3
+    assert_same_solution(one, other)
+
+
+def test_a_submap_with_its_motion_alone_is_restored_so(monkeypatch):
+    """With the landmarks of r2's submap 5 no graph counts as solvable."""
+    members = SUBMAPS.every()
+    solvable = refusal.is_solvable
+
+    def strict(island):
+        chosen = (each.contribution for each in island.graph.submaps)
+        return solvable(island) and not any(
+            (each.robot, each.sequence) == ("r2", 5) and len(each.local.ids) for each in chosen
+        )
+
+    monkeypatch.setattr(refusal, "is_solvable", strict)
+    bounded, full = fresh(), fresh(bounded=False)
+    for each in members:
+        add(bounded, each)
+        add(full, each)
+    one, other = bounded.solve(), full.solve()
+    assert bounded.fold.condensed_count > 0
+    assert one.motion_only == other.motion_only != frozenset()
+    assert_same_solution(one, other)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_new_main_island_merges_with_the_condensed_one(known):
+    """r1 appears late: its start gives the frame, or its name does; r2 is condensed by then."""
+    late = [
+        replace(each, stamp_ns=each.stamp_ns + LATER_NS, start_ns=each.start_ns + LATER_NS)
+        for each in SUBMAPS["r1"]
+    ]
+    ticks, full = (TickFold(CONFIG, limits) for limits in (SMALL, None))
+    for each in (ticks, full):
+        if known:
+            each.add_start(translate.InitialPoseFactor("r1", 1, np.zeros(3), None))
+        for submap in SUBMAPS["r2"]:
+            add(each, submap)
+        for submap in late:
+            add(each, submap)
+    ticks.fold_until(LATER_NS)
+    before = ticks.fold
+    assert before.condensed_count > 0
+    assert before.main_key == ("r2", 1)
+    ticks.fold_until(float("inf"))
+    assert ticks.fold.main_key == ("r1", 1)
+    assert ticks.fold.reasons == {}
+    assert len(ticks.fold.joined) == 1
+    assert ticks.fold.condensed_count > 0, "the merged island is condensed again"
+    assert_same_solution(ticks.solve(), full.solve())
 
 
 def test_a_withdrawal_gives_the_fold_without_the_robot():
     ticks, without = straight(), fresh()
     for each in SUBMAPS["r1"]:
         add(without, each)
-    without.take_until(float("inf"))
-    ticks.withdraw("r2")
-    ticks.take_until(float("inf"))
+    without.fold_until(float("inf"))
+    ticks.withdraw_robot("r2")
+    ticks.fold_until(float("inf"))
     assert bits(ticks.fold) == bits(without.fold)
 
 
 def test_checkpoints_are_few_and_spaced_by_their_age():
     kept: tuple[Checkpoint, ...] = ()
     for number in range(1, 5001):
-        kept = thinned((*kept, Checkpoint(number, EMPTY_FOLD, 0, number, raw=number <= 20)))
+        kept = thinned((*kept, Checkpoint(number, EMPTY_FOLD, 0, number)))
     numbers = [each.number for each in kept]
     assert len(numbers) < 45
     assert numbers[-4:] == list(range(4997, 5001))
-    assert 20 in numbers, "the last raw one stays"
     for age in range(1, 4900):
-        before = max(number for number in numbers if number <= 5000 - age)
+        before = max((number for number in numbers if number <= 5000 - age), default=0)
         assert 5000 - before <= 2.0 * age

@@ -1,7 +1,5 @@
 """The running fold of landmarks without names: bounded, and a pure function of the set."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,7 @@ from team import translate
 from team.association import AssociationProfile
 from team.config import UNNAMED
 from team.estimation.map_joining import auditing, condensing, marginals
-from team.estimation.map_joining.condensing import condensed
-from team.estimation.map_joining.relinearising import is_due
+from team.estimation.map_joining.condensing import Limits
 from team.estimation.submap import LocalMap, Unnamed
 from team.wire.codec import encoded
 from team.wire.digest import digest_of
@@ -21,6 +18,7 @@ from tests.estimation.association.unnamed_worlds import circle, drive, wrong
 
 PROFILE = AssociationProfile(recent=3, near=0.1, closure_pairs=5, audited=3, llr_loose=30.0)
 CONFIG = CentralConfig(tick_s=10.0, association=PROFILE)
+SMALL = Limits(begin=24, lag=3)
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +68,6 @@ def message(sequence, end_ns, local):
 @pytest.fixture(autouse=True, scope="module")
 def _small():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tick_fold, "condensed", partial(condensed, lag=3, begin=8))
-        patch.setattr(tick_fold, "is_due", partial(is_due, begin=24))
         patch.setattr(condensing, "MOST", 2)
         yield
 
@@ -91,12 +87,12 @@ def all_said(cluttered, _small):
 
 
 def folded(messages, bounded=True, watermarks=()):
-    ticks = TickFold(CONFIG, bounded)
+    ticks = TickFold(CONFIG, SMALL if bounded else None)
     for k, each in enumerate(messages):
-        ticks.add(each, digest_of(encoded(each)))
+        ticks.add_submap(each, digest_of(encoded(each)))
         if k in watermarks:
-            ticks.take_until(each.stamp_ns)
-    ticks.take_until(float("inf"))
+            ticks.fold_until(each.stamp_ns)
+    ticks.fold_until(float("inf"))
     return ticks
 
 
@@ -111,26 +107,26 @@ def bits(fold):
 def test_the_running_fold_is_bounded_and_the_full_solution_is_that_of_the_raw_set(world, ticks):
     messages, truth = world
     bounded, full = ticks
-    assert bounded.fold.departed > 0.5 * len(messages)
+    assert bounded.fold.condensed_count > 0.5 * len(messages)
     assert wrong(bounded.fold.landmarks, truth) == 0
     assert [each.kind for each in bounded.fold.landmarks.decisions] == ["closure"]
     assert len(bounded.fold.main.graph.observed) < 0.8 * len(messages)
-    one, other = bounded.solved(), full.solved()
+    one, other = bounded.solve(), full.solve()
     assert bits(one) == bits(other)
-    assert one.departed == other.departed == 0
+    assert one.condensed_count == other.condensed_count == 0
 
 
 def test_the_full_solution_of_a_large_set_has_the_running_folds_identities(
     world, ticks, monkeypatch
 ):
     messages, _ = world
-    bounded, raw = ticks[0], ticks[1].solved()
-    taken = []
-    monkeypatch.setattr(tick_fold, "taken", lambda *_: taken.append(_))
+    bounded, raw = ticks[0], ticks[1].solve()
+    folds = []
+    monkeypatch.setattr(tick_fold, "fold_tick", lambda *_: folds.append(_))
     monkeypatch.setattr(tick_fold, "FULL_UNNAMED", len(messages) - 1)
-    solved = bounded.solved()
-    assert not taken, "no tick is taken again"
-    assert solved.departed == 0
+    solved = bounded.solve()
+    assert not folds, "no tick is folded again"
+    assert solved.condensed_count == 0
     assert solved.landmarks.sets == raw.landmarks.sets
     one, two = marginals.landmark_map(solved), marginals.landmark_map(raw)
     apart = (one.means - two.means).ravel()
@@ -144,12 +140,12 @@ def test_a_closure_of_what_is_condensed_is_solved_with_all_of_it_linearised_agai
     sizes = []
 
     def noted(fold, *rest):
-        after = auditing.taken(fold, *rest)
+        after = auditing.fold_tick(fold, *rest)
         if after.landmarks.opened:
-            sizes.append((fold.departed, after.departed))
+            sizes.append((fold.condensed_count, after.condensed_count))
         return after
 
-    monkeypatch.setattr(tick_fold, "taken", noted)
+    monkeypatch.setattr(tick_fold, "fold_tick", noted)
     folded(messages[:40])
     (first, _), (again, after) = sizes
     assert first > again == after == 0
@@ -159,13 +155,13 @@ def test_late_submaps_give_the_same_bytes(world, ticks):
     messages, _ = world
     wanted = bits(ticks[0].fold)
     assert bits(folded(messages, watermarks=range(0, 72, 9)).fold) == wanted
-    ticks = TickFold(CONFIG)
+    ticks = TickFold(CONFIG, SMALL)
     held = messages[30]
     for each in [*messages[:30], *messages[31:]]:
-        ticks.add(each, digest_of(encoded(each)))
-    ticks.take_until(held.stamp_ns - 1)
-    ticks.add(held, digest_of(encoded(held)))
-    ticks.take_until(float("inf"))
+        ticks.add_submap(each, digest_of(encoded(each)))
+    ticks.fold_until(held.stamp_ns - 1)
+    ticks.add_submap(held, digest_of(encoded(held)))
+    ticks.fold_until(float("inf"))
     assert bits(ticks.fold) == wanted
 
 
@@ -182,19 +178,37 @@ def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_
     assert len({truth[of.first.name] for of in confirmed.values()}) == 16
     assert fold.landmarks.present.keys() == fold.main.graph.landmarks.keys()
     assert len(fold.landmarks.sets) == 16 + false[1]
-    late = TickFold(CONFIG)
+    late = TickFold(CONFIG, SMALL)
     for each in [*messages[:50], *messages[51:]]:
-        late.add(each, digest_of(encoded(each)))
-    late.take_until(messages[50].stamp_ns - 1)
-    late.add(messages[50], digest_of(encoded(messages[50])))
-    late.take_until(float("inf"))
+        late.add_submap(each, digest_of(encoded(each)))
+    late.fold_until(messages[50].stamp_ns - 1)
+    late.add_submap(messages[50], digest_of(encoded(messages[50])))
+    late.fold_until(float("inf"))
     assert bits(late.fold) == bits(fold)
 
 
 def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
-    again = all_said._inputs.relinearised(all_said.fold, float("inf"), ())
-    assert again.departed == 0
+    again = all_said._inputs.restore_submaps(all_said.fold, float("inf"), ())
+    assert again.condensed_count == 0
     assert again.landmarks.present.keys() == again.main.graph.landmarks.keys()
     assert again.main.graph.landmarks.keys() == all_said.fold.landmarks.sets.keys()
     cost = again.main.cost / sum(again.main.graph.dimensions)
     assert cost < 1.1, "each lies where its only submap has it"
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_the_first_unnamed_landmarks_meet_all_named_ones(bounded):
+    """The same sixteen landmarks with their names in the first lap, and without in the second."""
+    rng = np.random.default_rng(7)
+    angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
+    landmarks = 20.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    path = circle((0.0, 0.0), 17.0, 72, 2.0)
+    named, _ = drive("r1", path[:37], landmarks, rng, reach=9.0, named=True)
+    unnamed, _ = drive("r1", path[36:], landmarks, rng, reach=9.0)
+    count = len(named)
+    later = [(count + each.sequence, each.end_ns + count * 10**10, each.local) for each in unnamed]
+    first = [message(each.sequence, each.end_ns, each.local) for each in named]
+    both = [*first, *(message(*each) for each in later)]
+    assert folded(first, bounded).fold.condensed_count == bounded * (count - 1 - SMALL.lag)
+    fold = folded(both, bounded).fold
+    assert {id_ for id_ in fold.main.graph.landmarks if id_ >= UNNAMED} == set()

@@ -62,18 +62,18 @@ def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
     """The fold of the team's submaps with these of r3 in the place of its own."""
     ticks = TickFold(scenario().central)
     for start in messages(team_run(), m.InitialPose):
-        ticks.know_start(translate.start_of(start))
+        ticks.add_start(translate.start_of(start))
     rest = [each for each in messages(team_run(), m.Submap) if each.robot != "r3"]
     for each in sorted([*rest, *own], key=lambda each: each.stamp_ns, reverse=backwards):
-        ticks.add(each, bytes(8))
+        ticks.add_submap(each, bytes(8))
     return ticks
 
 
 def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried() -> None:
     ticks = folded(carried())
-    fold = ticks.solved()
+    fold = ticks.solve()
     assert set(ticks.convicted) == {"r3"}
-    (found,) = ticks.carried_off(fold)
+    (found,) = ticks.find_carried_off(fold)
     assert (found.robot, found.before, found.after) == ("r3", FIRST - 1, FIRST)
     assert found.begin_ns == found.end_ns == chain()[FIRST - 1].stamp_ns
     way = np.zeros(3)
@@ -83,14 +83,14 @@ def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried
     assert math.remainder(found.by[2] - way[2], 2 * math.pi) == pytest.approx(0.0, abs=0.05)
     assert not found.in_all
     other = folded(carried(), backwards=True)
-    assert other.carried_off(other.solved()) == [found], "the order of arrival changes nothing"
+    assert other.find_carried_off(other.solve()) == [found], "the order of arrival changes nothing"
 
 
 def test_nothing_is_said_of_a_robot_whose_camera_and_gyro_are_mirrored() -> None:
     ticks = folded(mirrored())
-    fold = ticks.solved()
+    fold = ticks.solve()
     assert set(ticks.convicted) == {"r3"}
-    assert ticks.carried_off(fold) == []
+    assert ticks.find_carried_off(fold) == []
 
 
 def test_nothing_is_said_of_a_robot_whose_wheels_are_a_third_too_large() -> None:

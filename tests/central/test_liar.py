@@ -136,7 +136,7 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar: str, kind: str) ->
     assert final.withdrawn == (liar,)
     assert [each.robot for each in messages(samples, m.Withdrawal)] == [liar]
     never = of_set(samples, without=liar)
-    never.take_until(math.inf)
+    never.fold_until(math.inf)
     found = landmark_map(converged(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
@@ -149,14 +149,14 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
     """r1 lies for a while; what is folded depends on the set, not on when it was asked for."""
     samples = run_with("r1", "still")
     ticks = of_set(samples)
-    ticks.take_until(30e9)
+    ticks.fold_until(30e9)
     assert list(ticks.suspended) == ["r1"]
     assert (list(ticks.convicted), ticks.withdrawn) == ([], ("r1",))
     assert {each.robot for each in ticks.fold.contributions} == {"r2", "r3"}
     for until_s in (35, 45, 60):
-        ticks.take_until(until_s * 1e9)
+        ticks.fold_until(until_s * 1e9)
     at_once = of_set(samples)
-    at_once.take_until(60e9)
+    at_once.fold_until(60e9)
     assert (ticks.convicted, ticks.suspended) == (at_once.convicted, at_once.suspended)
     assert ticks.fold.main.state.tobytes() == at_once.fold.main.state.tobytes()
     assert list(ticks.convicted) == ["r1"]
@@ -169,12 +169,12 @@ def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:
     mean = floats(wrong.mean, "mean").copy()
     mean[0] += 0.8
     ticks = of_set(samples, instead=msgspec.structs.replace(wrong, mean=from_floats(mean)))
-    ticks.take_until(20e9)
+    ticks.fold_until(20e9)
     assert (list(ticks.suspended), ticks.withdrawn) == (["r1"], ("r1",))
-    ticks.take_until(30e9)
+    ticks.fold_until(30e9)
     assert (ticks.suspended, ticks.convicted, ticks.withdrawn) == ({}, {}, ())
     assert {each.robot for each in ticks.fold.contributions} == {"r1", "r2", "r3"}
-    ticks.solved()
+    ticks.solve()
     assert ticks.withdrawn == ()
 
 
@@ -236,14 +236,14 @@ def test_chance_alone_makes_nobody_suspect() -> None:
 
 def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot_named() -> None:
     lying = of_set(run_with("r1", "still"), central=scenario(withdraw_above=None).central)
-    lying.take_until(math.inf)
+    lying.fold_until(math.inf)
     count = sum(each.robot == "r1" for each in messages(team_run(), m.Submap))
     assert dict(lying.raised) == {"r1": count - BEFORE}
     for each in lying.fold.contributions:
         variances = np.linalg.eigvalsh(each.local.covariance)
         assert variances.min() >= 5e-5**2 * 0.99
     true = of_set(team_run())
-    true.take_until(math.inf)
+    true.fold_until(math.inf)
     assert dict(true.raised) == {}
 
 
@@ -263,7 +263,7 @@ def test_a_covariance_above_the_least_spread_is_kept_to_the_bit() -> None:
 
 def test_a_variance_that_rounding_made_negative_raises_nothing() -> None:
     ticks = of_set(team_run())
-    ticks.take_until(math.inf)
+    ticks.fold_until(math.inf)
     island = replace(ticks.fold.main)
     island.__dict__["selected_covariance"] = -1e-18 * np.abs(island.selected_covariance)
     node = next(iter(island.graph.streams.values()))[-1]

@@ -22,12 +22,12 @@ SUBMAPS = Submaps([stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0
 def fresh(config=CONFIG):
     ticks = TickFold(config)
     for name, y in (("r1", 0.0), ("r2", 1.0)):
-        ticks.know_start(translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None))
+        ticks.add_start(translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None))
     return ticks
 
 
 def add(ticks, submap):
-    ticks.add(submap, digest_of(encoded(submap)))
+    ticks.add_submap(submap, digest_of(encoded(submap)))
 
 
 def bits(fold):
@@ -39,7 +39,7 @@ def straight():
     ticks = fresh()
     for each in SUBMAPS.every():
         add(ticks, each)
-    ticks.take_until(float("inf"))
+    ticks.fold_until(float("inf"))
     return ticks
 
 
@@ -57,8 +57,8 @@ def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(order,
     for i in order:
         add(ticks, waiting[SUBMAPS.every()[i].robot].pop(0))
         if data.draw(st.booleans()):
-            ticks.take_until(data.draw(st.sampled_from([0.0, 4e9, 8e9, 13e9, float("inf")])))
-    ticks.take_until(float("inf"))
+            ticks.fold_until(data.draw(st.sampled_from([0.0, 4e9, 8e9, 13e9, float("inf")])))
+    ticks.fold_until(float("inf"))
     assert bits(ticks.fold) == expected()
 
 
@@ -66,18 +66,18 @@ def test_a_late_submap_rolls_back_to_before_its_tick_and_no_further():
     ticks = fresh()
     for each in SUBMAPS["r1"]:
         add(ticks, each)
-    assert ticks.take_until(12e9)
-    before = [bits(each.fold) for each in ticks.checkpoints.taken]
+    assert ticks.fold_until(12e9)
+    before = [bits(each.fold) for each in ticks.checkpoints.kept]
     add(ticks, SUBMAPS["r2"][0])
-    assert ticks.checkpoints.taken == ()
+    assert ticks.checkpoints.kept == ()
     for each in SUBMAPS["r2"][1:]:
         add(ticks, each)
-    ticks.take_until(float("inf"))
+    ticks.fold_until(float("inf"))
     assert bits(ticks.fold) == expected()
-    assert bits(ticks.checkpoints.taken[0].fold) != before[0]
-    kept = [each.fold for each in ticks.checkpoints.taken]
+    assert bits(ticks.checkpoints.kept[0].fold) != before[0]
+    kept = [each.fold for each in ticks.checkpoints.kept]
     add(ticks, SUBMAPS["r2"][-1])
-    assert [each.fold for each in ticks.checkpoints.taken] == kept[:-1], (
+    assert [each.fold for each in ticks.checkpoints.kept] == kept[:-1], (
         "earlier checkpoints stay as they are"
     )
 
@@ -86,11 +86,11 @@ def test_a_tick_is_taken_when_the_watermark_has_reached_its_end():
     ticks = fresh()
     for each in SUBMAPS.every():
         add(ticks, each)
-    assert not ticks.take_until(4e9 - 1)
-    assert ticks.take_until(4e9)
-    assert not ticks.take_until(4e9)
+    assert not ticks.fold_until(4e9 - 1)
+    assert ticks.fold_until(4e9)
+    assert not ticks.fold_until(4e9)
     assert {c.end_ns for c in ticks.fold.contributions} == {3_000_000_000}
-    ticks.take_until(8e9)
+    ticks.fold_until(8e9)
     assert [c.end_ns // 10**9 for c in ticks.fold.contributions] == [3, 3, 6, 6]
 
 
@@ -98,7 +98,7 @@ def test_a_tick_is_taken_when_the_watermark_has_reached_its_end():
 def test_a_submap_that_ends_where_a_tick_ends_is_in_it(tick_s):
     ticks = fresh(CentralConfig(tick_s=tick_s))
     add(ticks, SUBMAPS["r1"][0])
-    assert ticks.take_until(3e9)
+    assert ticks.fold_until(3e9)
     assert len(ticks.fold.contributions) == 1
 
 
@@ -106,9 +106,9 @@ def test_the_provisional_fold_holds_everything_and_leaves_the_final_one_alone():
     ticks = fresh()
     for each in SUBMAPS.every():
         add(ticks, each)
-    ticks.take_until(4e9)
+    ticks.fold_until(4e9)
     before = bits(ticks.fold)
-    assert bits(ticks.provisional()) == expected()
+    assert bits(ticks.fold_ahead()) == expected()
     assert bits(ticks.fold) == before
 
 
@@ -119,9 +119,9 @@ def test_a_withdrawal_takes_the_ticks_again_that_were_taken_and_no_more(until_ns
         add(ticks, each)
     for each in SUBMAPS["r1"]:
         add(without, each)
-    taken = ticks.take_until(until_ns)
-    assert without.take_until(until_ns) == taken == (until_ns > 0.0)
-    ticks.withdraw("r2")
+    taken = ticks.fold_until(until_ns)
+    assert without.fold_until(until_ns) == taken == (until_ns > 0.0)
+    ticks.withdraw_robot("r2")
     assert ticks.withdrawn == ("r2",)
     assert [c.key for c in ticks.fold.contributions] == [c.key for c in without.fold.contributions]
     if taken:
@@ -129,10 +129,10 @@ def test_a_withdrawal_takes_the_ticks_again_that_were_taken_and_no_more(until_ns
     kept = ticks.fold
     add(ticks, SUBMAPS["r2"][0])
     assert ticks.fold is kept, "what it says later changes nothing"
-    ticks.withdraw("r2")
+    ticks.withdraw_robot("r2")
     assert ticks.fold is kept, "once is enough"
-    ticks.take_until(float("inf"))
-    without.take_until(float("inf"))
+    ticks.fold_until(float("inf"))
+    without.fold_until(float("inf"))
     assert bits(ticks.fold) == bits(without.fold)
 
 
@@ -159,13 +159,13 @@ def test_the_digest_changes_with_any_member_any_start_and_what_else_is_named():
         for each in SUBMAPS.every():
             if each != left_out:
                 add(ticks, each)
-        ticks.take_until(float("inf"))
+        ticks.fold_until(float("inf"))
         digests.add(ticks.digest(ticks.fold, b"x"))
     moved = straight()
-    moved.know_start(translate.InitialPoseFactor("r1", 1, np.array([0.0, 0.0, 1e-9]), None))
+    moved.add_start(translate.InitialPoseFactor("r1", 1, np.array([0.0, 0.0, 1e-9]), None))
     digests.add(moved.digest(moved.fold, b"x"))
     vague = straight()
-    vague.know_start(translate.InitialPoseFactor("r1", 1, np.zeros(3), np.eye(3)))
+    vague.add_start(translate.InitialPoseFactor("r1", 1, np.zeros(3), np.eye(3)))
     digests.add(vague.digest(vague.fold, b"x"))
     assert len(digests) == 6
     assert straight().digest(straight().fold, b"x") in digests

@@ -93,7 +93,7 @@ def of_set(
     """
     ticks = TickFold(scenario().central if central is None else central)
     for start in messages(samples, m.InitialPose):
-        ticks.know_start(translate.start_of(start))
+        ticks.add_start(translate.start_of(start))
     sightings = messages(samples, m.SightingFactor)
     for each in messages(samples, m.Submap):
         if each.robot != without:
@@ -101,12 +101,12 @@ def of_set(
             own = [s for s in sightings if (s.robot, s.incarnation, s.sequence) == name]
             if instead and name == (instead.robot, instead.incarnation, instead.sequence):
                 each = instead
-            ticks.add(each, bytes(8), [s for s in own if s.teammate != without])
+            ticks.add_submap(each, bytes(8), [s for s in own if s.teammate != without])
     return ticks
 
 
 def bits(ticks: TickFold) -> bytes:
-    ticks.take_until(math.inf)
+    ticks.fold_until(math.inf)
     fold = converged(ticks.fold, ticks.settings)
     found = landmark_map(fold)
     return b"".join(x.tobytes() for x in (fold.main.state, *found))
@@ -121,15 +121,15 @@ def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(
     whole = of_set(samples)
     if when == "before":
         whole = TickFold(scenario().central)
-        whole.withdraw("r3")
+        whole.withdraw_robot("r3")
         for start in messages(samples, m.InitialPose):
-            whole.know_start(translate.start_of(start))
+            whole.add_start(translate.start_of(start))
         for each in messages(samples, m.Submap):
             own = [s for s in met if (s.robot, s.sequence) == (each.robot, each.sequence)]
-            whole.add(each, bytes(8), own)
+            whole.add_submap(each, bytes(8), own)
     else:
-        whole.take_until(30e9 if when == "in the middle" else math.inf)
-        whole.withdraw("r3")
+        whole.fold_until(30e9 if when == "in the middle" else math.inf)
+        whole.withdraw_robot("r3")
     assert whole.withdrawn == ("r3",)
     assert bits(whole) == bits(of_set(samples, without="r3"))
     assert bits(whole) != bits(of_set(samples))
@@ -138,8 +138,8 @@ def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(
 def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was() -> None:
     samples = team_run()
     ticks = of_set(samples)
-    ticks.take_until(30e9)
-    other = ticks.without({"r3"})
+    ticks.fold_until(30e9)
+    other = ticks.leave_out({"r3"}, 30e9)
     assert {c.robot for c in other.fold.contributions} == {"r1", "r2"}
     assert {c.robot for c in ticks.fold.contributions} == {"r1", "r2", "r3"}
     assert bits(ticks) == bits(of_set(samples))
@@ -180,7 +180,7 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) ->
     assert not messages(samples, m.WithdrawalHeard), "no robot publishes another's order"
     assert (said.robot, said.by) == ("r3", "central")
     never = of_set(samples, without="r3")
-    never.take_until(math.inf)
+    never.fold_until(math.inf)
     found = landmark_map(converged(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
@@ -263,15 +263,15 @@ def test_who_was_convicted_without_what_comes_late_is_acquitted() -> None:
     """Two that agree convict a third; a submap of it that came late takes the checkpoint away."""
     samples = team_run("odometry")
     ticks = of_set(samples)
-    ticks.take_until(math.inf)
+    ticks.fold_until(math.inf)
     assert list(ticks.convicted) == ["r3"]
     again = next(each for each in messages(samples, m.Submap) if each.robot == "r3")
     sightings = messages(samples, m.SightingFactor)
     name = (again.robot, again.incarnation, again.sequence)
     own = [each for each in sightings if (each.robot, each.incarnation, each.sequence) == name]
-    ticks.add(again, bytes(8), own)
+    ticks.add_submap(again, bytes(8), own)
     assert (ticks.convicted, ticks.withdrawn) == ({}, ())
-    ticks.take_until(math.inf)
+    ticks.fold_until(math.inf)
     assert list(ticks.convicted) == ["r3"]
     assert bits(ticks) == bits(of_set(samples, without="r3"))
 
@@ -304,7 +304,7 @@ def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(
     samples = tuple(run(of))
     assert final_map(list(samples)).withdrawn == ()
     ticks = of_set(samples, central=of.central)
-    ticks.take_until(math.inf)
+    ticks.fold_until(math.inf)
     found = disagreement(joint_cost(converged(ticks.fold, ticks.settings)))
     assert set(found) == {"r1", "r2", "r3"}, "each has submaps enough to be judged"
     assert max(found.values()) < 2.0

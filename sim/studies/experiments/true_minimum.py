@@ -79,16 +79,16 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
     log = Recorded()
     for sample in samples:
         log.take(sample)
-    ticks = TickFold(log.central_config()[0], bounded=False)
+    ticks = TickFold(log.central_config()[0], limits=None)
     sightings = log.sightings()
     for stream, measurements in log.measurements.items():
         start = measurements.get(0)
         value = translate.start_of(start) if isinstance(start, m.InitialPose) else None
         if value is not None:
-            ticks.know_start(value)
+            ticks.add_start(value)
         for sequence, submap in sorted(log.submaps().get(stream, {}).items()):
-            ticks.add(submap, b"", sightings.get((*stream, sequence), ()))
-    ticks.take_until(float("inf"))
+            ticks.add_submap(submap, b"", sightings.get((*stream, sequence), ()))
+    ticks.fold_until(float("inf"))
     return converged(ticks.fold, ticks.settings)
 
 

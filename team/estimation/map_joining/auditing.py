@@ -1,11 +1,10 @@
-"""Takes back a closure that later submaps contradict.
+"""Folds a tick, and takes back a closure that later submaps contradict.
 
 For some ticks after a closure, or after a merge of robots, the share of the landmarks near its
 places that both sides have observed is computed again. Where it falls below the bound of the
-settings, the fold returns to the state before the closure and takes the same ticks again without
-it; the result is the fold that there would be had the closure never been accepted. The fold before
-a closure and the ticks since are part of the fold, so the outcome depends on the set of submaps
-alone.
+settings, the same ticks are folded again without the closure, from the state before it; the result
+is the fold that there would be had the closure never been accepted. The fold before a closure and
+the ticks since are part of the fold, so the outcome depends on the set of submaps alone.
 """
 
 from dataclasses import replace
@@ -15,17 +14,21 @@ import numpy as np
 from team.estimation.association.density import LandmarkDensity
 from team.estimation.association.landmark_sets import OPEN, Opened
 from team.estimation.association.verification import overlap_share
-from team.estimation.map_joining import refusal
 from team.estimation.map_joining.gauss_newton import Island, JoinSettings
 from team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
+from team.estimation.map_joining.refusal import add_members
 
 
-def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """The fold with the tick; closures that the tick contradicts are undone."""
+def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
+    """Fold one tick: add its members, then undo the closures that they contradict."""
     if tick.verdicts:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
-    after = refusal.taken(fold, tick, settings)
+    return _audit_closures(fold, add_members(fold, tick, settings), tick, settings)
+
+
+def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings) -> Fold:
+    """Undo a closure that the tick between two folds contradicts; else extend the audits by it."""
     if not after.landmarks.opened and not fold.audits:
         return after
     length = settings.association.audited
@@ -39,12 +42,12 @@ def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
     for audit in open_:
         share = share_now(after, audit.opened)
         if share is not None and share < settings.association.undone_below:
-            return _without(audit, after, share, settings)
+            return _undo_closure(audit, after, share, settings)
     return replace(after, audits=tuple(open_))
 
 
-def _without(audit: Audit, after: Fold, share: float, settings: JoinSettings) -> Fold:
-    """Takes the ticks since a closure again, without the closure."""
+def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSettings) -> Fold:
+    """Fold the ticks since a closure again, without the closure."""
     opened = audit.opened
     words = f"share {share:.2f} < {settings.association.undone_below:g} after {len(audit.ticks)}"
     stamp_ns = max((each.end_ns for each in after.contributions[-1:]), default=0)
@@ -53,10 +56,10 @@ def _without(audit: Audit, after: Fold, share: float, settings: JoinSettings) ->
     )
     landmarks = audit.before.landmarks.add_decisions(opened.decision, undone)
     landmarks = replace(landmarks, undone=(*landmarks.undone, opened))
-    again = replace(audit.before, landmarks=landmarks)
+    fold = replace(audit.before, landmarks=landmarks)
     for tick in audit.ticks:
-        again = taken(again, replace(tick, verdicts=()), settings)
-    return again
+        fold = fold_tick(fold, replace(tick, verdicts=()), settings)
+    return fold
 
 
 def share_now(fold: Fold, opened: Opened) -> float | None:

@@ -1,13 +1,13 @@
 """The bounded fold: old submaps are condensed into one quadratic, by sequence numbers only.
 
-The last LAG submaps of each stream of the main island stay as factors of their own. Older ones are
-linearised at the state that the fold has when they are condensed, with their robust weights at that
-moment, and become one quadratic over landmarks, biases and the pose at each stream's boundary
+The last `lag` submaps of each stream of the main island stay as factors of their own. Older ones
+are linearised at the state that the fold has when they are condensed, with their robust weights at
+that moment, and become one quadratic over landmarks, biases and the pose at each stream's boundary
 (`condensed_factor`); their other poses are eliminated. The cost of a tick therefore depends on the
 number of landmarks and robots, not on the duration of the run. A fold stays a pure function of its
 ticks.
 
-No submap is condensed before the fold has BEGIN submaps, nor before the submap's robust scale has
+No submap is condensed before the fold has `begin` submaps, nor before the submap's robust scale has
 reached its final value. Islands that are not merged yet are not condensed, since their frame will
 still be transformed.
 """
@@ -15,7 +15,7 @@ still be transformed.
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -45,23 +45,34 @@ from team.estimation.map_joining.submap_graph import Graph, without_nodes
 Indices = Int64[np.ndarray, " _"]
 T = TypeVar("T")
 
-LAG = 8
-"""Number of submaps of each stream that are never condensed."""
-BEGIN = 128
-"""A fold of fewer submaps than this is not condensed."""
 ALL_AWAKE = 2**62
 
 
-def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST) -> Fold:
-    """Condenses the old submaps of the fold's main island; returns the same fold where there are
-    none.
+class Limits(NamedTuple):
+    """The sizes by which a fold is condensed.
 
-    Nothing is condensed whose poses can not be eliminated. Unnamed landmarks stay nodes: nothing is
-    condensed while a team that has some has fewer submaps than landmarks. What is condensed is then
-    remembered (`memory`), all of it until the last closure can no longer be undone; landmarks that
-    hardly anything confirms are given up.
+    begin: a fold of up to so many submaps is raw. lag: number of submaps of each stream that are
+    never condensed. first: number of landmarks without a raw submap from which landmarks come to
+    rest.
     """
-    key = fold.main_key
+
+    begin: int = 128
+    lag: int = 8
+    first: int = FIRST
+
+
+LIMITS = Limits()
+
+
+def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
+    """Condense the old submaps of the fold's main island; return the same fold if there are none.
+
+    Submaps whose poses cannot be eliminated stay raw. Unnamed landmarks stay nodes: nothing is
+    condensed while a team that has some has fewer submaps than landmarks. Association keeps the
+    observations of condensed submaps (`memory`), all of them until the last closure can no longer
+    be undone; landmarks that few submaps confirm are given up.
+    """
+    key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:
         return fold
     unnamed = fold.landmarks.are_there
@@ -94,7 +105,6 @@ def condensed(fold: Fold, lag: int = LAG, begin: int = BEGIN, first: int = FIRST
         ),
         waiting=tuple(each for each in fold.waiting if each.sequence >= gone.get(each.stream, 0)),
         landmarks=fold.landmarks.without(left) if len(given_up) else fold.landmarks,
-        departed=fold.departed + int(leaving.sum()),
     )
 
 

@@ -258,6 +258,8 @@ def _merge_islands(
         graph, state = tied(island.graph, island.state, becomes)
         renamed[key] = replace(island, graph=graph, state=state)
     stays, goes = sorted(keys, key=lambda at: (at != fold.main_key, min(renamed[at].graph.streams)))
+    if renamed[goes].graph.condensed is not None:
+        return fold  # its condensed factor is linearised in its own frame
     place = second_from_first if stays == keys[1] else inverse(second_from_first)
     both, waiting = placed(renamed[stays], renamed[goes], place, fold.waiting)
     try:

@@ -30,7 +30,7 @@ from team.estimation.contribution import (
     moment,
     named,
 )
-from team.estimation.inter_robot import InterRobotFactor
+from team.estimation.inter_robot import InterRobotFactor, SightingKey
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -159,12 +159,13 @@ class Fold:
     iterations, change: the number of iterations and the last step [m, rad] of the main island's
         last full solution.
     refused: submaps that were received and are not in the map, in canonical order, with the reason
-        (`taken`).
-    set_aside: in words, what else was refused: initial poses, inter-robot measurements, and the
-        landmarks of submaps of which only the motion is in the map.
+        (`refusal`).
+    motion_only: submaps of which only the motion is in the map, not the landmarks.
+    left_out: inter-robot measurements with which the map has no solution.
+    set_aside: everything refused besides submaps, in words: initial poses, inter-robot
+        measurements, and landmarks of submaps.
     landmarks: which unnamed landmarks of which submaps are one, with the evidence (`associating`).
     audits: closures that may still be undone (`auditing`).
-    departed: number of condensed submaps (`condensing`), which are no longer among `contributions`.
     """
 
     contributions: tuple[Contribution, ...]
@@ -180,15 +181,22 @@ class Fold:
     judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
     searched_at: Mapping[Stream, int] = field(default_factory=dict)
     refused: Mapping[Key, str] = field(default_factory=dict)
+    motion_only: frozenset[Key] = frozenset()
+    left_out: frozenset[SightingKey] = frozenset()
     set_aside: tuple[str, ...] = ()
     landmarks: Landmarks = NO_LANDMARKS
     audits: tuple[Audit, ...] = ()
-    departed: int = 0
+
+    @property
+    def condensed_count(self) -> int:
+        """Number of condensed submaps (`condensing`), which are not among `contributions`."""
+        factors = (island.graph.condensed for island in self.islands.values())
+        return sum(each.submaps for each in factors if each is not None)
 
     @property
     def size(self) -> int:
         """Number of submaps in the fold, condensed ones included."""
-        return self.departed + len(self.contributions)
+        return self.condensed_count + len(self.contributions)
 
     @property
     def main_key(self) -> Stream | None:

@@ -71,8 +71,11 @@ def sighted(
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
     """Merges the other island into the main one's frame, or returns why that has to wait.
 
-    It waits, too, where the numbers of the shared points allow no solution.
+    The merge also waits where the numbers of the shared points allow no solution, and where submaps
+    of the other island are condensed, in a frame that could not be transformed.
     """
+    if other.graph.condensed is not None:
+        return Waits("its submaps are condensed in a frame of their own", after_search=False)
     try:
         with np.errstate(all="ignore"):
             return _merge(main, other, waiting)

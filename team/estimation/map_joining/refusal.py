@@ -1,15 +1,15 @@
-"""A total fold: every member of a tick is either taken or refused with a reason.
+"""Adds the members of a tick to a fold; those that allow no solution are refused with a reason.
 
 Whether the normal equations of a set can be solved is not known before it is tried. A tick is
-therefore taken as a whole; only if that has no solution are its members taken one after the other
+therefore added as a whole; only if that has no solution are its members added one after the other
 in canonical order, and those that make it unsolvable are left out. The outcome depends on the fold
 before and on the tick's members alone, hence on the set (law 2): any order of arrival gives the
 same refusals.
 
-Of a submap that can not be taken as it is, the motion alone is tried, the marginal of its end pose,
+If a submap as a whole allows no solution, its motion alone is tried, the marginal of its end pose,
 so that the robot's later submaps keep their place. Where that fails too, the robot's chain ends:
-later submaps have no place in any frame and are not in the map. An initial pose that can not be
-taken is treated as unknown; an inter-robot measurement is left out.
+later submaps have no place in any frame and are not in the map. An initial pose that allows no
+solution is treated as unknown; an inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -27,9 +27,9 @@ from team.estimation.map_joining.joining import Fold, Tick, folded, started
 T = TypeVar("T")
 
 
-def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """The fold with the tick; `refused` and `set_aside` list the parts of it that are not in the
-    map.
+def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
+    """Add the tick's members; `refused`, `motion_only`, `left_out` and `set_aside` of the fold list
+    the others.
     """
     fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
     fold, members = _in_reach(fold, tick.contributions, tick.outside)
@@ -39,9 +39,8 @@ def taken(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
     whole = _attempt(fold, members, starts, sightings, settings)
     if whole is not None:
         return whole
-    return _OneByOne(fold, settings, {start.stream: start for start in starts}).taken(
-        members, sightings
-    )
+    selection = _Selection(fold, settings, {start.stream: start for start in starts})
+    return selection.add_solvable(members, sightings)
 
 
 def refusals(fold: Fold) -> list[str]:
@@ -108,9 +107,10 @@ def _attempt(
     return after if all(is_solvable(island) for island in changed) else None
 
 
-class _OneByOne:
-    """A tick that has no solution as a whole: takes the members that have one, in canonical
-    order.
+class _Selection:
+    """The members of a tick with which a fold has a solution, found one by one in canonical order.
+
+    The tick as a whole has none.
     """
 
     def __init__(
@@ -121,15 +121,20 @@ class _OneByOne:
         self._starts = dict(starts)
         self._members: list[Contribution] = []
         self._refused = dict(fold.refused)
+        self._motion_only = set(fold.motion_only)
         self._set_aside = list(fold.set_aside)
 
-    def taken(self, members: Sequence[Contribution], sightings: Sequence[InterRobotFactor]) -> Fold:
-        """Takes the submaps first, then the inter-robot measurements, earlier ones that waited
-        included.
-        """
+    def add_solvable(
+        self, members: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
+    ) -> Fold:
+        """Add the submaps first, then the inter-robot measurements, waiting ones included."""
         unseen = replace(self._fold, waiting=())
         self._grow(unseen, members)
-        base = replace(unseen, refused=dict(sorted(self._refused.items())))
+        base = replace(
+            unseen,
+            refused=dict(sorted(self._refused.items())),
+            motion_only=frozenset(self._motion_only),
+        )
         waiting = [*self._fold.waiting, *_of_members(sightings, base)]
         candidates = sorted(waiting, key=lambda each: each.key)
 
@@ -145,7 +150,8 @@ class _OneByOne:
         found = after(accepted)
         if found is None:  # none of the members: the fold as it was, with its measurements
             found = replace(base, waiting=tuple(accepted))
-        return replace(found, set_aside=tuple(self._set_aside))
+        left_out = self._fold.left_out.union(each.key for each in bad)
+        return replace(found, left_out=left_out, set_aside=tuple(self._set_aside))
 
     def _of(self, members: Sequence[Contribution]) -> list[InitialPoseFactor]:
         streams = {each.stream for each in members}
@@ -155,7 +161,7 @@ class _OneByOne:
         return _attempt(fold, members, self._of(members), (), self._settings) is not None
 
     def _grow(self, fold: Fold, block: Sequence[Contribution]) -> None:
-        """Takes a block of submaps, or its halves, or refuses a single submap."""
+        """Add a block of submaps, or its halves, or refuse a single submap."""
         ended = {(robot, incarnation) for _, robot, incarnation, _ in self._refused}
         for each in block:
             if each.stream in ended:
@@ -173,7 +179,7 @@ class _OneByOne:
             self._grow_by_less(fold, block[0])
 
     def _grow_by_less(self, fold: Fold, whole: Contribution) -> None:
-        """Takes a part of one submap: without its initial pose, then its motion alone, else
+        """Add a part of one submap: without its initial pose, then its motion alone, else
         nothing.
         """
         start = self._starts.pop(whole.stream, None) if whole.sequence == 0 else None
@@ -189,6 +195,7 @@ class _OneByOne:
         motion = replace(whole, local=whole.local.motion)
         if self._solves(fold, [*self._members, motion]):
             self._members.append(motion)
+            self._motion_only.add(whole.key)
             self._set_aside.append(
                 f"of submap {whole.sequence} of {named(whole.stream)} only the motion is in the "
                 "map: with its landmarks it has no solution"
@@ -198,7 +205,7 @@ class _OneByOne:
 
 
 def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple[list[T], list[T]]:
-    """Adds items one after the other while `works`, by halves; returns the accepted and the
+    """Add items one after the other while `works`, by halves; return the accepted and the
     rejected ones.
     """
     accepted: list[T] = []

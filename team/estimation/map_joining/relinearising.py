@@ -1,9 +1,9 @@
-"""Linearises the condensed submaps again, at a few sizes of the fold.
+"""Restores condensed submaps: at a few sizes of the fold, and where a tick contradicts them.
 
 While poses are uncertain, headings still change, and submaps that were linearised at different
-headings contradict each other: the map becomes overconfident. At BEGIN · GROWTH^k submaps, up to
+headings contradict each other: the map becomes overconfident. At begin · GROWTH^k submaps, up to
 SETTLED of them, all condensed submaps are therefore restored, solved, and condensed at the new
-state.
+state. A tick that moves them further is folded with all of them restored.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from team.estimation.contribution import Contribution, Key, Stream
 from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import EliminatedPath
-from team.estimation.map_joining.condensing import BEGIN
+from team.estimation.map_joining.condensing import LIMITS
 from team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
@@ -41,8 +41,8 @@ again.
 """
 
 
-def is_due(before: int, after: int, begin: int = BEGIN) -> bool:
-    """Whether the fold has passed a size at which all of it is linearised again."""
+def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
+    """Return whether the fold passes a size at which all of it is linearised again."""
     size = begin * GROWTH
     while size <= min(after, SETTLED):
         if before < size:
@@ -51,26 +51,61 @@ def is_due(before: int, after: int, begin: int = BEGIN) -> bool:
     return False
 
 
-def relinearised(
+def is_contradicted(before: Fold, after: Fold) -> bool:
+    """Return whether a tick changes the condensed submaps by more than their linearisation allows.
+
+    That is a closure of unnamed landmarks, the first unnamed landmarks (which may be landmarks of
+    condensed submaps), and a new main island, into whose frame the former one will be transformed.
+    """
+    key, unnamed = before.main_key, after.landmarks
+    if key is None or before.condensed_count == 0:
+        return False
+    begins = unnamed.are_there and not before.landmarks.are_there
+    return bool(unnamed.opened) or begins or key != after.main_key
+
+
+def restore_submaps(
     fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
 ) -> Fold:
-    """The fold with nothing condensed, and its main island solved again from its present state.
+    """Restore the condensed submaps as factors, and solve their islands from the present state.
 
-    contributions, sightings: all of the island's, in canonical order. The fold is returned
-        unchanged where a part of it is not in them as it was sent (a refused submap among them), or
-        where they allow no solution.
+    contributions, sightings: all of the fold's members in canonical order, refused ones included.
+    An island that has no solution then stays as it is.
     """
-    key = fold.main_key
-    old = None if key is None else fold.islands[key].graph.condensed
-    if key is None or old is None or fold.refused or fold.set_aside:
-        return fold
+    for key, island in fold.islands.items():
+        old = island.graph.condensed
+        if old is not None:
+            fold = _restore_island(fold, key, old.departed.paths, contributions, sightings)
+    return fold
+
+
+def _restore_island(
+    fold: Fold,
+    key: Stream,
+    paths: Mapping[Stream, EliminatedPath],
+    contributions: Sequence[Contribution],
+    sightings: Sequence[InterRobotFactor],
+) -> Fold:
     island, landmarks, numbers = fold.islands[key], fold.landmarks, NO_NUMBERS
+    submaps = [
+        replace(each, local=each.local.motion) if each.key in fold.motion_only else each
+        for each in contributions
+        if fold.home.get(each.stream) == key and each.key not in fold.refused
+    ]
+    refused = {of[1:] for of in fold.refused}
+    seen = [
+        each
+        for each in sightings
+        if fold.home.get(each.stream) == key
+        and each.key not in fold.left_out
+        and (*each.stream, each.sequence) not in refused
+    ]
     if landmarks.are_there:
-        landmarks, numbers = landmarks.restore(contributions)
+        landmarks, numbers = landmarks.restore(submaps)
     try:
         with np.errstate(all="ignore"):
-            raw = _raw(island, fold, contributions, old.departed.paths, numbers)
-            raw, waiting = sighted(raw, sightings)
+            raw = _raw(island, fold, submaps, paths, numbers)
+            raw, waiting = sighted(raw, seen)
             for _ in range(SOLVED):
                 raw = iterated(raw)
     except UNSOLVABLE:
@@ -82,10 +117,9 @@ def relinearised(
     return replace(
         fold,
         islands={**fold.islands, key: raw},
-        contributions=tuple(sorted([*active, *contributions], key=lambda each: each.key)),
+        contributions=tuple(sorted([*active, *submaps], key=lambda each: each.key)),
         waiting=tuple(sorted([*others, *waiting], key=lambda each: each.key)),
         landmarks=landmarks,
-        departed=0,
     )
 
 

@@ -438,14 +438,6 @@ def _in_common(
     return found
 
 
-class CondensedError(ValueError):
-    """An island with condensed submaps would have to be transformed into another frame."""
-
-    def __init__(self, stream: Stream) -> None:
-        super().__init__(f"the island of {named(stream)} is condensed in a frame of its own")
-        self.stream = stream
-
-
 def without_nodes(
     graph: Graph,
     eliminated: Bool[np.ndarray, " _"],
@@ -538,11 +530,9 @@ def merged(
     """Both graphs in the main frame; landmarks with equal ids become one, at the main graph's
     value.
 
-    The other frame's fixed nodes (its gauge) become free. Raises CondensedError where submaps of
-    the other graph are condensed, since their frame would have to be transformed.
+    The other frame's fixed nodes (its gauge) become free, so none of its submaps may be condensed.
     """
-    if other.condensed is not None:
-        raise CondensedError(min(other.streams))
+    assert other.condensed is None, "a condensed factor is linearised in its own frame"
     common = {
         node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
     }

@@ -7,10 +7,15 @@ import pytest
 
 from central.join_messages import Shown, reasons
 from team.association import AssociationProfile
-from team.estimation.association.landmark_sets import OPEN, Landmarks, Opened, Verdict
+from team.estimation.association.landmark_sets import (
+    OPEN,
+    Landmarks,
+    Opened,
+    Verdict,
+)
 from team.estimation.association.member_log import LocalLandmark
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.auditing import share_now, taken
+from team.estimation.map_joining.auditing import fold_tick, share_now
 from team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -44,7 +49,7 @@ def _folded(
     submaps: list[Contribution], settings: JoinSettings = SETTINGS, fold: Fold = EMPTY_FOLD
 ) -> Fold:
     for submap in sorted(submaps, key=lambda each: each.key):
-        fold = taken(fold, Tick([submap]), settings)
+        fold = fold_tick(fold, Tick([submap]), settings)
     return fold
 
 
@@ -190,12 +195,12 @@ def test_a_verdict_merges_two_landmarks_or_keeps_them_apart(
     apart = Verdict(members[0], members[1], same=False)
     until = members[1].sequence
     before = _folded(submaps[:until])
-    told = taken(before, Tick([submaps[until]], verdicts=(apart,)), SETTINGS)
+    told = fold_tick(before, Tick([submaps[until]], verdicts=(apart,)), SETTINGS)
     assert told.landmarks.identity(members[0]) != told.landmarks.identity(members[1])
     single = [m[0] for m in told.landmarks.sets.values() if len(m) == 1 and m[0].sequence == until]
     other = next(m[0] for m in told.landmarks.sets.values() if m[0].sequence == 0)
     same = Verdict(single[0], other, same=True)
-    joined = taken(before, Tick([submaps[until]], verdicts=(same,)), SETTINGS)
+    joined = fold_tick(before, Tick([submaps[until]], verdicts=(same,)), SETTINGS)
     assert joined.landmarks.identity(single[0]) == joined.landmarks.identity(other)
 
 
@@ -209,7 +214,7 @@ def test_verdicts_that_contradict_each_other_over_a_third_landmark_keep_the_two_
     )[:3]
     chain = (Verdict(a, b, same=True), Verdict(b, c, same=True))
     for verdicts, one in ((chain, True), ((Verdict(a, c, same=False), *chain), False)):
-        told = taken(before, Tick([submaps[3]], verdicts=tuple(sorted(verdicts))), SETTINGS)
+        told = fold_tick(before, Tick([submaps[3]], verdicts=tuple(sorted(verdicts))), SETTINGS)
         identity = told.landmarks.identity
         assert (identity(a) == identity(c)) == one
         assert identity(a) == identity(b)  # the first of those that say "one" in their order

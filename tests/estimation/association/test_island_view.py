@@ -15,7 +15,7 @@ from team.estimation.association.island_view import (
     select_comparisons,
 )
 from team.estimation.association.joint_compatibility import assign_jointly
-from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.auditing import fold_tick
 from team.estimation.map_joining.fold_association import view_island
 from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, JoinSettings, Tick
 from team.estimation.submap import LocalMap, Unnamed
@@ -106,7 +106,7 @@ def view_of_a_group_shifted_by(shift: float) -> IslandView:
         np.diag(np.full(3 + 2 * count, LOCAL_SD**2)),
         unnamed=Unnamed(np.full(count, 5, np.uint32), np.zeros((count, 0), np.bool_)),
     )
-    fold = taken(EMPTY_FOLD, Tick([Contribution("r1", 1, 0, 10**10, local)]), JoinSettings())
+    fold = fold_tick(EMPTY_FOLD, Tick([Contribution("r1", 1, 0, 10**10, local)]), JoinSettings())
     view = view_island(fold.main, fold.landmarks)
     order = np.argsort(view.joint.mean[:, 0] * 10.0 + view.joint.mean[:, 1])
     mean = view.joint.mean.copy()

@@ -13,12 +13,12 @@ from team.estimation.map_joining import (
     marginals,
     path_elimination,
 )
-from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.condensing import Limits, condense_submaps
 from team.estimation.map_joining.gauss_newton import aged, final_cost
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
 from team.estimation.map_joining.minima import degrees_of_freedom
 from team.estimation.map_joining.path_elimination import quadratic
-from team.estimation.map_joining.relinearising import is_due, relinearised
+from team.estimation.map_joining.relinearising import is_due, restore_submaps
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import team
 
@@ -44,7 +44,7 @@ def both(world, settings):
     full = bounded = empty_fold(world)
     for tick in ticks_of(world):
         full = folded(full, tick, settings)
-        bounded = folded(condensed(bounded, LAG, begin=0), tick, settings)
+        bounded = folded(condense_submaps(bounded, Limits(0, LAG)), tick, settings)
     return full, bounded
 
 
@@ -63,7 +63,7 @@ def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
     island = bounded.main
     assert bounded.size == full.size == 40
     assert len(island.graph.submaps) <= 2 * (LAG + 6)
-    assert bounded.departed + len(bounded.contributions) == 40
+    assert bounded.condensed_count + len(bounded.contributions) == 40
     assert bounded.next_sequence(("r0", 0)) == 20
     assert apart(full, bounded) < 1e-3
     variances = [np.diag(marginals.landmark_map(each).covariance) for each in (full, bounded)]
@@ -101,13 +101,24 @@ def test_a_submap_that_is_condensed_twice_is_not_consistent():
 def test_what_is_linearised_again_is_the_full_solution():
     world = team(2, submaps=20)
     full, bounded = both(world, JoinSettings())
-    again = relinearised(bounded, world.submaps, [])
-    assert again.departed == 0
+    again = restore_submaps(bounded, world.submaps, [])
+    assert again.condensed_count == 0
     assert len(again.contributions) == again.size == full.size
     assert apart(full, again) < 1e-6 <= apart(full, bounded) * 1e3
-    smaller = condensed(again, LAG, begin=0)
-    assert smaller.departed == 2 * (20 - LAG)
+    smaller = condense_submaps(again, Limits(0, LAG))
+    assert smaller.condensed_count == 2 * (20 - LAG)
     assert apart(full, smaller) < 1e-6
+
+
+def test_an_inter_robot_measurement_that_was_left_out_is_not_restored():
+    world = meeting(3, robots=3, submaps=9)
+    bad, *others = world.sightings
+    fold = joined_with(world.submaps, world.starts, others, JoinSettings())
+    fold = condense_submaps(replace(fold, left_out=frozenset({bad.key})), Limits(0, lag=2))
+    assert fold.condensed_count == 21
+    raw = restore_submaps(fold, world.submaps, world.sightings)
+    assert raw.condensed_count == 0
+    assert len(raw.main.graph.sightings) == len(others)
 
 
 @pytest.mark.parametrize(
@@ -146,13 +157,13 @@ def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monke
     fold = joined_with(world.submaps, world.starts, world.sightings, ROBUST)
     fold = replace(fold, islands={fold.main_key: aged(fold.main, 100)})
     monkeypatch.setattr(path_elimination, "RUN", 3)
-    by_runs = condensed(fold, lag=2, begin=0, first=1).main.graph.condensed
+    by_runs = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
     monkeypatch.setattr(
         condensing,
         "without_paths",
         lambda island, union, factors, _: (union, *quadratic(island, union, factors)),
     )
-    at_once = condensed(fold, lag=2, begin=0, first=1).main.graph.condensed
+    at_once = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
     assert by_runs.submaps == 21
     assert by_runs.redundancy == at_once.redundancy
     assert by_runs.nodes.tolist() == at_once.nodes.tolist()

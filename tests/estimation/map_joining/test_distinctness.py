@@ -10,7 +10,7 @@ from central.join_messages import reasons, shown_landmarks
 from team.config import UNNAMED
 from team.estimation.association.landmark_sets import Verdict
 from team.estimation.association.member_log import LocalLandmark
-from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.auditing import fold_tick
 from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, Fold, JoinSettings, Tick
 from team.estimation.map_joining.memory import MOST
 from team.estimation.submap import LocalMap, Unnamed
@@ -46,7 +46,7 @@ def folded(
         places, pose_sd = (PAIR if k < 2 else [later]), (0.3 if k == 1 else SD)
         contribution = seen(k, places, pose_sd, heading_sd if k == 1 else 0.001)
         tick = Tick([contribution], verdicts=verdicts if k == 3 else ())
-        fold = taken(fold, tick, JoinSettings())
+        fold = fold_tick(fold, tick, JoinSettings())
     return fold
 
 
@@ -105,7 +105,7 @@ def looked_at(times: int, found: int, verdicts: tuple[Verdict, ...] = ()) -> Fol
     fold = EMPTY_FOLD
     for k in range(times):
         places = [*PAIR, FALSE] if k < found else PAIR
-        fold = taken(
+        fold = fold_tick(
             fold, Tick([seen(k, places, SD)], verdicts=verdicts * (k == 1)), JoinSettings()
         )
     return fold

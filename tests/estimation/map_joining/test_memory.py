@@ -5,12 +5,12 @@ import pytest
 
 from team.association import AssociationProfile
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.auditing import fold_tick
 from team.estimation.map_joining.condensed_factor import places
-from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.condensing import Limits, condense_submaps
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from team.estimation.map_joining.memory import MOST, Memory, Observed
-from team.estimation.map_joining.relinearising import relinearised
+from team.estimation.map_joining.relinearising import restore_submaps
 from team.estimation.map_joining.submap_graph import tied
 from tests.estimation.association.unnamed_worlds import (
     circle,
@@ -33,9 +33,9 @@ def laps():
     submaps, truth = drive("r1", circle((0.0, 0.0), 20.0, 24 * LAPS, LAPS), world, rng)
     full = bounded = EMPTY_FOLD
     for submap in submaps:
-        full = taken(full, Tick([submap]), SETTINGS)
-        before = condensed(bounded, lag=4, begin=30)
-        bounded = taken(before, Tick([submap]), SETTINGS)
+        full = fold_tick(full, Tick([submap]), SETTINGS)
+        before = condense_submaps(bounded, Limits(30, lag=4))
+        bounded = fold_tick(before, Tick([submap]), SETTINGS)
     return submaps, truth, full, bounded
 
 
@@ -53,7 +53,7 @@ def _apart(one: Fold, other: Fold) -> float:
 
 def test_the_bounded_fold_unites_the_same_landmarks_as_the_full_one(laps):
     submaps, truth, full, bounded = laps
-    assert bounded.departed > 0.5 * len(submaps)
+    assert bounded.condensed_count > 0.5 * len(submaps)
     assert wrong(bounded.landmarks, truth) == duplicates(bounded.landmarks, truth) == 0
     assert _members(bounded) == _members(full)
     assert _apart(full, bounded) < 1e-2
@@ -101,8 +101,8 @@ def test_landmarks_that_become_one_do_so_in_what_is_condensed_exactly(laps):
 
 def test_what_is_linearised_again_has_the_identities_that_were_found(laps):
     submaps, _, full, bounded = laps
-    again = relinearised(bounded, submaps, [])
-    assert again.departed == 0
+    again = restore_submaps(bounded, submaps, [])
+    assert again.condensed_count == 0
     assert not again.main.graph.memory.submaps
     assert _apart(full, again) < 1e-6
-    assert _members(condensed(again, lag=4, begin=30)) == _members(full)
+    assert _members(condense_submaps(again, Limits(30, lag=4))) == _members(full)

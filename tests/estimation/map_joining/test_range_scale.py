@@ -12,7 +12,7 @@ from team.estimation.gaussian import packed, unpacked
 from team.estimation.geometry import compose, inverse, transformed
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.condensing import Limits, condense_submaps
 from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
 from team.estimation.map_joining.markers import add_markers
@@ -209,7 +209,7 @@ def test_a_map_says_that_landmarks_without_a_name_lack_the_error_of_their_marker
     )
     fold, _ = hidden(submaps, starts, options)
     island, *_ = settled(fold.main)
-    old = condensed(replace(fold, islands={fold.main_key: island}), lag=2, begin=2)
+    old = condense_submaps(replace(fold, islands={fold.main_key: island}), Limits(2, lag=2))
     assert old.departed
     said = "5 landmarks without a name lack the error of their marker"
     assert [each for each in converged(old, options).warnings if said in each]

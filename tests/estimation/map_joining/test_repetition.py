@@ -9,7 +9,7 @@ from central.config import CentralConfig
 from central.join_messages import reasons, shown_landmarks
 from team.association import AssociationProfile
 from team.estimation.contribution import Contribution
-from team.estimation.map_joining.auditing import taken
+from team.estimation.map_joining.auditing import fold_tick
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from team.estimation.map_joining.repetition import BY_CHANCE, find_repetitions, log_by_chance
 from tests.estimation.association.unnamed_worlds import circle, drive
@@ -34,7 +34,7 @@ def folded(*parts: list[Contribution]) -> Fold:
     for part in parts:
         for each in part:
             own = Contribution("r1", 1, sequence, (sequence + 1) * 10**10, each.local)
-            fold, sequence = taken(fold, Tick([own]), SETTINGS), sequence + 1
+            fold, sequence = fold_tick(fold, Tick([own]), SETTINGS), sequence + 1
     return fold
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from team.estimation.map_joining import landmark_view, marginals
-from team.estimation.map_joining.condensing import condensed
+from team.estimation.map_joining.condensing import Limits, condense_submaps
 from team.estimation.map_joining.gauss_newton import final_cost
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
 from team.estimation.map_joining.minima import degrees_of_freedom
-from team.estimation.map_joining.relinearising import relinearised
+from team.estimation.map_joining.relinearising import restore_submaps
 from tests.estimation.submap_world import team
 
 ROBUST = JoinSettings(robust_c=2.0)
@@ -35,7 +35,7 @@ def folds(found, settings, first, starts=None):
     for start in found.starts if starts is None else starts:
         fold = started(fold, start)
     for tick in ticks_of(found):
-        fold = folded(condensed(fold, 2, begin=0, first=first), tick, settings)
+        fold = folded(condense_submaps(fold, Limits(0, lag=2, first=first)), tick, settings)
         yield fold
 
 
@@ -121,8 +121,8 @@ def test_what_wakes_without_the_others_being_conditioned_on_it_is_seen():
 def test_what_rests_is_there_when_all_is_linearised_again(last):
     found = world(4)
     *_, never = folds(found, JoinSettings(), NEVER)
-    again = relinearised(last, found.submaps, [])
-    other = relinearised(never, found.submaps, [])
+    again = restore_submaps(last, found.submaps, [])
+    other = restore_submaps(never, found.submaps, [])
     assert not at_rest(again)
     a, b = marginals.landmark_map(again), marginals.landmark_map(other)
     assert a.ids.tolist() == b.ids.tolist()
