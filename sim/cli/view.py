@@ -25,7 +25,7 @@ from sim.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from central.desk.view.session import Shown
+    from central.desk.view.server import Shown
     from team.recording.reader import Log
 
 _LOG = logging.getLogger("teamslam")
@@ -114,7 +114,7 @@ def shown_on_page(
     log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
 ) -> Iterator["Shown"]:
     """Serve a log, print where, and open the page if that is requested or there is a display."""
-    from central.desk.view.session import session
+    from central.desk.view.server import session
 
     with session(log, host, port, foxglove_port, growing=growing) as shown:
         typer.echo(f"page      {shown.url}")
