@@ -174,15 +174,10 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from rich.table import Table
     from rich.text import Text
 
+    from central.desk.compare import compare_rows, draw_maps, largest_move_m, same_final_map
     from central.desk.evaluation.evaluation import evaluate, to_json
     from central.desk.evaluation.history import history
     from central.desk.evaluation.states import not_in_the_map
-    from central.desk.side_by_side import (
-        comparison_picture,
-        comparison_rows,
-        largest_move_m,
-        same_final_map,
-    )
     from central.desk.verification.recorded import RerunError
     from sim.cli.importing import readable
     from sim.recorded.changed_run import changed_run
@@ -200,10 +195,10 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         changed = recorded if plain else evaluate(computed)
     except RerunError as error:
         fail(f"{path}: {error}", FAILED)
-    columns = ("", "computed") if plain else ("", "recorded", "recomputed")
-    table = Table(*columns)
-    for row in comparison_rows(recorded, changed):
-        table.add_row(*(Text(cell) for cell in row[: len(columns)]))
+    runs = {"computed": changed} if plain else {"recorded": recorded, "recomputed": changed}
+    table = Table("", *runs)
+    for figure, cells in compare_rows(runs):
+        table.add_row(Text(figure), *map(Text, cells))
     console = Console()
     console.print(table)
     _print_warnings(recorded, changed, history(computed), console)
@@ -224,7 +219,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         picture = output / "maps.png"
-        if comparison_picture(recorded, changed, picture):
+        if draw_maps({"recorded": recorded, "recomputed": changed}, picture):
             console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
     if changed.map is None:
         fail("the changed run ended without a final map", FAILED)
