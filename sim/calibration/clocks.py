@@ -19,7 +19,7 @@ from central.desk.evaluation.errors import Path, on_circle
 from sim.calibration.claims import measured_and_true
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import Figure, huber, jackknifed
-from sim.world.streams import RobotStream, WorldStreams, robot_stream
+from sim.world.streams import RobotStream, WorldStreams
 from team.config import Sensor
 
 LEAST = 200
@@ -103,17 +103,12 @@ def _moved(stream: RobotStream, clock: Clock) -> RobotStream:
         for each in (stream.landmark_detections, stream.teammate_detections)
     )
     first_ns = int((intervals.end_ns - intervals.duration_ns)[0])
-    return robot_stream(
-        robot=stream.robot,
-        start_ns=min(int(stream.stamps_ns[0]) - seen_ns, first_ns),
-        start=stream.start,
+    return replace(
+        stream,
+        start_ns=min(stream.start_ns - seen_ns, first_ns),
         intervals=intervals,
-        observations=observations,
-        sightings=sightings,
-        teammates=stream.teammates,
-        truth_ns=stream.truth_ns,
-        truth=stream.truth,
-        notes=stream.notes,
+        landmark_detections=observations,
+        teammate_detections=sightings,
     )
 
 

@@ -35,7 +35,6 @@ from sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
-    robot_stream,
 )
 from team.config import RobotConfig
 
@@ -226,13 +225,13 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
 
 def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
     known = len(read.truth) > 0
-    return robot_stream(
+    return RobotStream(
         robot=read.robot,
         start_ns=read.start_ns,
         start=None if starts_unknown(world, read.robot) else read.start,
         intervals=read.intervals,
-        observations=together(_with_empty(read.seen.grouped(), read.empty_ns), read.unnamed),
-        sightings=read.teammates.grouped(),
+        landmark_detections=together(_with_empty(read.seen.grouped(), read.empty_ns), read.unnamed),
+        teammate_detections=read.teammates.grouped(),
         teammates=tuple(clocks),
         truth_ns=read.truth_ns if known else None,
         truth=read.truth if known else None,

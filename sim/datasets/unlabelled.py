@@ -26,7 +26,6 @@ from sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
-    robot_stream,
 )
 
 FILES = ("odometry.csv", "detections.csv")
@@ -129,15 +128,15 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     notes = [f"{outside} scans are outside the time of the odometry"] if outside else []
     if form == CAR:
         notes += pace_notes(intervals.duration_ns)
-    return robot_stream(
+    return RobotStream(
         robot="r1",
         start_ns=start_ns,
         start=StartPose(np.zeros(3), None),
         intervals=intervals,
-        observations=seen,
-        sightings=_nothing(),
+        landmark_detections=seen,
+        teammate_detections=_nothing(),
         teammates=("r1",),
-        notes=notes,
+        notes=tuple(notes),
         positions_ns=gps_ns,
         positions=gps,
     )
@@ -332,13 +331,13 @@ def _piece(
     if gps_ns is not None and gps is not None:
         inside = (gps_ns >= begin_ns) & (gps_ns <= end_ns)
         gps_ns, gps = gps_ns[inside] - back, gps[inside]
-    return robot_stream(
+    return RobotStream(
         robot=names[index],
         start_ns=zero_ns,
         start=None,
         intervals=replace(own, end_ns=own.end_ns - back),
-        observations=replace(mine, stamps_ns=mine.stamps_ns - back),
-        sightings=_nothing(),
+        landmark_detections=replace(mine, stamps_ns=mine.stamps_ns - back),
+        teammate_detections=_nothing(),
         teammates=names,
         notes=(*whole.notes, f"it begins {back * 1e-9:.2f} s into the log"),
         positions_ns=gps_ns,

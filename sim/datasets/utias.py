@@ -17,7 +17,7 @@ from sim.datasets.tables import EXPECTED, DatasetError, File, opened, optional_t
 from sim.datasets.utias_log import Log, log_of, present_robots
 from sim.datasets.utias_rows import start_pose
 from sim.world.config import UtiasWorld, starts_unknown
-from sim.world.streams import RobotStream, StartPose, WorldStreams, grouped, robot_stream
+from sim.world.streams import RobotStream, StartPose, WorldStreams, grouped
 from team.config import RobotConfig
 
 ROBOTS = 5
@@ -108,14 +108,16 @@ def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: 
     seen = log.measurements.where(log.measurements.subjects > last_robot)
     teammates = log.measurements.where(log.measurements.subjects <= last_robot)
     index = (teammates.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
-    return robot_stream(
+    return RobotStream(
         robot=log.robot,
         start_ns=log.start_ns,
         start=_start(world, log),
         intervals=log.intervals,
-        observations=grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
-        sightings=grouped(teammates.stamps_ns, index, teammates.ranges, teammates.bearings),
-        teammates=robots,
+        landmark_detections=grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
+        teammate_detections=grouped(
+            teammates.stamps_ns, index, teammates.ranges, teammates.bearings
+        ),
+        teammates=tuple(robots),
         truth_ns=log.truth_ns if len(log.truth) else None,
         truth=log.truth if len(log.truth) else None,
         notes=(*log.notes, *_truth_notes(log)),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams, with_observations
+from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def _hidden(
         untagged = _with_clutter(untagged, hiding, rng)
     both = in_order([*parts, untagged])
     # A scan that saw nothing stays a measurement, whichever kind it is.
-    return with_observations(stream, both)
+    return replace(stream, landmark_detections=both)
 
 
 def _rows(

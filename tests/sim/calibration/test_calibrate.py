@@ -33,13 +33,11 @@ from sim.recorded.streams import recorded_streams
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.world.config import SimulatedWorld, UtiasWorld
 from sim.world.streams import (
-    ODOMETRY,
     Detections,
     Intervals,
     RobotStream,
     WorldStreams,
     grouped,
-    robot_stream,
 )
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
@@ -334,11 +332,10 @@ def test_the_joined_teams_paths_and_landmarks_lie_where_the_robots_were() -> Non
 def test_a_team_without_submaps_is_an_error_with_a_text() -> None:
     team = scenario(robots=2)
     world = streams(team)
-    standing = []
-    for stream in world.streams:
-        left = stream.kinds != ODOMETRY
-        kinds, stamps, rows = (each[left] for each in (stream.kinds, stream.stamps_ns, stream.rows))
-        standing.append(replace(stream, kinds=kinds, stamps_ns=stamps, rows=rows))
+    standing = [
+        replace(s, intervals=s.intervals.where(np.zeros(len(s.intervals.end_ns), np.bool_)))
+        for s in world.streams
+    ]
     with pytest.raises(CalibrationError, match="no robot has odometry and measurements"):
         joined_team(replace(world, streams=tuple(standing)), team)
 
@@ -355,15 +352,7 @@ def logged_often(world: WorldStreams, pieces: int) -> WorldStreams:
         often = Intervals(
             ends, durations, np.repeat(each.forward, pieces), np.repeat(each.yaw_rate, pieces)
         )
-        return robot_stream(
-            robot=stream.robot,
-            start_ns=int(ends[0] - step[0]),
-            start=stream.start,
-            intervals=often,
-            observations=stream.landmark_detections,
-            sightings=stream.teammate_detections,
-            teammates=stream.teammates,
-        )
+        return replace(stream, start_ns=int(ends[0] - step[0]), intervals=often)
 
     return replace(world, streams=tuple(of(each) for each in world.streams))
 
