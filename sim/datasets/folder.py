@@ -26,6 +26,7 @@ from sim.datasets.csv_table import CsvTable, read_table
 from sim.datasets.detections_table import detections_of, together
 from sim.datasets.folder_files import EXPECTED, left_out, opened_folder, shown
 from sim.datasets.folder_odometry import intervals_of
+from sim.datasets.scans import Scans
 from sim.datasets.some_rows import POSE_COVARIANCE
 from sim.datasets.tables import DatasetError, File
 from sim.world.config import FolderWorld, starts_unknown
@@ -117,9 +118,9 @@ class RobotRows:
     robot: str
     start: StartPose | None
     intervals: Intervals
-    seen: rows.Scans
+    seen: Scans
     empty_ns: Int64[np.ndarray, " E"]
-    teammates: rows.Scans
+    teammates: Scans
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]

@@ -12,8 +12,8 @@ from sim.datasets.folder_tables import (
     STEERED,
     Rows,
 )
+from sim.datasets.scans import on_circle
 from sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
-from sim.datasets.utias_rows import on_circle
 from sim.world.streams import Intervals, moved
 from team.config import Bounds
 from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S

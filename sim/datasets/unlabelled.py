@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.detections_table import labels_of, scans_of
 from sim.datasets.folder_odometry import pace_notes
 from sim.datasets.tables import DatasetError
 from sim.world.config import UnlabelledWorld
@@ -108,7 +109,9 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     odometry, detections = (
         _table(root, name, *needed) for name, needed in zip(FILES, (form, seen_form), strict=True)
     )
-    labels = _labels(root, len(detections))
+    labels = labels_of(
+        _table(root, "labels.csv") if (root / "labels.csv").is_file() else None, len(detections)
+    )
     take = _of_car if form == CAR else _of_steps
     intervals, seen = take(odometry, detections, labels)
     if not len(intervals.end_ns):
@@ -162,7 +165,7 @@ def _of_car(
     )
     polar = detections.numbers("range_m", "bearing_rad")
     diameters = detections.numbers("diameter_m")[:, 0] if detections.has("diameter_m") else None
-    return intervals, _scans(detections, seen_ns, polar, labels, None, diameters)
+    return intervals, scans_of(detections, seen_ns, *_columns(polar), labels, None, diameters)
 
 
 def _of_steps(
@@ -184,7 +187,14 @@ def _of_steps(
     own = detections.numbers("c_xx", "c_xy", "c_yy")
     polar, claimed = _polar(points, own)
     stamps = (_steps(detections) + 1) * STEP_NS
-    return intervals, _scans(detections, stamps, polar, labels, claimed, None)
+    return intervals, scans_of(detections, stamps, *_columns(polar), labels, claimed, None)
+
+
+def _columns(
+    polar: Float[np.ndarray, "R 2"],
+) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+    """Ranges, and bearings in (−π, π]."""
+    return polar[:, 0].copy(), np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi)
 
 
 def _in_the_end(
@@ -216,43 +226,6 @@ def _polar(
     rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / ranges
     bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (ranges * ranges)
     return np.column_stack((ranges, np.arctan2(y, x))), np.column_stack((rr, rb, bb))
-
-
-def _scans(
-    table: CsvTable,
-    stamps: Int64[np.ndarray, " R"],
-    polar: Float[np.ndarray, "R 2"],
-    labels: UInt32[np.ndarray, " R"],
-    covariances: Float[np.ndarray, "R 3"] | None,
-    signatures: Float[np.ndarray, " R"] | None,
-) -> Detections:
-    """One message for each stamp; its rows in the order of the table."""
-    if (np.diff(stamps) < 0).any():
-        raise table.fault("its rows are not in order of time")
-    if (polar[:, 0] < 0.0).any():
-        raise table.fault("a range is negative")
-    first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
-    return Detections(
-        stamps_ns=stamps[first],
-        offsets=np.append(first, len(stamps)).astype(np.int64),
-        ids=labels,
-        ranges=polar[:, 0].copy(),
-        bearings=np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi),
-        points=None,
-        covariances=covariances,
-        hidden=np.ones(len(first), np.bool_),
-        signatures=signatures,
-    )
-
-
-def _labels(root: Path, rows: int) -> UInt32[np.ndarray, " R"]:
-    if not (root / "labels.csv").is_file():
-        return np.full(rows, NO_LABEL, np.uint32)
-    table = _table(root, "labels.csv", "landmark")
-    labels = table.numbers("landmark")[:, 0].astype(np.int64)
-    if len(labels) != rows:
-        raise table.fault(f"{len(labels)} rows, {rows} in detections.csv: row by row, one for each")
-    return np.where(labels < 0, NO_LABEL, labels).astype(np.uint32)
 
 
 def _named(seen: Detections) -> Detections:

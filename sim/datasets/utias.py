@@ -7,6 +7,7 @@ What is not handed out is dropped, and counted in the notes with its reason.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from sim.datasets.tables import EXPECTED, DatasetError, File, opened, optional_t
 from sim.datasets.utias_log import Log, log_of, present_robots
 from sim.datasets.utias_rows import start_pose
 from sim.world.config import UtiasWorld, starts_unknown
-from sim.world.streams import RobotStream, StartPose, WorldStreams, grouped
+from sim.world.streams import RobotStream, StartPose, WorldStreams
 from team.config import RobotConfig
 
 ROBOTS = 5
@@ -101,22 +102,20 @@ def _landmarks(
 def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: int) -> RobotStream:
     robots = list(clocks)
     numbers = np.array([int(robot[1:]) for robot in robots], dtype=np.uint32)
-    log = log.without(log.measurements.subjects == log.subject, "of itself")
-    subjects = log.measurements.subjects
+    log = log.without(log.measurements.ids == log.subject, "of itself")
+    subjects = log.measurements.ids
     stranger = (subjects <= last_robot) & ~np.isin(subjects, numbers)
     log = log.without(stranger, "of a robot that is not in the team")
-    seen = log.measurements.where(log.measurements.subjects > last_robot)
-    teammates = log.measurements.where(log.measurements.subjects <= last_robot)
-    index = (teammates.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
+    seen = log.measurements.where(log.measurements.ids > last_robot)
+    teammates = log.measurements.where(log.measurements.ids <= last_robot)
+    index = (teammates.ids[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
     return RobotStream(
         robot=log.robot,
         start_ns=log.start_ns,
         start=_start(world, log),
         intervals=log.intervals,
-        landmark_detections=grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
-        teammate_detections=grouped(
-            teammates.stamps_ns, index, teammates.ranges, teammates.bearings
-        ),
+        landmark_detections=seen.grouped(),
+        teammate_detections=replace(teammates, ids=index).grouped(),
         teammates=tuple(robots),
         truth_ns=log.truth_ns if len(log.truth) else None,
         truth=log.truth if len(log.truth) else None,

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from sim.datasets.scans import Scans, counted
 from sim.datasets.tables import DatasetError, File, optional_table
-from sim.datasets.utias_rows import Measurements, counted, intervals_of, measurements_of, truth_of
+from sim.datasets.utias_rows import intervals_of, measurements_of, truth_of
 from sim.world.streams import Intervals
 
 TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
@@ -24,7 +25,7 @@ class Log:
     subject: int
     start_ns: int
     intervals: Intervals
-    measurements: Measurements
+    measurements: Scans
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]

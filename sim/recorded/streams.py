@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.datasets.utias_rows import counted
+from sim.datasets.scans import counted
 from sim.recorded.forms import forms_of, intervals_of, landmarks_of
 from sim.scenarios.scenario import Scenario, ScenarioError, loads
 from sim.world.streams import (
