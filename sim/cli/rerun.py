@@ -308,10 +308,10 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
 def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console
-    from rich.table import Table
 
     from central.desk.ledger import ledger
     from central.desk.names import in_order
+    from central.desk.report.tables import disposition_sheet, terminal_table
     from central.desk.verification.recorded import RerunError, recorded
     from team.recording.reader import open_log
 
@@ -322,15 +322,9 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     except RerunError as error:
         fail(f"{log}: {error}", FAILED)
     robots = in_order({robot for robot, _ in found.entries})
-    table = Table("disposition")
-    for robot in [*robots, "all"]:
-        table.add_column(robot, justify="right")
-    of_robots = [found.totals(robot) for robot in robots]
-    for disposition, count in found.totals().items():
-        counts = [*(totals.get(disposition, 0) for totals in of_robots), count]
-        table.add_row(disposition, *(f"{n:,}" for n in counts))
     console = Console()
-    console.print(table)
+    sheet = disposition_sheet({robot: found.totals(robot) for robot in robots})
+    console.print(terminal_table(sheet))
     used = sum(1 for maps in found.maps.values() if maps)
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
     if not opened.complete:

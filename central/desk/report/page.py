@@ -22,28 +22,15 @@ from central.desk.pictures.time import (
     timeline_picture,
     traffic_picture,
 )
-from central.desk.report.identities import (
-    DECISION_HEADINGS,
-    DECISION_NOTE,
-    SCORE_HEADINGS,
-    decision_rows,
-    score_note,
-    score_rows,
-)
+from central.desk.report.identities import decision_sheet, score_sheet
 from central.desk.report.run import Run
 from central.desk.report.tables import (
-    OWN_HEADINGS,
-    OWN_NOTE,
-    PATH_HEADINGS,
-    PATH_NOTE,
-    PEER_HEADINGS,
-    PEER_NOTE,
-    ROBOT_HEADINGS,
-    own_rows,
-    path_row,
-    peer_rows,
-    robot_note,
-    robot_row,
+    Sheet,
+    disposition_sheet,
+    own_sheet,
+    path_sheet,
+    peer_sheet,
+    robot_sheet,
     shown,
     team_rows,
     title_of,
@@ -176,19 +163,14 @@ def _page(
 
 def _identities(run: Run) -> list[str]:
     """The section on landmarks without names: scores, closures and merges."""
-    parts = []
-    if (found := run.evaluation.association) is not None:
-        parts += [_table(SCORE_HEADINGS, score_rows(found)), _note(score_note(found))]
-    if decisions := run.evaluation.decisions:
-        parts += [_table(DECISION_HEADINGS, decision_rows(decisions)), _note(DECISION_NOTE)]
-    return parts
+    evaluation = run.evaluation
+    parts = [] if evaluation.association is None else _sheet(score_sheet(evaluation.association))
+    return parts + (_sheet(decision_sheet(evaluation.decisions)) if evaluation.decisions else [])
 
 
 def _peers(run: Run) -> list[str]:
     """Each robot's copy of the team's set, where there are peers."""
-    if not run.evaluation.peers:
-        return []
-    return [_table(PEER_HEADINGS, peer_rows(run.evaluation)), _note(PEER_NOTE)]
+    return _sheet(peer_sheet(run.evaluation)) if run.evaluation.peers else []
 
 
 def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
@@ -204,7 +186,7 @@ def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]
         )
         for name, took in processes.items()
     ]
-    return [_table(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows), _note(PSS_NOTE)]
+    return _sheet(Sheet(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows, PSS_NOTE))
 
 
 def _notes(run: Run) -> str:
@@ -213,21 +195,13 @@ def _notes(run: Run) -> str:
 
 def _own_maps(run: Run) -> list[str]:
     """The robots' own maps, where there is no fused map."""
-    if not unfused(run.evaluation):
-        return []
-    return [_table(OWN_HEADINGS, own_rows(run.evaluation)), _note(OWN_NOTE)]
+    return _sheet(own_sheet(run.evaluation)) if unfused(run.evaluation) else []
 
 
 def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    arbitrary = run.evaluation.arbitrary_frame
-    rows = [robot_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
-    if not rows:
+    if not run.evaluation.robots:
         return []
-    return [
-        _table(ROBOT_HEADINGS, rows),
-        _note(robot_note(run.evaluation)),
-        _image(pictures, "errors"),
-    ]
+    return [*_sheet(robot_sheet(run.evaluation)), _image(pictures, "errors")]
 
 
 def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -263,13 +237,13 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "online\nNEES/dof",
         "in\n95 %",
     )
-    return [_table(headings, filled), _note(NIS_NOTE), _image(pictures, "consistency")]
+    return [*_sheet(Sheet(headings, filled, NIS_NOTE)), _image(pictures, "consistency")]
 
 
 def _paths(run: Run) -> list[str]:
     arbitrary = run.evaluation.arbitrary_frame
-    rows = [path_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
-    if all(cell in {"–", OUTSIDE} for row in rows for cell in row[1:]):
+    sheet = path_sheet(run.evaluation)
+    if all(cell in {"–", OUTSIDE} for row in sheet.rows for cell in row[1:]):
         return []
     absolute = [
         (
@@ -292,14 +266,14 @@ def _paths(run: Run) -> list[str]:
         "RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
         "evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum gives the same."
     )
-    return [_table(PATH_HEADINGS, rows), _note(PATH_NOTE), _table(headings, absolute), _note(note)]
+    return [*_sheet(sheet), *_sheet(Sheet(headings, absolute, note))]
 
 
 def _measurements(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
-        tables = [_dispositions(ledgers)] if any(ledgers.values()) else []
+        tables = _sheet(disposition_sheet(ledgers)) if any(ledgers.values()) else []
         return [*tables, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
@@ -309,18 +283,9 @@ def _measurements(run: Run) -> list[str]:
         verdict = f"{len(ledger.offenders)} offenders: {'; '.join(ledger.offenders[:5])}"
     return [
         f'<p class="{kind}">Ledger: {escape(verdict)}.</p>',
-        _dispositions({robot: ledger.totals(robot) for robot in robots}),
+        *_sheet(disposition_sheet({robot: ledger.totals(robot) for robot in robots})),
         _note(f"{len(ledger.maps)} submaps, {used} of them in a map"),
     ]
-
-
-def _dispositions(ledgers: Mapping[str, Mapping[str, int]]) -> str:
-    """A row for each disposition, a column for each robot."""
-    rows = []
-    for disposition in sorted(set().union(*ledgers.values())):
-        counts = [of.get(disposition, 0) for of in ledgers.values()]
-        rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
-    return _table(("disposition", *ledgers, "all"), rows)
 
 
 def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -355,7 +320,7 @@ def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "Wall time [s] from the publication of a submap's last and first measurement to that of "
         "the first map that used it, by the publishers' clocks."
     )
-    return [_table(headings, rows), _note(note), _image(pictures, "latency")]
+    return [*_sheet(Sheet(headings, rows, note)), _image(pictures, "latency")]
 
 
 def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -401,6 +366,11 @@ def _image(pictures: Mapping[str, Path], name: str, *, wide: bool = True) -> str
 
 def _note(text: str) -> str:
     return f'<p class="note">{escape(text)}</p>'
+
+
+def _sheet(sheet: Sheet) -> list[str]:
+    """A table, and its note below it."""
+    return [_table(sheet.headings, sheet.rows), *([_note(sheet.note)] if sheet.note else [])]
 
 
 def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, words: bool = False) -> str:

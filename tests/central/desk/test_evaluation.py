@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from central.desk.compare import compare_picture, compare_rows
 from central.desk.evaluation.errors import Path, interpolated, map_errors, moved, pose_errors
 from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.report.tables import robot_note, robot_row, team_rows, title_of
+from central.desk.report.tables import robot_sheet, team_rows, title_of
 from sim.scenarios.scenario import Scenario
 from sim.world.config import FolderWorld
 from team.estimation.consistency import chi2_interval, nees, state_error
@@ -566,18 +566,18 @@ def test_the_table_tells_used_from_rejected_and_open_measurements() -> None:
     assert (used.used, used.rejected, used.open) == (
         published - 6, {"no pose node near it": 3}, 3
     )  # fmt: skip
-    assert robot_row("r1", run.robots["r1"])[2] == f"{published - 6} of {published}"
-    assert robot_note(run).endswith("; r1: 3 rejected (no pose node near it), 3 open")
+    assert robot_sheet(run).rows[0][2] == f"{published - 6} of {published}"
+    assert robot_sheet(run).note.endswith("; r1: 3 rejected (no pose node near it), 3 open")
     figures = to_json(run)["robots"]["r1"]
     assert figures["measurements_rejected"] == {"no pose node near it": 3}
     assert (figures["measurements_used"], figures["measurements_open"]) == (published - 6, 3)
     every = evaluate(
         world_log(scenario()) + samples([done(published, (("in a submap", published),))])
     )
-    assert robot_row("r1", every.robots["r1"])[2] == f"{published} of {published}"
-    assert "rejected" not in robot_note(every)
+    assert robot_sheet(every).rows[0][2] == f"{published} of {published}"
+    assert "rejected" not in robot_sheet(every).note
     without = evaluate(world_log(scenario()))
-    assert robot_row("r1", without.robots["r1"])[2] == f"– of {published}"
+    assert robot_sheet(without).rows[0][2] == f"– of {published}"
 
 
 def test_a_run_on_a_data_set_is_titled_with_its_name() -> None:
