@@ -104,8 +104,7 @@ def verdict(
     until it is withdrawn.
     """
     from central.desk.evaluation.verdicts import contradicting, in_words
-    from central.desk.orders import NoRobotError, WithdrawError
-    from central.desk.verdicts import judge, local_landmark
+    from central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
     from team.wire.messages import Judgement
 
     if word not in ("same", "different"):

@@ -11,9 +11,8 @@ from central.config import CentralConfig
 from central.desk import orders
 from central.desk.evaluation.evaluation import evaluate
 from central.desk.evaluation.verdicts import contradicting
-from central.desk.orders import WithdrawError, give_up, withdraw
+from central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
 from central.desk.report.tables import team_rows
-from central.desk.verdicts import judge, local_landmark
 from central.node import CentralNode
 from sim.cli.main import app
 from team.wire import channels as ch
