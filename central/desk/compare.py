@@ -20,7 +20,7 @@ from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResul
 from central.desk.names import OUTSIDE, in_order
 from central.desk.pictures.run import new_figure
 from central.desk.pictures.style import save
-from central.desk.report.tables import shown
+from central.desk.report.tables import format_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -143,7 +143,7 @@ def _draw_map(axis: "Axes", fused: MapResult, colour: str, label: str, marker: s
 
 def _of_map(name: str, form: str) -> Callable[[Evaluation], str]:
     """A figure of the final map."""
-    return lambda run: shown(None if run.map is None else getattr(run.map, name), form, "")
+    return lambda run: format_figure(None if run.map is None else getattr(run.map, name), form, "")
 
 
 def _of_map_errors(name: str, form: str) -> Callable[[Evaluation], str]:
@@ -153,7 +153,7 @@ def _of_map_errors(name: str, form: str) -> Callable[[Evaluation], str]:
         errors = None if run.map is None else run.map.errors
         if errors is None or (run.arbitrary_frame and name != "aligned_rmse_m"):
             return "–"
-        return shown(getattr(errors, name), form, "")
+        return format_figure(getattr(errors, name), form, "")
 
     return cell
 
@@ -167,7 +167,7 @@ def _of_path(
         if kind == "online" and robot.outside:
             return OUTSIDE
         errors = None if run.arbitrary_frame else getattr(robot, kind)
-        return shown(None if errors is None else convert(getattr(errors, name)), form, "")
+        return format_figure(None if errors is None else convert(getattr(errors, name)), form, "")
 
     return cell
 
@@ -197,10 +197,10 @@ _TEAM: Sequence[tuple[str, Callable[[Evaluation], str]]] = (
 )
 _ROBOT: Sequence[tuple[str, Callable[[Evaluation, RobotResult], str]]] = (
     ("online position RMSE [m]", _of_path("online", "position_rmse_m", ".4f")),
-    ("… aligned [m]", lambda _, robot: shown(robot.online_aligned_rmse_m, ".4f", "")),
+    ("… aligned [m]", lambda _, robot: format_figure(robot.online_aligned_rmse_m, ".4f", "")),
     ("smoothed position RMSE [m]", _of_path("smoothed", "position_rmse_m", ".4f")),
-    ("… aligned, smoothed [m]", lambda _, robot: shown(robot.aligned_rmse_m, ".4f", "")),
+    ("… aligned, smoothed [m]", lambda _, robot: format_figure(robot.aligned_rmse_m, ".4f", "")),
     ("heading RMSE, smoothed [°]", _of_path("smoothed", "heading_rmse_rad", ".3f", degrees)),
     ("pose NEES per dof", _of_path("smoothed", "nees_per_dof", ".3g")),
-    ("uplink [bytes/step]", lambda _, robot: shown(robot.uplink_bytes_per_step, ".1f", "")),
+    ("uplink [bytes/step]", lambda _, robot: format_figure(robot.uplink_bytes_per_step, ".1f", "")),
 )

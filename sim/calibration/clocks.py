@@ -18,7 +18,7 @@ from jaxtyping import Float, Int64
 from central.desk.evaluation.errors import Path, on_circle
 from sim.calibration.claims import measured_and_true
 from sim.calibration.data import Reference, poses_at
-from sim.calibration.figures import Figure, huber, jackknifed
+from sim.calibration.figures import Figure, huber, jackknife
 from sim.world.streams import RobotStream, WorldStreams
 from team.config import Sensor
 
@@ -64,7 +64,7 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
             robots.setdefault(each.robot, []).append(each)
     found = {}
     for robot, own in sorted(robots.items()):
-        figures = {each.name: each for each in jackknifed(_fit_of(sensor), own, UNITS)}
+        figures = {each.name: each for each in jackknife(_fit_of(sensor), own, UNITS)}
         if len(figures) == len(UNITS):
             found[robot] = Clock(**figures)
     return found

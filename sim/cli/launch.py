@@ -379,10 +379,10 @@ def _conclude(
     """Evaluate the log, print the result and write the report; ends with 1 if anything failed."""
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
+    from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
     from central.desk.evaluation.history import history
     from central.desk.evaluation.states import not_in_the_map
-    from central.desk.export.take_home import taken_home
+    from central.desk.export.take_home import take_home
     from central.desk.names import in_order
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
@@ -410,7 +410,7 @@ def _conclude(
     try:
         log = replace(open_log(outcome.log), reading=steps.share)
         plain = evaluate(log.samples())
-        evaluation = with_holes(plain, log)
+        evaluation = add_holes(plain, log)
     except (LogError, OSError) as error:
         outcome.failures += [*outcome.deaths, f"the log can not be evaluated: {error}"]
         figures = extra
@@ -424,7 +424,7 @@ def _conclude(
             steps.begin("reading what the robots received")
             messages = recorded(log)
             steps.begin("smoothing the paths")
-            home = taken_home(messages, steps.robot)
+            home = take_home(messages, steps.robot)
             steps.begin("reading the run's history")
             run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
             typer.echo("drawing the pictures and writing the report", err=True)

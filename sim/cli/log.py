@@ -12,7 +12,7 @@ from sim.cli.options import (
     FAILED,
     WRONG_USE,
     LogArgument,
-    counted,
+    count_noun,
     fail,
     refuse_existing,
     tell_holes,
@@ -66,11 +66,11 @@ def info(
 
     from team.recording.check import holes
     from team.recording.reader import open_log
-    from team.recording.summary import summarised
+    from team.recording.summary import summarise_log
 
     opened = open_log(log)
     lacks = holes(opened)
-    summary = summarised(opened)
+    summary = summarise_log(opened)
     span = summary.span_ns()
     console = Console()
     messages, size = (sum(getattr(k, name) for k in summary.keys) for name in ("messages", "bytes"))
@@ -107,10 +107,10 @@ def check(log: LogArgument) -> None:
 
     Exit status 1 when anything is wrong; each finding is one line.
     """
-    from team.recording.check import checked
+    from team.recording.check import check_log
     from team.recording.reader import open_log
 
-    findings = checked(open_log(log))
+    findings = check_log(open_log(log))
     for finding in findings:
         typer.echo(one_line(str(finding)))
     if findings:
@@ -202,7 +202,7 @@ def export(
         return
     exported = _exporter(form)(opened, output, chosen)
     for path, rows in exported.rows.items():
-        typer.echo(f"{path}: {counted(rows, 'row')}")
+        typer.echo(f"{path}: {count_noun(rows, 'row')}")
     if exported.unsound:
         typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
 

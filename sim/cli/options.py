@@ -114,7 +114,7 @@ def check_pieces(scenario: Scenario) -> None:
         )
 
 
-def connected(
+def connect_bus(
     team: str,
     connect: str,
     keys: Path | None,
@@ -194,7 +194,7 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
     for finding in found[:MOST_HOLES]:
         typer.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:
-        more = counted(len(found) - MOST_HOLES, "more finding")
+        more = count_noun(len(found) - MOST_HOLES, "more finding")
         typer.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
 
 
@@ -210,7 +210,7 @@ def set_aside(file: Path) -> Path:
     return aside
 
 
-def counted(count: int, what: str) -> str:
+def count_noun(count: int, what: str) -> str:
     """A count with its noun: `1 robot`, `3 robots`."""
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 

@@ -12,7 +12,7 @@ from sim.cli.options import (
     Keys,
     TeamOption,
     check_names,
-    connected,
+    connect_bus,
     fail,
     signer_of,
 )
@@ -40,7 +40,7 @@ def map_(
     from team.wire.codec import decoded
     from team.wire.messages import FoldRequest, FusedMap
 
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
         except BusError as error:
@@ -73,7 +73,7 @@ def withdraw(
     from central.desk.orders import withdraw as order
 
     check_names(team, robot)
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
         except WithdrawError as error:
@@ -116,7 +116,7 @@ def verdict(
         fail(str(error), WRONG_USE)
     if one == two:
         fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             judgement = Judgement(first=one, second=two, same=word == "same")
             signer = signer_of(keys, "operator", team)
@@ -167,7 +167,7 @@ def end(
     from central.desk.orders import WithdrawError, end_team, give_up
 
     check_names(team, without)
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             if without is None:
                 end_team(bus, reason, patience)

@@ -15,8 +15,8 @@ from sim.cli.options import (
     Keys,
     LogArgument,
     SpeedText,
-    connected,
-    counted,
+    connect_bus,
+    count_noun,
     fail,
     parsed_speed,
     refuse_existing,
@@ -71,7 +71,7 @@ def replay(
     with (
         process("replay") as stop,
         hub as endpoint,
-        connected(opened.team, endpoint, keys, "replay", stop) as bus,
+        connect_bus(opened.team, endpoint, keys, "replay", stop) as bus,
     ):
         if connect is None:
             typer.echo(f"listening at {endpoint}", err=True)
@@ -110,9 +110,9 @@ def report(
     """A page, pictures, tables and figures of a run, from its log alone."""
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
+    from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
     from central.desk.evaluation.history import history
-    from central.desk.export.take_home import taken_home
+    from central.desk.export.take_home import take_home
     from central.desk.report.page import write_pictures, write_report
     from central.desk.report.run import Run, nis_line, run_figures
     from central.desk.report.tables import summary_tables
@@ -124,13 +124,13 @@ def report(
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
     steps.begin("scoring the run")
-    evaluation = with_holes(evaluate(opened.samples()), opened)
+    evaluation = add_holes(evaluate(opened.samples()), opened)
     steps.begin("reading what the robots received")
     messages = recorded(opened)
     found, why = _ledger(messages, steps) if ledger else (None, Run.no_ledger)
     console = Console()
     steps.begin("smoothing the paths")
-    home = taken_home(messages, steps.robot)
+    home = take_home(messages, steps.robot)
     steps.begin("reading the run's history")
     run = Run(evaluation, history(opened.samples()), opened.metadata, found, why, home)
     steps.begin("drawing")
@@ -206,19 +206,19 @@ def repair(
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from sim.importing.source import is_own_log
-    from team.recording.bag_repair import bag_repaired
+    from team.recording.bag_repair import repair_bag
     from team.recording.reader import log_file
-    from team.recording.repair import repaired
+    from team.recording.repair import repair_log
 
     refuse_existing(output)
     log = log_file(log)
     if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
-        bag = bag_repaired(log, output)
-        typer.echo(f"{output}: {counted(bag.messages, 'message')}")
+        bag = repair_bag(log, output)
+        typer.echo(f"{output}: {count_noun(bag.messages, 'message')}")
         for damage in bag.damaged:
             typer.echo(f"lost: {damage}", err=True)
         return
-    result = repaired(log, output)
+    result = repair_log(log, output)
     until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
     typer.echo(f"{output}: {result.messages} messages{until}")
     for damage in result.damaged:

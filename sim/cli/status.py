@@ -14,7 +14,7 @@ from sim.cli.options import (
     Keys,
     TeamOption,
     check_names,
-    connected,
+    connect_bus,
     fail,
 )
 
@@ -39,7 +39,7 @@ def status(
 
     check_names(team)
     presence = Presence()
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         presence.take(bus, seconds)
         others = [] if presence.members else bus.other_teams()
     if not presence.members:

@@ -17,7 +17,7 @@ from sim.cli.options import (
     Keys,
     LogArgument,
     ScenarioArgument,
-    connected,
+    connect_bus,
     fail,
     refuse_existing,
     scenario_of,
@@ -54,7 +54,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
     resolved = scenario_of(scenario)
     with (
         process("viewer", endless=True) as stop,
-        connected(resolved.team, connect, keys, "viewer", stop) as bus,
+        connect_bus(resolved.team, connect, keys, "viewer", stop) as bus,
     ):
         _LOG.info("connected to team %s at %s", resolved.team, connect)
         peers = [each.id for each in resolved.robots] if resolved.peers else []

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable, cells_of, read_table
-from sim.datasets.folder_files import shown
+from sim.datasets.folder_files import name_table
 from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
 from sim.datasets.scans import on_circle
 from sim.datasets.some_rows import covariances_of
@@ -135,7 +135,7 @@ def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTabl
     file = place / name
     if not file.is_file():
         return None
-    return read_table(file, shown(place, file, robot), columns)
+    return read_table(file, name_table(place, file, robot), columns)
 
 
 def labels_of(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int64
 from sim.datasets import folder_tables as rows
 from sim.datasets.csv_table import CsvTable, read_table
 from sim.datasets.detections_table import detections_of, together
-from sim.datasets.folder_files import EXPECTED, left_out, opened_folder, shown
+from sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
 from sim.datasets.folder_odometry import intervals_of
 from sim.datasets.scans import Scans
 from sim.datasets.some_rows import POSE_COVARIANCE
@@ -74,7 +74,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
     clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
-    with opened_folder(world.path) as (root, folders):
+    with open_folder(world.path) as (root, folders):
         missing = [name for name in clocks if name not in folders]
         if missing:
             raise DatasetError(
@@ -217,7 +217,7 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     file = place / f"{kind}.csv"
     if not file.is_file():
         return None
-    table = read_table(file, shown(place, file, robot), TABLES[kind])
+    table = read_table(file, name_table(place, file, robot), TABLES[kind])
     for column in REQUIRED[kind]:
         if not table.has(column):
             raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")

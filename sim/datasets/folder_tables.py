@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable
-from sim.datasets.scans import Scans, counted, first_of_each, on_circle
+from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from sim.datasets.some_rows import (
     POSE_COVARIANCE,
     covariances_of,
@@ -87,7 +87,7 @@ class Rows:
 
     def _note(self, count: int, what: str, table: CsvTable, row: int) -> None:
         where = "first at" if count > 1 else "at"
-        note = counted(count, self.thing, what)
+        note = count_note(count, self.thing, what)
         self.notes.append(f"{note} ({table.name}, {where} line {table.lines[row]})")
 
 

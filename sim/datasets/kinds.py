@@ -21,7 +21,7 @@ def kind_of(path: str | Path) -> Kind:
     if (Path(path) / unlabelled.FILES[1]).is_file():
         return "unlabelled"  # reading it says what is missing
     try:
-        with tables.opened(str(path), UTIAS_MARKER):
+        with tables.open_data_set(str(path), UTIAS_MARKER):
             return "utias"
     except tables.MarkerError:
         inner = _with_tables_within(Path(path))

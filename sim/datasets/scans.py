@@ -60,6 +60,6 @@ def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
     return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
 
 
-def counted(count: int, thing: str, what: str) -> str:
+def count_note(count: int, thing: str, what: str) -> str:
     """A note such as "2 measurements dropped: unknown barcode"; empty for none."""
     return f"{count} {thing}{'s' if count != 1 else ''} {what}" if count else ""

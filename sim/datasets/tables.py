@@ -23,7 +23,7 @@ class MarkerError(DatasetError):
 
 
 @contextmanager
-def opened(path: str, marker: str) -> Iterator[Mapping[str, File]]:
+def open_data_set(path: str, marker: str) -> Iterator[Mapping[str, File]]:
     """The files by name of the one folder, in `path` (a folder or zip), that holds `marker`."""
     place = Path(path)
     if not place.exists():

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from sim.datasets.errata import erratum_of
-from sim.datasets.tables import EXPECTED, DatasetError, File, opened, optional_table, table
+from sim.datasets.tables import EXPECTED, DatasetError, File, open_data_set, optional_table, table
 from sim.datasets.utias_log import Log, log_of, present_robots
 from sim.datasets.utias_rows import start_pose
 from sim.world.config import UtiasWorld, starts_unknown
@@ -38,7 +38,7 @@ def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
-    with opened(world.path, "Barcodes.dat") as files:
+    with open_data_set(world.path, "Barcodes.dat") as files:
         clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
         return _streams(world, clocks, files)
 

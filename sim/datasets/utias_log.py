@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from sim.datasets.scans import Scans, counted
+from sim.datasets.scans import Scans, count_note
 from sim.datasets.tables import DatasetError, File, optional_table
 from sim.datasets.utias_rows import intervals_of, measurements_of, truth_of
 from sim.world.streams import Intervals
@@ -32,7 +32,7 @@ class Log:
 
     def without(self, dropped: Bool[np.ndarray, " R"], reason: str) -> "Log":
         """The log without some measurements, and a note that counts them."""
-        note = counted(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
+        note = count_note(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
         notes = (*self.notes, note) if note else self.notes
         return replace(self, measurements=self.measurements.where(~dropped), notes=notes)
 

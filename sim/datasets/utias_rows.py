@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sim.datasets.scans import Scans, counted, first_of_each, on_circle
+from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from sim.world.streams import Intervals
 
 LONG_GAP_NS = 2_000_000_000
@@ -44,8 +44,8 @@ def intervals_of(
         yaw_rate=rows[:-1, 2][lasting],
     )
     notes = [
-        counted(backward, "odometry row", "earlier than the row before: sorted by time"),
-        counted(
+        count_note(backward, "odometry row", "earlier than the row before: sorted by time"),
+        count_note(
             int(np.count_nonzero(~lasting)),
             "odometry row",
             "dropped: another row has the same time, so it lasts no time",
@@ -73,12 +73,12 @@ def measurements_of(
     usable = known & positive
     single = first_of_each(measurements.stamps_ns, measurements.ids, usable)
     notes = (
-        counted(backward, "measurement", "earlier than the row before: sorted by time"),
-        counted(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
-        counted(
+        count_note(backward, "measurement", "earlier than the row before: sorted by time"),
+        count_note(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
+        count_note(
             int(np.count_nonzero(known & ~positive)), "measurement", "dropped: range not above 0"
         ),
-        counted(
+        count_note(
             int(np.count_nonzero(usable & ~single)),
             "measurement",
             "dropped: a second one of the same subject at the same time",
@@ -93,7 +93,9 @@ def truth_of(
     """Ground truth rows (t, x, y, θ) as they are, in order of time."""
     rows, backward = _by_time(rows)
     stamps = nanoseconds(rows[:, 0])
-    notes = [counted(backward, "ground truth row", "earlier than the row before: sorted by time")]
+    notes = [
+        count_note(backward, "ground truth row", "earlier than the row before: sorted by time")
+    ]
     gaps = np.diff(stamps)
     if np.any(gaps > LONG_GAP_NS):
         notes.append(f"ground truth has gaps, the longest of {gaps.max() * 1e-9:.1f} s")

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.importing.bag_topics import UndecidedError, decided, listing
+from sim.importing.bag_topics import UndecidedError, decide_topics, listing
 from sim.importing.tables import RobotTables
 from team.ros2.bags import Bag, opened_bag
 from team.ros2.decoding import (
@@ -35,14 +35,14 @@ class Imported:
     messages: int = 0
 
 
-def imported_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
+def import_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
     """The tables of a bag; raises BagError, UndecidedError.
 
     topics: each robot's topics; None: as their names and types propose them, if there is one way
     only. robot: the name of the bag's only robot.
     """
     with opened_bag(path) as bag:
-        chosen = topics or decided(bag, path, robot)
+        chosen = topics or decide_topics(bag, path, robot)
         _check_present(chosen, bag, path)
         return _translated(bag, chosen, path)
 

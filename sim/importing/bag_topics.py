@@ -37,13 +37,13 @@ class Proposal(NamedTuple):
     warnings: list[str]
 
 
-def proposed_topics(path: Path) -> str:
+def propose_topics(path: Path) -> str:
     """A bag's topics, and a proposal for the file that assigns them; raises BagError."""
     with opened_bag(path) as bag:
         return _question(path, bag, _proposed(bag, None))
 
 
-def decided(bag: Bag, path: Path, robot: str | None) -> Topics:
+def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
     """The topics of each robot by their names and types; raises UndecidedError where they do not
     decide.
     """

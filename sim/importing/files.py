@@ -16,14 +16,14 @@ from sim.datasets.folder_tables import (
     POSES,
 )
 from sim.datasets.tables import DatasetError
-from sim.importing.columns import REQUIRED, TABLES, Map, Table, mapped, proposed
+from sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
 from sim.importing.tables import RobotTables
 
 QUATERNION = 8
 """Number of columns of a trajectory in TUM's format: t x y z qx qy qz qw."""
 
 
-def imported_files(
+def import_files(
     paths: Sequence[Path],
     columns: Map | None,
     robot: str,
@@ -60,7 +60,7 @@ def _by_names(files: dict[str, CsvTable], command: str) -> Map:
         kind = Path(name).stem
         ours = kind in TABLES and set(table.columns) <= set(TABLES[kind])
         if not ours or not all(table.has(each) for each in REQUIRED[kind]):
-            text, lacking = proposed(files)
+            text, lacking = propose_map(files)
             raise DatasetError(
                 f"{name}: its columns are {', '.join(table.columns)}. Which are what? "
                 "Write it into a file, as columns.toml, beginning with this:\n\n"
@@ -98,7 +98,7 @@ def _take(
                 f"({whole.name}, first at line {whole.lines[first]})"
             )
             whole = whole.rows(chosen)
-    found = mapped(whole, table.columns)
+    found = map_columns(whole, table.columns)
     if kind == "detections":
         found = _polar(found, whole)
     tables.columns[kind] = list(found)

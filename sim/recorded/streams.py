@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.datasets.scans import counted
+from sim.datasets.scans import count_note
 from sim.recorded.forms import forms_of, intervals_of, landmarks_of
 from sim.scenarios.scenario import Scenario, ScenarioError, loads
 from sim.world.streams import (
@@ -89,7 +89,7 @@ def recorded_streams(
     ]
     notes = [
         f"{robot}: "
-        + counted(
+        + count_note(
             sum(map(len, of.values())),
             "measurement",
             "left out: its stream began anew, and a data set has one stream of each robot",

@@ -24,7 +24,7 @@ class BagReport(NamedTuple):
     damaged: tuple[str, ...]
 
 
-def bag_repaired(path: Path, out: Path) -> BagReport:
+def repair_bag(path: Path, out: Path) -> BagReport:
     """Copy every message of an MCAP file's whole chunks to a new file with an index.
 
     Raises LogError where `path` is no MCAP file or has no whole message; then there is no new file.

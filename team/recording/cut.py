@@ -5,7 +5,7 @@ from pathlib import Path
 
 from team.recording.reader import Log, LogError
 from team.recording.recorder import Recorder
-from team.recording.summary import summarised
+from team.recording.summary import summarise_log
 from team.wire import channels as ch
 from team.wire.bus import Sample
 
@@ -33,7 +33,7 @@ def cut(
     The metadata is copied, with a note of the cut. Raises `LogError` when no sample is left or the
     log is damaged, before `out` is created, and `RecorderError` when `out` exists.
     """
-    summary = summarised(log)
+    summary = summarise_log(log)
     if summary.damaged:
         raise LogError(log.path, summary.damaged[0], "`teamslam log repair` saves the rest")
     span = summary.span_ns()

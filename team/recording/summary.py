@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from team.recording.reader import Log, LogError
-from team.recording.repair import salvaged
+from team.recording.repair import read_undamaged
 from team.wire.bus import Sample
 from team.wire.channels import SENSORS, VIEW, channel_of
 
@@ -59,11 +59,11 @@ class Summary(NamedTuple):
         return min(each.first_ns for each in chosen), max(each.last_ns for each in chosen)
 
 
-def summarised(log: Log) -> Summary:
+def summarise_log(log: Log) -> Summary:
     """Summarises every whole chunk of a log, damaged or not, in one pass."""
     found: dict[str, KeySummary] = {}
     damaged = []
-    for chunk in salvaged(log):
+    for chunk in read_undamaged(log):
         if isinstance(chunk, LogError):
             damaged.append(chunk.what)
             continue

@@ -7,7 +7,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from team.recording.reader import Log, LogError, open_log
-from team.recording.records import FRAME_SIZE, MALFORMED, frames
+from team.recording.records import FRAME_SIZE, MALFORMED, read_frames
 from team.wire.bus import Sample
 
 MOST = 20_000
@@ -40,7 +40,7 @@ class Tail:
         found: list[Sample] = []
         with self.path.open("rb") as file:
             start = () if self._offset is None else (self._offset,)
-            for frame in frames(file, self.path, *start):
+            for frame in read_frames(file, self.path, *start):
                 self._offset = frame.offset + FRAME_SIZE + len(frame.body)
                 if frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     self.ended = True

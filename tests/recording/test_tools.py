@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from team.recording.check import checked
+from team.recording.check import check_log
 from team.recording.counters import Counters
 from team.recording.csv_tables import export_csv
 from team.recording.cut import CUT, cut
-from team.recording.declared import declared, misdeclared
+from team.recording.declared import find_misdeclaration, read_declarations
 from team.recording.merge import MERGED, merge
 from team.recording.reader import Log, LogError, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.schemas import schema_of
-from team.recording.summary import summarised
+from team.recording.summary import summarise_log
 from team.recording.tables import table_of
 from team.wire import channels as c
 from team.wire import messages as m
@@ -83,7 +83,7 @@ def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
 
 
 def found(log: Log) -> list[str]:
-    return [str(finding) for finding in checked(log)]
+    return [str(finding) for finding in check_log(log)]
 
 
 @pytest.fixture
@@ -464,7 +464,7 @@ def test_a_damaged_log_is_told_of_and_never_a_crash(
     with contextlib.suppress(LogError):
         log = open_log(path)
         lines = found(log)
-        assert not summarised(log).damaged or lines
+        assert not summarise_log(log).damaged or lines
         assert log.complete or lines
 
 
@@ -500,7 +500,7 @@ OTHER = schema_of(m.Submap).replace(b'"integer"', b'"number"')
 def test_a_schema_is_held_against_its_channel(
     path: Path, key: str, encoding: str, schema: str, text: bytes, told: str | None
 ) -> None:
-    found = misdeclared(declared(foreign(path, key, encoding, schema, text))[key])
+    found = find_misdeclaration(read_declarations(foreign(path, key, encoding, schema, text))[key])
     assert found is None if told is None else found is not None and found.startswith(told)
 
 
@@ -508,7 +508,7 @@ def test_a_schema_is_held_against_its_channel(
 
 
 def test_a_summary_counts_and_its_span_is_that_of_the_measurements(whole: Log) -> None:
-    summary = summarised(whole)
+    summary = summarise_log(whole)
     of = {each.key: each for each in summary.keys}
     assert {key: each.messages for key, each in of.items()} == {
         key: count.messages for key, count in whole.counts().items()

@@ -206,7 +206,7 @@ class Collected:
             self.timed[robot, message.incarnation].take(message)
 
 
-def collected(samples: Iterable[Sample]) -> Collected:
+def collect_log(samples: Iterable[Sample]) -> Collected:
     """Collect the contents of a log from its samples."""
     found = Collected()
     centre = PeersAsCentre()

@@ -44,7 +44,7 @@ class TakenHome:
     measurements: Mapping[int, int]
 
 
-def taken_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
+def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
     """The paths at keyframe rate and the counts of a log; `progress` is called with each robot's
     name.
     """

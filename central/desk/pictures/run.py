@@ -19,7 +19,7 @@ from central.desk.drawing import (
     robot_colours,
     robot_labels,
 )
-from central.desk.evaluation.errors import Path, moved
+from central.desk.evaluation.errors import Path, transform_points
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.paths import SmoothedPath
 from central.desk.pictures.style import save
@@ -93,11 +93,11 @@ def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
 
     def moved_path(path: Path) -> Path:
         turned = path.poses[:, 2:] + back[2]
-        return Path(path.stamps_ns, np.hstack((moved(back, path.poses[:, :2]), turned)))
+        return Path(path.stamps_ns, np.hstack((transform_points(back, path.poses[:, :2]), turned)))
 
     return replace(
         evaluation,
-        true_landmarks=moved(back, evaluation.true_landmarks),
+        true_landmarks=transform_points(back, evaluation.true_landmarks),
         robots={n: replace(r, truth=moved_path(r.truth)) for n, r in evaluation.robots.items()},
     )
 

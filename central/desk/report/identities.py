@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from central.desk.evaluation.association import AssociationResult, Pairs
-from central.desk.report.tables import Sheet, shown
+from central.desk.report.tables import Sheet, format_figure
 from team.wire import messages as m
 
 SCORE_HEADINGS = ("pairs of detections", "precision", "recall", "F1", "wrong\ndetections")
@@ -29,10 +29,10 @@ def score_sheet(found: AssociationResult) -> Sheet:
 def _row(name: str, pairs: Pairs) -> tuple[str, ...]:
     return (
         name,
-        shown(pairs.precision, ".5f", ""),
-        shown(pairs.recall, ".4f", ""),
-        shown(pairs.f1, ".4f", ""),
-        shown(pairs.wrong_percent, ".3f", " %"),
+        format_figure(pairs.precision, ".5f", ""),
+        format_figure(pairs.recall, ".4f", ""),
+        format_figure(pairs.f1, ".4f", ""),
+        format_figure(pairs.wrong_percent, ".3f", " %"),
     )
 
 

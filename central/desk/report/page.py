@@ -27,14 +27,14 @@ from central.desk.report.run import Run
 from central.desk.report.tables import (
     Sheet,
     disposition_sheet,
+    format_figure,
+    is_unfused,
     own_sheet,
     path_sheet,
     peer_sheet,
     robot_sheet,
-    shown,
     team_rows,
     title_of,
-    unfused,
 )
 
 LISTED_EVENTS = 200
@@ -180,9 +180,9 @@ def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]
     rows = [
         (
             name,
-            shown(took.get("cpu_s"), ".2f", ""),
-            shown(took.get("peak_rss_mb"), ".0f", ""),
-            shown(took.get("pss_mb"), ".0f", ""),
+            format_figure(took.get("cpu_s"), ".2f", ""),
+            format_figure(took.get("peak_rss_mb"), ".0f", ""),
+            format_figure(took.get("pss_mb"), ".0f", ""),
         )
         for name, took in processes.items()
     ]
@@ -195,7 +195,7 @@ def _notes(run: Run) -> str:
 
 def _own_maps(run: Run) -> list[str]:
     """The robots' own maps, where there is no fused map."""
-    return _sheet(own_sheet(run.evaluation)) if unfused(run.evaluation) else []
+    return _sheet(own_sheet(run.evaluation)) if is_unfused(run.evaluation) else []
 
 
 def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -215,14 +215,14 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         rows.append(
             (
                 name,
-                shown(None if of is None else of.per_dof, ".3f", ""),
+                format_figure(None if of is None else of.per_dof, ".3f", ""),
                 "–" if of is None else f"{int(of.dof.sum()):,}",
-                shown(cost.get(name), ".3f", ""),
-                shown(scale.get(name), ".2f", ""),
+                format_figure(cost.get(name), ".3f", ""),
+                format_figure(scale.get(name), ".2f", ""),
                 OUTSIDE
                 if robot is not None and robot.outside
-                else shown(None if online is None else online.nees_per_dof, ".3g", ""),
-                shown(None if online is None else online.coverage, ".0%", ""),
+                else format_figure(None if online is None else online.nees_per_dof, ".3g", ""),
+                format_figure(None if online is None else online.coverage, ".0%", ""),
             )
         )
     filled = [row for row in rows if any(cell != "–" for cell in row[1:])]
@@ -248,9 +248,9 @@ def _paths(run: Run) -> list[str]:
     absolute = [
         (
             name, kind, f"{errors.poses:,}",
-            shown(None if arbitrary else errors.ape_m, ".3f", ""),
-            shown(errors.ape_aligned_m, ".3f", ""),
-            _degrees(errors.ape_aligned_rad), shown(errors.rpe_m, ".3f", ""),
+            format_figure(None if arbitrary else errors.ape_m, ".3f", ""),
+            format_figure(errors.ape_aligned_m, ".3f", ""),
+            _degrees(errors.ape_aligned_rad), format_figure(errors.rpe_m, ".3f", ""),
             _degrees(errors.rpe_rad),
         )
         for name, of in run.trajectories().items()
@@ -387,4 +387,4 @@ def _quantile(values: Float[np.ndarray, " n"], share: float) -> float:
 
 
 def _degrees(angle_rad: float | None) -> str:
-    return shown(None if angle_rad is None else degrees(angle_rad), ".2f", "")
+    return format_figure(None if angle_rad is None else degrees(angle_rad), ".2f", "")

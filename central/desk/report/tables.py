@@ -36,7 +36,7 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     for name, value in team_rows(evaluation):
         team.add_row(Text(name), Text(value))
     sheets = [robot_sheet(evaluation)]
-    if not evaluation.peers and unfused(evaluation):
+    if not evaluation.peers and is_unfused(evaluation):
         sheets.append(own_sheet(evaluation))
     else:
         if any(robot.smoothed is not None for robot in evaluation.robots.values()):
@@ -82,10 +82,10 @@ def peer_sheet(evaluation: Evaluation) -> Sheet:
                 name,
                 "none" if sha256 is None else sha256[:12],
                 f"{peer.submaps}",
-                shown(peer.complete_at_s, ".1f", ""),
-                shown(peer.uplink, ",.0f", ""),
-                shown(peer.downlink, ",.0f", ""),
-                shown(star, ",.0f", ""),
+                format_figure(peer.complete_at_s, ".1f", ""),
+                format_figure(peer.uplink, ",.0f", ""),
+                format_figure(peer.downlink, ",.0f", ""),
+                format_figure(star, ",.0f", ""),
                 ", ".join(over),
             )
         )
@@ -114,7 +114,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
         rows += [] if fused.matching is None else [("landmark errors", f"by {fused.matching}")]
         rows += [
             ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m{by}"),
-            ("after rigid alignment", shown(errors.aligned_rmse_m, ".3f", " m")),
+            ("after rigid alignment", format_figure(errors.aligned_rmse_m, ".3f", " m")),
         ]
         if not arbitrary:
             absurd = errors.nees_per_dof > ABSURD_NEES
@@ -126,8 +126,8 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("shape NEES/landmark", nees))
         if not arbitrary:
             rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
-    rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
-    rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
+    rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f", "")))
+    rows.append(("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += _association_rows(evaluation)
     rows += [("joined", short(words)) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
@@ -187,10 +187,18 @@ def _association_rows(evaluation: Evaluation) -> Rows:
     if found is None:
         return rows
     pairs = found.pairs
+    precision, recall, f1, wrong = (
+        format_figure(value, form, unit)
+        for value, form, unit in (
+            (pairs.precision, ".4f", ""),
+            (pairs.recall, ".3f", ""),
+            (pairs.f1, ".3f", ""),
+            (pairs.wrong_percent, ".3f", " %"),
+        )
+    )
     scores = (
-        f"precision {shown(pairs.precision, '.4f', '')}, recall {shown(pairs.recall, '.3f', '')}, "
-        f"F1 {shown(pairs.f1, '.3f', '')}; {shown(pairs.wrong_percent, '.3f', ' %')} of the "
-        "detections are in a wrong landmark"
+        f"precision {precision}, recall {recall}, F1 {f1}; {wrong} of the detections are in a "
+        "wrong landmark"
     )
     many = found.merges_right + found.merges_wrong + found.merges_refused > 0
     merges = (
@@ -260,10 +268,10 @@ def _robot_row(name: str, robot: RobotResult, *, arbitrary: bool) -> tuple[str, 
         str(used.steps),
         f"{'–' if used.used is None else used.used} of {used.published}",
         str(used.submaps),
-        OUTSIDE if outside else shown(position, ".3f", mark),
-        shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
-        shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
-        shown(robot.uplink_bytes_per_step, ".1f", ""),
+        OUTSIDE if outside else format_figure(position, ".3f", mark),
+        format_figure(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
+        format_figure(None if errors is None else errors.nees_per_dof, ".3g", mark),
+        format_figure(robot.uplink_bytes_per_step, ".1f", ""),
     )
 
 
@@ -297,10 +305,10 @@ def _path_row(name: str, robot: RobotResult, *, arbitrary: bool) -> tuple[str, .
         cells += [
             OUTSIDE
             if outside
-            else shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
-            shown(aligned, ".3f", ""),
-            shown(None if errors is None else errors.nees_per_dof, ".3g", ""),
-            shown(None if errors is None else errors.coverage, ".0%", ""),
+            else format_figure(None if errors is None else errors.position_rmse_m, ".3f", ""),
+            format_figure(aligned, ".3f", ""),
+            format_figure(None if errors is None else errors.nees_per_dof, ".3g", ""),
+            format_figure(None if errors is None else errors.coverage, ".0%", ""),
         ]
     return tuple(cells)
 
@@ -311,7 +319,7 @@ OWN_HEADINGS = (
 OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
-def unfused(evaluation: Evaluation) -> bool:
+def is_unfused(evaluation: Evaluation) -> bool:
     """Whether there is no fused map, and each robot has its own."""
     empty = evaluation.map is not None and not len(evaluation.map.ids)
     return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
@@ -331,7 +339,7 @@ def own_sheet(evaluation: Evaluation) -> Sheet:
                 name,
                 str(own.count),
                 f"{own.rmse_m:.3f}",
-                shown(own.aligned_rmse_m, ".3f", ""),
+                format_figure(own.aligned_rmse_m, ".3f", ""),
                 f"{own.nees_per_dof:.4g}",
                 f"{low:.2f}…{high:.2f}",
                 f"{own.coverage:.0%}",
@@ -349,6 +357,6 @@ def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
     return Sheet(("disposition", *ledgers, "all"), rows)
 
 
-def shown(value: float | None, form: str, unit: str) -> str:
+def format_figure(value: float | None, form: str, unit: str) -> str:
     """The number with its unit, a dash where there is none."""
     return "–" if value is None else f"{value:{form}}{unit}"

@@ -19,7 +19,7 @@ from central.desk.evaluation.events import Event, EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
 from central.desk.names import in_order
 from central.desk.view import foxglove_scene as fox
-from central.desk.view.drawn import Landmarks, Track, around, landmarks_of, placed
+from central.desk.view.drawn import Landmarks, Track, centre_particles, landmarks_of, place_points
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire import views
@@ -331,7 +331,7 @@ class ViewerNode:
         out = []
         for name, robot in self._in_order():
             if robot.cloud is not None and robot.estimate is not None:
-                points = placed(around(robot.cloud), robot.pose().tolist())
+                points = place_points(centre_particles(robot.cloud), robot.pose().tolist())
                 weights = floats(robot.cloud.weights, "weights").astype(np.float64)
                 payload = fox.cloud(now_ns, points, weights, "weight")
                 out.append(Shown(views.PARTICLES.key(name), now_ns, payload))

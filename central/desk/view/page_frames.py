@@ -22,7 +22,7 @@ import numpy as np
 from central.desk.drawing import ROBOT_COLOURS
 from central.desk.evaluation.events import EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
-from central.desk.view.drawn import around, landmarks_of
+from central.desk.view.drawn import centre_particles, landmarks_of
 from central.desk.view.landmark_sets import sets_of
 from central.desk.view.node import FORGET_NS
 from team.wire import channels as ch
@@ -155,7 +155,7 @@ class PageFrames:
                 places = self._truth.positions.ravel().tolist()
                 self._say("truth_map", ids=self._truth.ids.tolist(), xy=places)
             case m.ParticleCloud():
-                t, seen = self._t(message.stamp_ns), around(message)
+                t, seen = self._t(message.stamp_ns), centre_particles(message)
                 self._say("cloud", r=message.robot, t=t, v=_base64(seen.astype("<f4")))
             case m.Trajectory():
                 times = [self._t(at) for at in stamps(message.stamps, "stamps").tolist()]

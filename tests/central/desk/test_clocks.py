@@ -7,7 +7,7 @@ import pytest
 
 from central.desk.evaluation.clocks import BEYOND_DOUBT, Timed, lateness
 from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.evaluation.log import collected
+from central.desk.evaluation.log import collect_log
 from central.desk.report.tables import team_rows
 from sim.publisher.node import WorldNode
 from sim.scenarios.scenario import load, with_options
@@ -33,7 +33,7 @@ def published(world: StressWorld, place: Path) -> list[Sample]:
 
 
 def timed_of(log: list[Sample], robot: str) -> Timed:
-    (found,) = (each for (name, _), each in collected(log).timed.items() if name == robot)
+    (found,) = (each for (name, _), each in collect_log(log).timed.items() if name == robot)
     return found
 
 
