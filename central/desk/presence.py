@@ -24,7 +24,7 @@ DRIFT = 0.1
 
 @dataclass
 class Member:
-    """One node: its liveliness, its last status, and what it counted in which time.
+    """One node: its liveliness, its last status, and its counts over time.
 
     clock_s: its team time less its machine's wall clock; None where it reports no team time.
     drift: by how much that has changed per second of the observation.
@@ -82,9 +82,9 @@ class Presence:
                     _, _, message = shown(sample)
                 except WireError:
                     continue
-                self._hear(message, sample.wall_ns)
+                self._take_message(message, sample.wall_ns)
 
-    def _hear(self, message: m.Message, wall_ns: int) -> None:
+    def _take_message(self, message: m.Message, wall_ns: int) -> None:
         match message:
             case m.Liveliness():
                 self._of(message.node).alive = message.alive

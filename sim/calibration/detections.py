@@ -224,7 +224,7 @@ def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
 def claim_notes(
     figures: Sequence[Figure], central: Sequence[Figure], settings: AssociationSettings
 ) -> tuple[str, ...]:
-    """Warnings where what is claimed does not hold, in words."""
+    """Warnings where claimed covariances do not hold, in words."""
     value = {each.name: each.value for each in (*figures, *central)}
     notes = []
     inside, between = value.get("errors_over_claims", 1.0), value.get("covariance_factor", 1.0)

@@ -28,7 +28,7 @@ Fit = Callable[[Sequence[T]], Mapping[str, float]]
 
 
 class CalibrationError(ValueError):
-    """The data do not determine a figure; the text says what is missing."""
+    """The data do not determine a figure; the text names the missing data."""
 
 
 @dataclass(frozen=True)

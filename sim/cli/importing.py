@@ -142,7 +142,7 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 
 def _as_read(folder: Path) -> list[str]:
-    """What there is of each robot, and what its tables have that can not be used."""
+    """The measurements of each robot, and the notes on unusable rows of its tables."""
     from sim.datasets.tables import DatasetError
     from sim.scenarios.scenario import load, with_options
     from sim.scenarios.source import scenario_beside, streams_of

@@ -221,7 +221,7 @@ def _keep_showing(url: str, log: Path) -> None:
     """Keep the page until the user ends the command."""
     from team.shell import process
 
-    with process("launch", endless=True) as stop:  # who reads of Ctrl-C may press it at once
+    with process("launch", endless=True) as stop:  # the line names Ctrl-C, which may follow at once
         typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
         stop.wait()
 
@@ -229,7 +229,7 @@ def _keep_showing(url: str, log: Path) -> None:
 def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
     """The scenario with the robots that its data set has, a note on the others, and the streams.
 
-    A data set is read before any process starts. What is simulated needs none of this.
+    A data set is read before any process starts; a simulated world is not.
     """
     from sim.world.config import LiveWorld, SimulatedWorld
 
@@ -274,7 +274,7 @@ def _check_writable(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         is_new = not path.exists()
         path.open("a").close()
-        if is_new:  # whoever waits for the file is to find it whole
+        if is_new:  # a reader that waits for the file must find it whole
             path.unlink()
     except OSError as error:
         fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
@@ -314,7 +314,7 @@ def _keep_earlier(log: Path) -> None:
 
 
 KERNELS_TO_ESTIMATE = 5
-"""The first kernels take longer than most: they say nothing of the rest."""
+"""The first kernels take longer than most, so no time is estimated from them."""
 
 
 class _Compiling:
@@ -360,7 +360,7 @@ def _compile(scenario: Scenario) -> None:
 def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
-    """Write the report and say what was written; where that fails, as on a full disk, note it."""
+    """Write the report and print its files; an error, as of a full disk, fails the run."""
     from central.desk.report.page import write_report
 
     try:

@@ -361,7 +361,7 @@ def record(
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
     configurations = []
-    if resolved.is_live:  # what a recorder of other teams does not need: it takes 105 MB
+    if resolved.is_live:  # other teams' recorders save its 105 MB
         from team.wire.digest import configured
 
         configurations = [configured("world", 0, 0, resolved)]

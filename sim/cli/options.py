@@ -132,7 +132,7 @@ def connect_bus(
 
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
-    """The node's certificate and key, checked; warns of what will soon expire."""
+    """The node's certificate and key, checked; warns of a certificate that will soon expire."""
     from team.keys.credentials import credentials_of
 
     own = credentials_of(folder, node, team)
@@ -183,7 +183,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def warn_of_holes(log: "Log") -> None:
-    """Warn on stderr of what a log lacks, since results made of it lack it, too."""
+    """Warn on stderr of the messages that a log lacks, since results computed from it lack them."""
     from team.recording.check import holes
 
     tell_holes(log.path, holes(log))

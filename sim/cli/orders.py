@@ -98,7 +98,7 @@ def verdict(
         float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """Tell a running team that two landmarks without names are one, or that they are two.
+    """Give a running team the verdict that two landmarks without names are one, or two.
 
     The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
     until it is withdrawn.
@@ -115,7 +115,7 @@ def verdict(
     except ValueError as error:
         fail(str(error), WRONG_USE)
     if one == two:
-        fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
+        fail(f"{first} is one landmark, and needs no verdict", WRONG_USE)
     with connect_bus(team, connect, keys, "operator") as bus:
         try:
             judgement = Judgement(first=one, second=two, same=word == "same")
@@ -136,12 +136,12 @@ def verdict(
         )
     if chain:
         remedy = f"`teamslam verdict {opposite} {first} {second} --withdraw` withdraws that"
-        contradiction = f"{first} and {second} were said to be {opposite}, too"
+        contradiction = f"{first} and {second} have an earlier verdict, {opposite}"
         if word == "same":
             fail(f"{contradiction}, which is what holds; {remedy}", FAILED)
         typer.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
     landmarks = len(ids(fused.ids, "ids"))
-    are = "are no more said to be" if withdraw else "are"
+    are = "have no verdict any more that they are" if withdraw else "are"
     typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
 
 

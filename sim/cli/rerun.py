@@ -230,7 +230,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 def _print_warnings(
     recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
 ) -> None:
-    """Print what `launch` says of its run, here of the one that was computed."""
+    """Print the warnings and notes of the computed run, as `launch` does."""
     from central.desk.report.run import nis_line
 
     lines = [f"warning: {warning}" for warning in changed.warnings]

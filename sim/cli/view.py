@@ -44,7 +44,7 @@ app = typer.Typer()
 
 @app.command()
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
-    """Publish what Foxglove, Lichtblick and Rerun draw, once a second of team time.
+    """Publish the views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
     The recorder stores it beside the team's own messages. It ends after the final map.
     """

@@ -129,9 +129,9 @@ def measurements_of(
 
     if len(found.ranges) and np.median(found.ranges) > FAR_M:
         rows.notes.append(
-            f"what it measures is {np.median(found.ranges):,.0f} m away most of the time "
-            f"({rows.table.name}): metres are meant; of millimetres a map of columns makes them "
-            "(scale = 0.001)"
+            f"the median range is {np.median(found.ranges):,.0f} m "
+            f"({rows.table.name}): ranges must be in metres; to convert from millimetres, add a "
+            "column map (scale = 0.001)"
         )
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
@@ -181,8 +181,8 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
         raise table.error(
             row,
             "bearing_rad",
-            f"{bearings[row]:g} is more than a whole turn; bearings are in radians: of degrees "
-            "a map of columns makes them (scale = 0.017453292519943295)",
+            f"{bearings[row]:g} is more than a whole turn; bearings must be in radians: to "
+            "convert from degrees, add a column map (scale = 0.017453292519943295)",
         )
     bearings, as_points = on_circle(bearings), ~np.isnan(points[:, 0])
     x, y = points[as_points].T

@@ -19,7 +19,7 @@ def kind_of(path: str | Path) -> Kind:
     if folder_files.has_tables(path):
         return "folder"
     if (Path(path) / unlabelled.FILES[1]).is_file():
-        return "unlabelled"  # reading it says what is missing
+        return "unlabelled"  # its reader reports the missing file
     try:
         with tables.open_data_set(str(path), UTIAS_MARKER):
             return "utias"

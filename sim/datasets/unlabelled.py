@@ -94,7 +94,7 @@ def _table(root: Path, name: str, *needed: str) -> CsvTable:
 
 
 def _form(odometry: CsvTable) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The columns of odometry.csv and of detections.csv, by what is special to the former."""
+    """The columns of odometry.csv and detections.csv, by those that are special to the former."""
     own = {CAR: CAR[1:], STEPS + COVARIANCE: STEPS}
     form = max(own, key=lambda each: sum(odometry.has(column) for column in own[each]))
     if not any(odometry.has(column) for column in own[form]):
@@ -297,7 +297,7 @@ def _piece(
     begin_ns, end_ns = int(own.end_ns[0] - own.duration_ns[0]), int(own.end_ns[-1])
     back = begin_ns - zero_ns
     seen = whole.landmark_detections
-    # What is seen at the end of an interval is that interval's, and at the first start its own.
+    # A scan at the end of an interval belongs to it; one at the first start to the first.
     first, last = np.searchsorted(seen.stamps_ns, [begin_ns + (index > 0), end_ns + 1])
     mine = seen.only(int(first), int(last))
     gps_ns, gps = whole.positions_ns, whole.positions

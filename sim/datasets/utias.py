@@ -3,7 +3,7 @@
 Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. A set is 17 text files: `Barcodes.dat`,
 `Landmark_Groundtruth.dat`, and of each robot N its odometry, measurements and ground truth.
 Measurements name a *barcode*; `Barcodes.dat` gives its subject: a robot (its number) or a landmark.
-What is not handed out is dropped, and counted in the notes with its reason.
+Dropped rows are counted in the notes with their reason.
 """
 
 from collections.abc import Mapping, Sequence

@@ -26,7 +26,7 @@ from team.ros2.translator import Translator
 class Imported:
     """The tables of a bag's robots.
 
-    notes: what was used, what was left out and why, in words. messages: number of messages that
+    notes: the topics used and left out, and why, in words. messages: number of messages that
     were read.
     """
 
@@ -103,7 +103,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
 
 def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
     """A translator for each robot; where robots share a topic of detections, all transforms of the
-    bag are read first, since they tell whose a detection is.
+    bag are read first, since they decide to which robot a detection belongs.
     """
     frames = {name: _static_frames(bag, each.odometry) for name, each in topics.robots.items()}
     owners = Owners(topics.robots, frames)

@@ -1,4 +1,4 @@
-"""Proposes which topics of a ROS 2 bag are what, by their names, types and frames."""
+"""Propose which topics of a ROS 2 bag are what, by their names, types and frames."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -22,9 +22,7 @@ SAMPLED_MESSAGES = 2000
 
 
 class UndecidedError(DatasetError):
-    """The names and types of a bag's topics do not decide which are used; the text says what to
-    type.
-    """
+    """The names and types of a bag's topics do not decide which are used; the text has a remedy."""
 
 
 class Proposal(NamedTuple):

@@ -166,8 +166,8 @@ class _Guess(NamedTuple):
 
 
 def propose_map(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
-    """A map in TOML for these files as far as the columns' names determine it, and what it
-    lacks.
+    """Propose a map in TOML for these files as far as the columns' names determine it; also the
+    columns that it lacks.
     """
     guesses: list[_Guess] = []
     lacking: list[str] = []

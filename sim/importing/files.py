@@ -30,7 +30,7 @@ def import_files(
     everyones: Collection[str] = (),
     command: str = "",
 ) -> tuple[RobotTables, list[str]]:
-    """One robot's tables from CSV files, and notes on what was used and left out.
+    """Import one robot's tables from CSV files; also notes on the files used and left out.
 
     everyones: the names of all robots' files; a table whose files only other robots have is left
     out. command: the command line to repeat with a map. Raises DatasetError; without a map its text

@@ -35,7 +35,7 @@ MEASURED = ("odometry", "observations", "sightings", "detections")
 
 @dataclass(frozen=True)
 class Request:
-    """What the user has asked for.
+    """A user's request for an import.
 
     sources: files or folders. starts: initial poses by robot (a pose, then two standard deviations
     or none); "" is the only robot. truth: a trajectory of the only robot.
@@ -53,8 +53,8 @@ class Request:
 class Report:
     """The result of an import.
 
-    robots: their names. notes: what was used and left out, in words. messages: number of messages
-    that were read from bags.
+    robots: their names. notes: the files and rows used and left out, in words. messages: number of
+    messages that were read from bags.
     """
 
     robots: list[str]
@@ -171,8 +171,8 @@ def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
 
 
 def proposal(path: Path) -> str:
-    """The topics of a bag, and a proposal for the file that assigns them; empty for what is
-    no bag.
+    """The topics of a bag, and a proposal for the file that assigns them; empty for a path
+    that is no bag.
     """
     if not is_bag(path) or is_own_log(path):
         return ""

@@ -142,7 +142,7 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
 def in_order(parts: list[Detections]) -> Detections:
     """The messages of all parts by time; at equal times those with identities first.
 
-    What only some parts have, as points or covariances, is NaN in the others' rows.
+    Columns that only some parts have, as points or covariances, are NaN in the others' rows.
     """
     if len(parts) == 1:
         return parts[0]

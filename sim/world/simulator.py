@@ -277,7 +277,7 @@ def _with_claims(
     ],
     seed: int,
 ) -> Detections:
-    """Measurements of what is visible, each with a covariance of its own and an error of that
+    """Measurements of the visible points, each with a covariance of its own and an error of that
     covariance.
     """
     assert world.landmark_claims is not None

@@ -1,4 +1,4 @@
-"""Checks a log: whether it is whole, complete and sound; each finding is one line."""
+"""Check a log: whether it is whole, complete and sound; each finding is one line."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -156,9 +156,9 @@ _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
 """Channels whose publisher has received the end of the streams."""
-NO_END = "missing: how many measurements there were is not known"
+NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
-NO_FINAL = "repaired, and without a final map: what came after its recorder died is not in it"
+NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
 
 

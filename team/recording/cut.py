@@ -1,4 +1,4 @@
-"""Cuts an interval of team time, or some channels, out of a log, into a log of its own."""
+"""Cut an interval of team time, or some channels, out of a log, into a log of its own."""
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -25,7 +25,7 @@ def cut(
     to_s: float | None = None,
     channels: Collection[ch.Channel] | None = None,
 ) -> int:
-    """Writes the samples of [from_s, to_s) on these channels to a new log `out`; returns their
+    """Write the samples of [from_s, to_s) on these channels to a new log `out`; returns their
     number.
 
     Times are seconds of team time since the first measurement; None: no bound. Adjacent cuts

@@ -1,4 +1,4 @@
-"""Opens one file of a log: the run that it is of, and whether its recorder finished it."""
+"""Open one file of a log: the run that it is of, and whether its recorder finished it."""
 
 import os
 from dataclasses import dataclass, field

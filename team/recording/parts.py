@@ -120,7 +120,7 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
 
 
 def join(path: Path) -> list[Path]:
-    """Joins the parts of a log to one; returns the parts that remain, a single one on success.
+    """Join the parts of a log to one; returns the parts that remain, a single one on success.
 
     Their undamaged chunks are copied in the order of arrival. Where the disk is full nothing
     changes. To be called again after a crash: what is joined already is not joined twice.
@@ -157,7 +157,7 @@ def join(path: Path) -> list[Path]:
 
 
 def _write_through(path: Path) -> None:
-    """Waits until a file, or the names in a folder, are on the disk: power may fail."""
+    """Wait until a file, or the names in a folder, are on the disk: power may fail."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

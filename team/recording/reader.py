@@ -1,4 +1,4 @@
-"""Reads the samples of a log, also of one in several parts or whose recorder was killed."""
+"""Read the samples of a log, also of one in several parts or whose recorder was killed."""
 
 import struct
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -67,12 +67,6 @@ class Log:
             if isinstance(chunk, DamagedChunkError):
                 raise chunk
             yield from chunk
-
-    def in_time_order(self, channels: Collection[Channel] | None = None) -> list[Sample]:
-        """The samples in the order of team time, equal stamps in that of the file; all in
-        memory.
-        """
-        return sorted(self.samples(channels), key=lambda sample: sample.stamp_ns)
 
     def counts(self) -> dict[str, Count]:
         """Messages and payload bytes of each key, by reading the whole log."""

@@ -1,4 +1,4 @@
-"""Reads the records of an MCAP file, one after another, as untrusted input.
+"""Read the records of an MCAP file, one after another, as untrusted input.
 
 Every length and every chunk's CRC is checked before use, and a chunk that claims a larger expanded
 size than a recorder can have written is refused before it is expanded.
@@ -117,7 +117,7 @@ def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> I
         opcode, length = _FRAME.unpack(head)
         none = opcode not in _OPCODES or _LENGTHS.get(opcode, length) != length
         if none or offset + _FRAME.size + length > size:
-            # Damage, or zeros or half a record: what a machine that went down leaves behind.
+            # Damage; zeros or half a record, as after a power failure.
             following = _next_chunk(file, before + 1, size)
             if following is None:
                 return
@@ -162,7 +162,7 @@ def read_records(data: bytes) -> Iterator[Frame]:
 
 
 def locate_records(data: bytes) -> list[tuple[int, int, int]]:
-    """Of each record of an expanded chunk its opcode, and where its bytes begin and end; raises as
+    """The opcode of each record of an expanded chunk, and its first and last byte; raises as
     `read_records`.
     """
     found: list[tuple[int, int, int]] = []

@@ -1,4 +1,4 @@
-"""Repairs a log: copies the undamaged chunks of a damaged or unfinished log to a new, complete
+"""Repair a log: copies the undamaged chunks of a damaged or unfinished log to a new, complete
 one.
 """
 
@@ -35,7 +35,7 @@ def read_undamaged(log: Log) -> Iterator[list[Sample] | LogError]:
 
 
 def repair_log(path: str | Path, out: str | Path) -> Report:
-    """Copies every undamaged chunk of the log at `path` to a new, complete log `out`.
+    """Copy every undamaged chunk of the log at `path` to a new, complete log `out`.
 
     The metadata is copied; of a log that its recorder did not finish with a note. Raises `LogError`
     when `path` is no log, `RecorderError` when `out` exists.

@@ -1,4 +1,4 @@
-"""Summarises a log: messages, bytes, rates and times of each key, and the span of its
+"""Summarise a log: messages, bytes, rates and times of each key, and the span of its
 measurements.
 """
 
@@ -33,7 +33,7 @@ class KeySummary:
         return (self.messages - 1) * 1e9 / (self.last_ns - self.first_ns)
 
     def take(self, sample: Sample) -> None:
-        """Counts one more sample."""
+        """Count one more sample."""
         self.messages += 1
         self.bytes += len(sample.payload)
         self.first_ns = min(self.first_ns, sample.stamp_ns)
@@ -60,7 +60,7 @@ class Summary(NamedTuple):
 
 
 def summarise_log(log: Log) -> Summary:
-    """Summarises every whole chunk of a log, damaged or not, in one pass."""
+    """Summarise every whole chunk of a log, damaged or not, in one pass."""
     found: dict[str, KeySummary] = {}
     damaged = []
     for chunk in read_undamaged(log):

@@ -1,4 +1,4 @@
-"""Follows a log: its samples while its recorder writes them, chunk by chunk."""
+"""Follow a log: its samples while its recorder writes them, chunk by chunk."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ MOST = 20_000
 
 @dataclass
 class Tail:
-    """Reads a log that may still grow, or does not exist yet; no sample is returned twice.
+    """Read a log that may still grow, or does not exist yet; no sample is returned twice.
 
     log: once it exists.
     ended: whether its recorder has finished it, and all of it is read.

@@ -303,7 +303,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
             world.publish(Outgoing(c.OWN_POSE, "alpha", POSE))
             said += 1
         loop.take(bus.receive())
-        loop.mend(0.0)
+        loop.request_missing(0.0)
         return any("nothing is recorded" in each for each in loop.status().warnings)
 
     wait_until(stopped)
@@ -321,7 +321,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
         )
     )
     for now_s in (1e9, 2e9, 3e9):
-        loop.mend(now_s)
+        loop.request_missing(now_s)
         loop.take(bus.receive())
     loop.close()
     assert join(path) == [path]

@@ -332,7 +332,7 @@ def _never_came(log: Collected) -> list[str]:
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
-    """What each node set aside, and the first exception, in words."""
+    """The messages that each node set aside, and the first exception, in words."""
     by_node: dict[str, list[m.Fault]] = {}
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
@@ -664,7 +664,7 @@ def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> floa
 
 
 def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotion | None:
-    """What moves the team's map onto the truth, and by what; None where there is no map."""
+    """The rigid motion of the team's map onto the truth, and its source; None without a map."""
     if fused is None:
         return None
     if fused.errors is not None and fused.errors.truth_from_map is not None:

@@ -274,7 +274,7 @@ def _measurements(run: Run) -> list[str]:
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
         tables = _sheet(disposition_sheet(ledgers)) if any(ledgers.values()) else []
-        return [*tables, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
+        return [*tables, _note(f"As the robots report it. The ledger: {run.no_ledger}.")]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
@@ -299,7 +299,7 @@ def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     ]
     more = len(events) - len(rows)
     left = _note(f"{more} more in report.json") if more else ""
-    return [_image(pictures, "timeline"), _table(("", "who", "what"), rows, words=True), left]
+    return [_image(pictures, "timeline"), _table(("", "node", "event"), rows, words=True), left]
 
 
 def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:

@@ -199,10 +199,10 @@ def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(
     assert (alone.exit_code, alone.stderr) == (0, "")
     against = said(monkeypatch, "different", *names, rests_on=both)
     assert against.exit_code == 0
-    assert "were said to be same, too; different is what holds" in against.stderr
+    assert "have an earlier verdict, same; different is what holds" in against.stderr
     in_vain = said(monkeypatch, "same", *names, rests_on=both)
     assert in_vain.exit_code == 1
-    assert "were said to be different, too, which is what holds" in in_vain.stderr
+    assert "have an earlier verdict, different, which is what holds" in in_vain.stderr
 
 
 def test_verdicts_that_contradict_each_other_over_a_third_landmark_are_named(

@@ -277,10 +277,10 @@ def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: s
     [
         (
             "1763800000000",
-            "of milliseconds a map of columns makes seconds (scale = 1e-3)",
+            "to convert from milliseconds, add a column map (scale = 1e-3)",
         ),
-        ("1763800000000000", "of microseconds a map"),
-        ("1763800000000000000", "of nanoseconds a map"),
+        ("1763800000000000", "from microseconds, add a column map"),
+        ("1763800000000000000", "from nanoseconds, add a column map"),
     ],
 )
 def test_times_in_another_unit_are_refused_with_that_unit(
