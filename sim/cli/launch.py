@@ -36,6 +36,7 @@ from sim.cli.options import (
     scenario_of,
     set_aside,
 )
+from sim.cli.results import print_evaluation, print_nis, print_written, read_run
 from sim.cli.steps import Steps
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
 from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
@@ -364,8 +365,7 @@ def _write_report(
     from central.desk.report.page import write_report
 
     try:
-        for path in write_report(run, outcome.folder, figures):
-            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        print_written(write_report(run, outcome.folder, figures), console)
     except OSError as error:
         outcome.failures.append(
             f"{outcome.folder}: can not write the report: {error.strerror}; "
@@ -380,13 +380,9 @@ def _conclude(
     from rich.console import Console
 
     from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
-    from central.desk.evaluation.history import history
     from central.desk.evaluation.states import not_in_the_map
-    from central.desk.export.take_home import take_home
     from central.desk.names import in_order
-    from central.desk.report.run import Run, nis_line, run_figures
-    from central.desk.report.tables import summary_tables
-    from central.desk.verification.recorded import recorded
+    from central.desk.report.run import run_figures
     from team.recording.parts import join
     from team.recording.reader import LogError, open_log
 
@@ -416,20 +412,11 @@ def _conclude(
         figures = extra
     else:
         figures = to_json(evaluation, extra)
-        for table in summary_tables(evaluation):
-            console.print(table)
-        for note in evaluation.notes:
-            console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        print_evaluation(evaluation, console)
         if report:
-            steps.begin("reading what the robots received")
-            messages = recorded(log)
-            steps.begin("smoothing the paths")
-            home = take_home(messages, steps.robot)
-            steps.begin("reading the run's history")
-            run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
+            run = read_run(log, evaluation, steps, proves_ledger=False)
             typer.echo("drawing the pictures and writing the report", err=True)
-            if (line := nis_line(run.history)) is not None:
-                console.print(line, highlight=False, soft_wrap=True)
+            print_nis(run, console)
             _write_report(run, outcome, {**figures, **run_figures(run)}, console)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")

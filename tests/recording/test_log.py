@@ -117,13 +117,6 @@ def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
     assert sorted(log.samples(), key=lambda s: s.stamp_ns) == samples
 
 
-def test_time_order_is_stable(path: Path) -> None:
-    samples = stream(50)[::-1]
-    assert sorted(recorded(path, samples).samples(), key=lambda s: s.stamp_ns) == sorted(
-        samples, key=lambda s: s.stamp_ns
-    )
-
-
 def test_channels_can_be_selected(path: Path) -> None:
     log = recorded(path, stream(100))
     submaps = [one for one in stream(100) if one.key.endswith("submap")]

@@ -33,10 +33,9 @@ from central.desk.evaluation.errors import (
     rigid_alignment,
     transform_points,
 )
-from central.desk.evaluation.gospa import Gospa, gospa, half_spacing
 from central.desk.evaluation.gps import gps_median
 from central.desk.evaluation.log import Collected, Traffic, collect_log
-from central.desk.evaluation.matching import Matching, nearest
+from central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.desk.evaluation.running import TruthFrames
