@@ -43,7 +43,7 @@ class Gospa:
 def assign(
     found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], gate_m: float
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """The pairs of the least sum of squared distances, one to one, within the gate: the rows of both
+    """The one-to-one pairs within the gate of the least sum of squared distances: the rows of both
     sets, and the squared distances [m²].
     """
     squared = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), gate_m**2)
