@@ -1,4 +1,4 @@
-"""Compares runs: a row for each figure with a cell for each run, and pictures."""
+"""Compare runs: a row for each figure with a cell for each run, and pictures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import degrees

@@ -1,4 +1,4 @@
-"""Learns the figures of the odometry's and the sensor's models from measurements.
+"""Learn the figures of the odometry's and the sensor's models from measurements.
 
 Where the data have the true poses and landmarks, every figure is a maximum-likelihood estimate
 against them. Constants of the sensor are learnt for each robot separately where robots differ

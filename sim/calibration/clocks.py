@@ -1,4 +1,4 @@
-"""Estimates by how much a robot's detections and its odometry are stamped late, against its path.
+"""Estimate by how much a robot's detections and its odometry are stamped late, against its path.
 
 A detection stamped t was made at t − τ: it is compared with the true pose of that time. Where a
 robot drives straight on, an offset looks like a mount moved forward by v τ, so the mount's pose and

@@ -1,4 +1,4 @@
-"""Learns how consistent submaps are from the maps of single robots, without the truth.
+"""Learn how consistent submaps are from the maps of single robots, without the truth.
 
 A robot's own map a and the map b of the others share no measurement. If the covariances are right,
 
@@ -129,10 +129,10 @@ def landmark_sigma(
     teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
 ) -> Figure | None:
     """The σ [m] under which the shapes of the joined maps are as far from the true landmarks as
-    their covariances P + σ² I say: Σ χ²(σ) = Σ dof.
+    their covariances P + σ² I predict: Σ χ²(σ) = Σ dof.
 
-    What is left between map and truth where the robots' maps agree among themselves is common to
-    all robots: they measure another point than the one that was surveyed. teams: the fold of each
+    Where the robots' maps agree among themselves, the remaining difference between map and truth is
+    common to all robots: they measure another point than the surveyed one. teams: the fold of each
     world with its true landmarks. The standard deviation is half of what Σ χ² = Σ dof ± √(2 Σ dof)
     leaves. None where no map has a shape; 0 where the covariances alone are wide enough.
     """

@@ -1,4 +1,4 @@
-"""Learns from detections without identities how many are clutter and how many are missed.
+"""Learn from detections without identities how many are clutter and how many are missed.
 
 Each window is associated anew, without any identity (`team.estimation.association`). After the scan
 that found a landmark first, every scan that looks at its place is a trial: with n of them, v
@@ -54,7 +54,7 @@ UNITS = {
 
 
 class WindowLooks(NamedTuple):
-    """What the scans of one window saw again.
+    """The repeated detections in the scans of one window.
 
     trials, again: for each landmark, the number of scans that looked at its place after its first
     detection, and of those of them that detected it. further: number of its other detections.

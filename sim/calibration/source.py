@@ -1,4 +1,4 @@
-"""Reads the measurements of a calibration: a data set's, or those of a log."""
+"""Read the measurements of a calibration: a data set's, or those of a log."""
 
 from pathlib import Path
 

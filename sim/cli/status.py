@@ -31,7 +31,7 @@ def status(
     ] = 3.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write it as JSON, too.")] = None,
 ) -> None:
-    """Show the nodes of a running team: rates, clocks, which waits for which, and what to do."""
+    """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
     from rich.console import Console
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""Decides which kind of data set lies at a path."""
+"""Decide which kind of data set lies at a path."""
 
 from pathlib import Path
 from typing import Literal

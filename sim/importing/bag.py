@@ -128,7 +128,7 @@ def _stamped(record: Record, arrival_ns: int) -> Record:
 
 
 def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
-    """Takes the mount of the robot's first sensor into the tables; returns notes."""
+    """Take the mount of the robot's first sensor into the tables; returns notes."""
     if not translator.mounts:
         return []
     tables.mount = next(iter(translator.mounts.values())).pose

@@ -1,4 +1,4 @@
-"""Propose which topics of a ROS 2 bag are what, by their names, types and frames."""
+"""Propose the use of the topics of a ROS 2 bag by their names, types and frames."""
 
 from pathlib import Path
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Imports a user's files, bag, log or data set into a data set's folder."""
+"""Import a user's files, bag, log or data set into a data set's folder."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Supervises the processes of a team: restarts those that die and gives up those without progress.
+"""Supervise the processes of a team: restarts those that die and gives up those without progress.
 
 The map does not need recorder and viewer: where they are given up the team goes on, and the run
 fails in the end. A robot that is given up is named as lost in the final map. Without router, world

@@ -1,4 +1,4 @@
-"""Evaluates a run: every figure from the samples of its log alone, against the truth in it.
+"""Evaluate a run: every figure from the samples of its log alone, against the truth in it.
 
 A figure that can not be computed (no truth, no such message) is None. Errors are in metres and
 radians; NEES is per degree of freedom, 1 where the covariance is right.

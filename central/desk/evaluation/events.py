@@ -1,4 +1,4 @@
-"""Detects the events of a team, in words: robots that join, are lost or refused, and nodes'
+"""Detect the events of a team, in words: robots that join, are lost or refused, and nodes'
 warnings.
 """
 

@@ -1,4 +1,4 @@
-"""Matches landmarks to true ones by distance: GOSPA of a map, and the true positions of landmarks
+"""Match landmarks to true ones by distance: GOSPA of a map, and the true positions of landmarks
 without identities where no labels are known.
 """
 

@@ -1,4 +1,4 @@
-"""Computes errors of running estimates against the truth as soon as that arrives."""
+"""Compute errors of running estimates against the truth as soon as that arrives."""
 
 from collections import deque
 from dataclasses import dataclass, field

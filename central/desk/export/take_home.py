@@ -1,4 +1,4 @@
-"""Writes the results of a run, the map and the paths, as tables in common formats.
+"""Write the results of a run, the map and the paths, as tables in common formats.
 
 `map.csv` and `map.json` have a landmark a row, `paths/<robot>.csv` and `.tum` a pose a row. Metres,
 seconds, radians, all in the frame that the map names; numbers with all digits, so that they are

@@ -1,4 +1,4 @@
-"""Writes the report as a folder: one self-contained page, its pictures, the figures."""
+"""Write the report as a folder: one self-contained page, its pictures, the figures."""
 
 import base64
 import json

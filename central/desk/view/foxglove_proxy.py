@@ -1,4 +1,4 @@
-"""Restricts access to the page and to Foxglove's WebSocket: viewers of this machine, no page of a
+"""Restrict access to the page and to Foxglove's WebSocket: viewers of this machine, no page of a
 foreign origin.
 
 The SDK's server accepts any origin, so it listens at a random address of loopback and a random

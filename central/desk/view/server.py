@@ -1,4 +1,4 @@
-"""Serves a log: the page with its stream of frames over a WebSocket, and Foxglove's WebSocket.
+"""Serve a log: the page with its stream of frames over a WebSocket, and Foxglove's WebSocket.
 
 A new connection receives every frame of the log from the first on, then the new ones. A page of
 another origin may not connect, nor one that uses another name for this machine (DNS rebinding).
