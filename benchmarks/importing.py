@@ -19,7 +19,7 @@ from pathlib import Path
 from rosbags.highlevel import AnyReader
 
 from benchmarks.baseline import worse
-from sim.importing.bag import imported_bag
+from sim.importing.bag import import_bag
 from team.ros2.decoding import READERS, DamagedError, decode
 from team.ros2.definitions import types
 from tests.ros2 import messages as ros
@@ -54,7 +54,7 @@ def plain_s(bag: Path) -> float:
 
 def imported_s(bag: Path, folder: Path) -> float:
     began = time.perf_counter()
-    for robot in imported_bag(bag, None, None).robots:
+    for robot in import_bag(bag, None, None).robots:
         robot.write(folder)
     return time.perf_counter() - began
 

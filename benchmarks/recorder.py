@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.baseline import concluded
 from sim.scenarios.scenario import dumps, load, with_options
-from team.recording.check import checked
+from team.recording.check import check_log
 from team.recording.reader import open_log
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -161,7 +161,7 @@ def _figures(log: Path, said: list[dict[str, Any]], cpu: float, memory: float) -
         "published": total,
         "recorded": sum(counts[key].messages for key in measurements if key in counts),
         "lost": lost,
-        "findings": [str(f) for f in checked(opened)],
+        "findings": [str(f) for f in check_log(opened)],
         "messages_per_s": total / took_s,
         "publishers_late_s": max(each["late_s"] for each in said),
         "payload_bytes": size,

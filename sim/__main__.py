@@ -1,4 +1,4 @@
-"""`python -m sim` is `teamslam`; what `launch` forks its processes from begins here, too."""
+"""`python -m sim` is `teamslam`; the template of `launch` begins here, too."""
 
 import sys
 
@@ -13,7 +13,7 @@ def main() -> None:
             _launch()
         else:
             _run()
-    except KeyboardInterrupt:  # while modules are imported; later a command says what it ended
+    except KeyboardInterrupt:  # while modules are imported; later a command reports it
         sys.exit(INTERRUPTED)
 
 

@@ -17,7 +17,6 @@ from sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
-    robot_stream,
 )
 from team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.pairs import NEEDS_MAP
@@ -105,13 +104,13 @@ def stream(
         np.zeros(len(met_at)),
     )
     start = StartPose(np.array([0.0, y, 0.0]), None) if known else None
-    return robot_stream(
+    return RobotStream(
         robot=robot,
         start_ns=0,
         start=start,
         intervals=intervals,
-        observations=seen,
-        sightings=met,
+        landmark_detections=seen,
+        teammate_detections=met,
         teammates=("r9",),
         truth_ns=ends,
         truth=poses,

@@ -1,8 +1,8 @@
 """The final map of a team without a centre: the one that every peer has.
 
-A robot publishes its own final map and its own conclusion, and nobody else's. The team's final map
-is therefore the one on which all peers agree; where they differ there is none, and whoever differs
-is named.
+A robot publishes its own final map and its own conclusion only. The team's final map is therefore
+the one on which all peers agree; where they differ there is none, and the differing peers are
+named.
 """
 
 import hashlib

@@ -1,32 +1,52 @@
-"""Several runs side by side: a column for each, a row for each figure, and one picture."""
+"""Compare runs: a row for each figure with a cell for each run, and pictures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import degrees
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from central.desk.drawing import GREY, robot_colours
-from central.desk.evaluation.evaluation import Evaluation, RobotResult
-from central.desk.names import in_order
+from central.desk.drawing import (
+    BLUE,
+    GREY,
+    TRUTH_COLOUR,
+    VERMILION,
+    draw_ellipses,
+    landmark_blocks,
+    robot_colours,
+)
+from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from central.desk.names import OUTSIDE, in_order
 from central.desk.pictures.run import new_figure
 from central.desk.pictures.style import save
-from central.desk.report.tables import shown
+from central.desk.report.tables import format_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Row = tuple[str, tuple[str, ...]]
+MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
+"""Colour and marker of the maps in `draw_maps`."""
 
 
 def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
-    """(figure, one cell per run); "–" where a run has none."""
+    """(figure, one cell per run); "–" where a run has none.
+
+    Of a run in an arbitrary frame only the aligned errors have a meaning.
+    """
     every = list(runs.values())
     rows = [(name, tuple(of(run) for run in every)) for name, of in _TEAM]
     matched = tuple(run.matched_by for run in every)
     rows += [("landmark errors by", matched)] if any(matched) else []
+    for robot in in_order({name for run in every for name in run.states}):
+        states = [run.states.get(robot) for run in every]
+        cells = tuple("–" if of is None else of.state for of in states)
+        rows.append((f"{robot}: in the final map", cells))
     for robot in in_order({name for run in every for name in run.robots}):
-        results = [run.robots.get(robot) for run in every]
+        results = [(run, run.robots.get(robot)) for run in every]
         rows += [
-            (f"{robot}: {name}", tuple("–" if r is None else of(r) for r in results))
+            (f"{robot}: {name}", tuple("–" if r is None else of(run, r) for run, r in results))
             for name, of in _ROBOT
         ]
     return rows
@@ -44,7 +64,7 @@ def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
     A run without true landmarks has its paths' errors only.
     """
     errors = [None if run.map is None else run.map.errors for run in runs.values()]
-    paths = [_aligned(each) for run in runs.values() for each in run.robots.values()]
+    paths = [_aligned_m(each) for run in runs.values() for each in run.robots.values()]
     if not any(errors) and np.isnan(paths).all():
         return False
     figure, (axes,) = new_figure(max(9.0, 2.5 + 1.2 * len(runs)), 4.2, 1, 3)
@@ -60,7 +80,7 @@ def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
     axes[1].set_title("map NEES per dof, 95 % band", fontsize=10)
     colours = robot_colours({name for run in runs.values() for name in run.robots})
     for robot, colour in colours.items():
-        paths = [_aligned(run.robots.get(robot)) for run in runs.values()]
+        paths = [_aligned_m(run.robots.get(robot)) for run in runs.values()]
         axes[2].plot(at, paths, "o-", color=colour, linewidth=0.7, label=robot)
     axes[2].set_title("path RMSE, aligned [m]", fontsize=10)
     axes[2].legend(frameon=False, fontsize=8)
@@ -72,58 +92,115 @@ def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
     return True
 
 
-def _aligned(robot: RobotResult | None) -> float:
+def _aligned_m(robot: RobotResult | None) -> float:
     value = None if robot is None else robot.aligned_rmse_m
     return float("nan") if value is None else value
 
 
-def _errors(run: Evaluation, name: str, form: str) -> str:
-    """A figure of the map's errors; of a map in an arbitrary frame only the aligned ones."""
-    errors = None if run.map is None else run.map.errors
-    if errors is None or (run.arbitrary_frame and name != "aligned_rmse_m"):
-        return "–"
-    return shown(getattr(errors, name), form, "")
+def same_final_map(recorded: Evaluation, changed: Evaluation) -> bool:
+    """Whether both ended with a map, and with the same bytes."""
+    a, b = recorded.map, changed.map
+    return a is not None and b is not None and a.payload_sha256 == b.payload_sha256
 
 
-def _smoothed(robot: RobotResult, name: str) -> float | None:
-    return None if robot.smoothed is None else float(getattr(robot.smoothed, name))
+def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
+    """The largest distance between a landmark's two positions; None without a common landmark."""
+    if recorded.map is None or changed.map is None:
+        return None
+    _, a, b = np.intersect1d(recorded.map.ids, changed.map.ids, return_indices=True)
+    moves = recorded.map.means[a] - changed.map.means[b]
+    return float(np.hypot(*moves.T).max()) if len(moves) else None
 
 
-def _settings(run: Evaluation) -> str:
-    return "–" if run.scenario is None else run.title
+def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
+    """Draw two final maps with 95 % ellipses over the truth; False where there is neither."""
+    if all(run.map is None for run in runs.values()):
+        return False
+    figure, ((axis,),) = new_figure(9.0, 9.0, 1, 1)
+    truth = next(iter(runs.values())).true_landmarks
+    if len(truth):
+        axis.plot(*truth.T, "x", color=TRUTH_COLOUR, markersize=8, label="true landmarks")
+    for (name, run), (colour, marker) in zip(runs.items(), MAP_STYLES, strict=True):
+        if run.map is not None:
+            _draw_map(axis, run.map, colour, name, marker)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.grid(color="#e4e4e4", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_title("Final maps with 95 % ellipses", fontsize=12)
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, frameon=False)
+    save(figure, path)
+    return True
 
 
-def _method(run: Evaluation) -> str:
-    scenario = run.scenario
-    return "–" if scenario is None else f"{scenario.estimator} + {scenario.fusion}"
+def _draw_map(axis: "Axes", fused: MapResult, colour: str, label: str, marker: str) -> None:
+    axis.plot(
+        *fused.means.T, marker, color=colour, markersize=8, markerfacecolor="none", label=label
+    )
+    draw_ellipses(axis, fused.means, landmark_blocks(fused.covariance), colour)
+
+
+def _of_map(name: str, form: str) -> Callable[[Evaluation], str]:
+    """A figure of the final map."""
+    return lambda run: format_figure(None if run.map is None else getattr(run.map, name), form, "")
+
+
+def _of_map_errors(name: str, form: str) -> Callable[[Evaluation], str]:
+    """A figure of the final map's errors."""
+
+    def cell(run: Evaluation) -> str:
+        errors = None if run.map is None else run.map.errors
+        if errors is None or (run.arbitrary_frame and name != "aligned_rmse_m"):
+            return "–"
+        return format_figure(getattr(errors, name), form, "")
+
+    return cell
+
+
+def _of_path(
+    kind: str, name: str, form: str, convert: Callable[[float], float] = float
+) -> Callable[[Evaluation, RobotResult], str]:
+    """A figure of a robot's smoothed or online path, as it lies."""
+
+    def cell(run: Evaluation, robot: RobotResult) -> str:
+        if kind == "online" and robot.outside:
+            return OUTSIDE
+        errors = None if run.arbitrary_frame else getattr(robot, kind)
+        return format_figure(None if errors is None else convert(getattr(errors, name)), form, "")
+
+    return cell
+
+
+def _maps_broadcast(run: Evaluation) -> str:
+    traffic = run.channels.get("central/map")
+    return str(0 if traffic is None else traffic.messages)
 
 
 _TEAM: Sequence[tuple[str, Callable[[Evaluation], str]]] = (
-    ("scenario", _settings),
-    ("method", _method),
-    ("landmarks", lambda r: "–" if r.map is None else str(len(r.map.ids))),
-    ("landmark RMSE [m]", lambda r: _errors(r, "rmse_m", ".4f")),
-    ("after rigid alignment [m]", lambda r: _errors(r, "aligned_rmse_m", ".4f")),
-    ("map NEES per dof", lambda r: _errors(r, "nees_per_dof", ".4g")),
+    ("scenario", lambda run: "–" if run.scenario is None else run.title),
     (
-        "joint cost per dof",
-        lambda r: shown(None if r.map is None else r.map.cost_per_dof, ".4g", ""),
-    ),
-    (
-        "covariance scale",
-        lambda r: shown(None if r.map is None else r.map.covariance_scale, ".2f", ""),
-    ),
-    ("final map, its bytes", lambda r: "–" if r.map is None else r.map.payload_sha256[:16]),
-)
-_ROBOT: Sequence[tuple[str, Callable[[RobotResult], str]]] = (
-    ("path RMSE, aligned [m]", lambda r: shown(r.aligned_rmse_m, ".4f", "")),
-    (
-        "heading RMSE [°]",
-        lambda r: shown(
-            None if r.smoothed is None else degrees(r.smoothed.heading_rmse_rad), ".3f", ""
+        "method",
+        lambda run: (
+            "–" if run.scenario is None else f"{run.scenario.estimator} + {run.scenario.fusion}"
         ),
     ),
-    ("pose NEES per dof", lambda r: shown(_smoothed(r, "nees_per_dof"), ".3g", "")),
-    ("online RMSE, aligned [m]", lambda r: shown(r.online_aligned_rmse_m, ".4f", "")),
-    ("uplink [B/step]", lambda r: shown(r.uplink_bytes_per_step, ".1f", "")),
+    ("landmarks", lambda run: "–" if run.map is None else str(len(run.map.ids))),
+    ("landmark RMSE [m]", _of_map_errors("rmse_m", ".4f")),
+    ("… after rigid alignment [m]", _of_map_errors("aligned_rmse_m", ".4f")),
+    ("map NEES per dof", _of_map_errors("nees_per_dof", ".4g")),
+    ("joint cost per dof", _of_map("cost_per_dof", ".4g")),
+    ("covariance scale", _of_map("covariance_scale", ".2f")),
+    ("maps broadcast", _maps_broadcast),
+    ("rule of the final map", lambda run: "–" if run.map is None else run.map.rule),
+    ("final map, its bytes", lambda run: "–" if run.map is None else run.map.payload_sha256[:16]),
+)
+_ROBOT: Sequence[tuple[str, Callable[[Evaluation, RobotResult], str]]] = (
+    ("online position RMSE [m]", _of_path("online", "position_rmse_m", ".4f")),
+    ("… aligned [m]", lambda _, robot: format_figure(robot.online_aligned_rmse_m, ".4f", "")),
+    ("smoothed position RMSE [m]", _of_path("smoothed", "position_rmse_m", ".4f")),
+    ("… aligned, smoothed [m]", lambda _, robot: format_figure(robot.aligned_rmse_m, ".4f", "")),
+    ("heading RMSE, smoothed [°]", _of_path("smoothed", "heading_rmse_rad", ".3f", degrees)),
+    ("pose NEES per dof", _of_path("smoothed", "nees_per_dof", ".3g")),
+    ("uplink [bytes/step]", lambda _, robot: format_figure(robot.uplink_bytes_per_step, ".1f", "")),
 )

@@ -39,7 +39,7 @@ def robot_colours(names: Iterable[str]) -> dict[str, str]:
 
 
 def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict[str, str]:
-    """What a legend has for each robot: its name; of more than `most` robots one entry for all.
+    """The legend entry of each robot: its name; one entry for all of more than `most` robots.
 
     Matplotlib leaves out a label that begins with an underscore.
     """

@@ -19,9 +19,7 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def not_joined(reasons: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Of a map's reasons: the robots that are not joined, as `r2, r3`, and why; others are left
-    out.
-    """
+    """The robots that are not joined by a map's reasons, as `r2, r3`, and why."""
     for reason in reasons:
         who, apart, why = reason.partition(_NOT_JOINED)
         if apart:

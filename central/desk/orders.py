@@ -1,8 +1,14 @@
-"""An operator's orders to a running team: go on without a robot, or end without it."""
+"""An operator's orders to a running team: withdraw a robot, end the team or go on without a lost
+robot, and verdicts on landmarks without names.
+"""
 
+import re
 import time
+from collections.abc import Iterator
 
+from central.desk.evaluation.verdicts import pair_of
 from central.desk.names import in_order
+from team.keys.roster import ROBOT
 from team.peers.members import Member, about
 from team.peers.proofs import Signs, signed_order
 from team.wire import channels as ch
@@ -13,22 +19,76 @@ from team.wire.codec import encoded
 CENTRE_S = 10.0
 """Time [s] within which a running centre or robot is noticed."""
 LOOK_S = 0.05
-NO_CENTRE = "no centre and no peer answers; is the team running there? see --team, --connect"
 PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
 """The channels of peers' own folds."""
-_PEER = "*"
-"""Stands in the set of reporters once a peer has announced its own fold."""
+_LANDMARK = re.compile(rf"({ROBOT.pattern})/(\d+)/(\d+)/(\d+)")
 
 
 class WithdrawError(RuntimeError):
-    """The order could not be given, or was not followed; the text says why and what to do."""
+    """The order could not be given, or was not followed; the text gives the reason and remedy."""
 
 
 class NoRobotError(WithdrawError):
     """The team has no such robot."""
 
 
-def ordered(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
+class RunningTeam:
+    """A running team on a bus: the robots with messages, and whether a centre or a peer folds."""
+
+    def __init__(self, bus: Bus, *channels: ch.Channel) -> None:
+        self.bus = bus
+        self.robots: set[str] = set()
+        self._has_peer = self._has_map = False
+        for channel in (ch.ROBOT_CONFIG, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS, *channels):
+            bus.subscribe(channel)
+        bus.watch_alive()
+
+    @property
+    def folds(self) -> bool:
+        """Whether a centre is alive, a peer has announced its own fold, or a map has arrived."""
+        return self._has_peer or self._has_map or self.bus.is_alive("central")
+
+    def messages(self, patience_s: float) -> Iterator[tuple[ch.Channel, m.Message]]:
+        """The sound messages that arrive within a time."""
+        until = time.monotonic() + patience_s
+        while time.monotonic() < until:
+            for channel, name, message in sound(self.bus.receive(LOOK_S)):
+                self._has_peer |= channel in PEERS
+                if channel is ch.ROBOT_CONFIG:
+                    self.robots.add(name)
+                elif isinstance(message, m.FusedMap):
+                    self._has_map = True
+                    self.robots |= {each.robot for each in message.members}
+                    self.robots |= set(message.withdrawn)
+                yield channel, message
+
+    def maps(self, patience_s: float) -> Iterator[m.FusedMap]:
+        """The maps of a centre or of peers that arrive within a time."""
+        for _, message in self.messages(patience_s):
+            if isinstance(message, m.FusedMap):
+                yield message
+
+    def await_robot(self, robot: str | None = None) -> None:
+        """Wait until a centre, or a peer, is present, and a message of the robot has arrived.
+
+        Raises WithdrawError where there is neither within CENTRE_S, NoRobotError where there is no
+        such robot.
+        """
+        until = time.monotonic() + CENTRE_S
+        while time.monotonic() < until:
+            for _ in self.messages(LOOK_S):
+                pass
+            if self.folds and (robot is None or robot in self.robots):
+                return
+        if not self.folds:
+            raise WithdrawError(
+                "no centre and no peer answers; is the team running there? see --team, --connect"
+            )
+        known = ", ".join(in_order(self.robots)) or "none"
+        raise NoRobotError(f"the team has no robot {robot}; its robots: {known}")
+
+
+def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
     """Publish an order; with keys its signature after it, for peers that receive it over others."""
     bus.publish(order)
     if signer is not None:
@@ -41,67 +101,57 @@ def ordered(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
 def withdraw(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
 ) -> m.FusedMap:
-    """Order a robot's withdrawal and wait for the first map without it, a centre's or a peer's.
+    """Order a robot's withdrawal and return the first map without it, a centre's or a peer's.
 
     signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
     no peer, no such robot, no rule that can withdraw, or no such map within the time.
     """
-    for channel in (ch.ROBOT_CONFIG, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
-        bus.subscribe(channel)
-    bus.watch_alive()
-    robots: set[str] = set()
-    await_team(bus, robot, robots)
+    team = RunningTeam(bus)
+    team.await_robot(robot)
     order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)
-    ordered(bus, Outgoing(ch.ORDER, robot, order), signer)
-    until = time.monotonic() + patience_s
-    while time.monotonic() < until:
-        for fused in _maps(bus, robots):
-            if robot in fused.withdrawn:
-                return fused
-            if fused.rule != "join":
-                raise WithdrawError(f"the rule {fused.rule} can not withdraw; only join can")
-            if fused.final:
-                raise WithdrawError("the final map was out before the order; run the log again")
+    publish_order(bus, Outgoing(ch.ORDER, robot, order), signer)
+    for fused in team.maps(patience_s):
+        if robot in fused.withdrawn:
+            return fused
+        if fused.rule != "join":
+            raise WithdrawError(f"the rule {fused.rule} can not withdraw; only join can")
+        if fused.final:
+            raise WithdrawError("the final map was out before the order; run the log again")
     raise WithdrawError(f"no map without {robot} within {patience_s:g} s; the order stands")
 
 
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
 ) -> None:
-    """Order that nobody waits for a robot any more, and wait until a centre or a peer confirms it.
+    """Order the team to go on without a lost robot; returns when a centre or a peer confirms it.
 
     signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
     no peer, no such robot, or no confirmation within the time.
     """
-    for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP, *PEERS):
-        bus.subscribe(channel)
-    bus.watch_alive()
-    await_team(bus, robot, set())
+    team = RunningTeam(bus, ch.STATUS)
+    team.await_robot(robot)
     node = ch.robot_node(robot)
     order = m.GivenUp(stamp_ns=0, node=node, by="operator", reason=reason)
-    ordered(bus, Outgoing(ch.GIVEN_UP, node, order), signer)
-    until = time.monotonic() + patience_s
-    while time.monotonic() < until:
-        for _, name, message in sound(bus.receive(LOOK_S)):
-            if isinstance(message, m.FusedMap) and message.final:
-                return
-            folds = name == "central" or name.startswith("robot/")
-            warnings = message.warnings if isinstance(message, m.Status) and folds else ()
-            if any(warning.startswith(f"{robot} is given up") for warning in warnings):
-                return
+    publish_order(bus, Outgoing(ch.GIVEN_UP, node, order), signer)
+    for _, message in team.messages(patience_s):
+        if isinstance(message, m.FusedMap) and message.final:
+            return
+        if not isinstance(message, m.Status):
+            continue
+        folds = message.node == "central" or message.node.startswith("robot/")
+        if folds and any(text.startswith(f"{robot} is given up") for text in message.warnings):
+            return
     raise WithdrawError(f"nobody has followed within {patience_s:g} s; the order stands")
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
-    """Order a live team to end, and wait until the centre repeats the order, or a peer follows.
+    """Order a live team to end; returns when the centre repeats the order, or a peer follows.
 
     Raises WithdrawError where there is neither, the team has a world, or no confirmation within the
     time.
     """
-    for channel in (ch.TEAM_END, ch.FINAL_MAP):
-        bus.subscribe(channel)
-    bus.watch_alive()
-    await_fold(bus)
+    team = RunningTeam(bus, ch.TEAM_END)
+    team.await_robot()
     if bus.is_alive("world"):
         raise WithdrawError(
             "this team has a world, which ends by itself; `teamslam end --without ROBOT` lets it "
@@ -109,58 +159,65 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
         )
     order = m.TeamEnd(stamp_ns=0, by="operator", reason=reason)
     bus.publish(Outgoing(ch.END_ORDER, "", order))
-    until = time.monotonic() + patience_s
-    while time.monotonic() < until:
-        for sample in bus.receive(LOOK_S):
-            found = ch.channel_of(sample.key)
-            if found is not None and found[0] in (ch.TEAM_END, ch.FINAL_MAP, ch.TEAM_FINAL):
-                return
+    for channel, _ in team.messages(patience_s):
+        if channel in (ch.TEAM_END, ch.FINAL_MAP, ch.TEAM_FINAL):
+            return
     raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 
 
-def await_fold(bus: Bus) -> None:
-    """Wait until a centre is alive or a peer has announced its fold; raises WithdrawError where
-    none has within CENTRE_S.
+def local_landmark(text: str) -> m.LocalLandmark:
+    """Parse `r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark; ValueError."""
+    found = _LANDMARK.fullmatch(text)
+    if found is None:
+        raise ValueError(f"{text!r} is no local landmark: robot/incarnation/submap/landmark")
+    robot, *numbers = found.groups()
+    incarnation, sequence, local = (int(each) for each in numbers)
+    return m.LocalLandmark(robot=robot, incarnation=incarnation, sequence=sequence, local=local)
+
+
+def judge(
+    bus: Bus,
+    judgement: m.Judgement,
+    reason: str,
+    patience_s: float,
+    signer: Signs | None = None,
+    *,
+    withdrawn: bool = False,
+) -> m.FusedMap:
+    """Publish a verdict on two landmarks without names; return the first map, a centre's or a
+    peer's, that takes it into account.
+
+    withdrawn: withdraw the verdict, and return a map without it. signer: the operator's, where
+    there are keys. Raises NoRobotError where the team does not have one of the robots,
+    WithdrawError where there is neither centre nor peer, or no such map within the time.
     """
-    until, reporters = time.monotonic() + CENTRE_S, set[str]()
-    for channel in PEERS:
-        bus.subscribe(channel)
-    while not (bus.is_alive("central") or _PEER in reporters):
-        if time.monotonic() > until:
-            raise WithdrawError(NO_CENTRE)
-        _maps(bus, reporters)
-
-
-def await_team(bus: Bus, robot: str, robots: set[str]) -> None:
-    """Wait until a centre, or a peer, is there, and a message of the robot has arrived.
-
-    robots: those of whom something has arrived; they are added. Raises WithdrawError where there is
-    neither, NoRobotError where there is no such robot.
-    """
-    until = time.monotonic() + CENTRE_S
-    folds = False
-    while time.monotonic() < until:
-        folds = bool(_maps(bus, robots)) or bus.is_alive("central") or _PEER in robots
-        if folds and robot in robots - {_PEER}:
-            return
-    if not folds:
-        raise WithdrawError(NO_CENTRE)
-    robots.discard(_PEER)
-    known = ", ".join(in_order(robots)) or "none"
-    raise NoRobotError(f"the team has no robot {robot}; its robots: {known}")
-
-
-def _maps(bus: Bus, robots: set[str]) -> list[m.FusedMap]:
-    """The maps that have arrived; the names of all robots in arrived messages are added to
-    `robots`.
-    """
-    found = []
-    for channel, name, message in sound(bus.receive(LOOK_S)):
-        if channel is ch.ROBOT_CONFIG:
-            robots.add(name)
-        elif channel is ch.TEAM_CONFIG:
-            robots.add(_PEER)
-        elif isinstance(message, m.FusedMap):
-            robots |= {member.robot for member in message.members} | set(message.withdrawn)
-            found.append(message)
-    return found
+    team = RunningTeam(bus)
+    robot = judgement.first.robot
+    for each in (robot, judgement.second.robot):
+        team.await_robot(each)
+    verdict = m.Verdict(
+        stamp_ns=0,
+        robot=robot,
+        judgement=judgement,
+        by="operator",
+        reason=reason,
+        withdrawn=withdrawn,
+    )
+    publish_order(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
+    for fused in team.maps(patience_s):
+        holds = any(
+            pair_of(each) == pair_of(judgement) and each.same == judgement.same
+            for each in fused.verdicts
+        )
+        if holds is not withdrawn:
+            return fused
+        if fused.final:
+            raise WithdrawError("the final map was out before the verdict; run the log again")
+    if withdrawn:
+        raise WithdrawError(
+            f"no map without it within {patience_s:g} s; its withdrawal is recorded, and stands"
+        )
+    raise WithdrawError(
+        f"no map rests on it within {patience_s:g} s; the verdict is recorded, and holds once a "
+        "map has both landmarks: if none ever does, a submap or a landmark is not as named"
+    )

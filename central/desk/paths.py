@@ -1,4 +1,4 @@
-"""Computes smoothed paths at the rate of keyframes, from a log's final map and its measurements.
+"""Compute smoothed paths at the rate of keyframes, from a log's final map and its measurements.
 
 The final map has each robot's poses at the ends of its submaps. Between them the robot's windows
 are computed again from the recorded measurements, and each window's path is placed between its two

@@ -1,4 +1,4 @@
-"""Presents a team without a centre to the desk: peers' messages about the map, as a centre's.
+"""Present a team without a centre to the desk: peers' messages about the map, as a centre's.
 
 The running maps are those of one peer, the first that publishes one; the final map is the one on
 which all peers agree; a prior and a smoothed path are their own robot's. While there is a centre,

@@ -1,4 +1,4 @@
-"""Observes a running team: its nodes, their progress and rates, their clocks, and which wait for
+"""Observe a running team: its nodes, their progress and rates, their clocks, and which wait for
 which.
 """
 
@@ -9,8 +9,7 @@ from statistics import median
 from central.desk.names import in_order
 from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Bus, shown
-from team.wire.codec import WireError
+from team.wire.bus import Bus, sound
 from team.wire.newer import later_head
 
 LOOK_S = 0.1
@@ -24,7 +23,7 @@ DRIFT = 0.1
 
 @dataclass
 class Member:
-    """One node: its liveliness, its last status, and what it counted in which time.
+    """One node: its liveliness, its last status, and its counts over time.
 
     clock_s: its team time less its machine's wall clock; None where it reports no team time.
     drift: by how much that has changed per second of the observation.
@@ -78,13 +77,10 @@ class Presence:
         until = time.monotonic() + for_s
         while time.monotonic() < until:
             for sample in bus.receive(LOOK_S):
-                try:
-                    _, _, message = shown(sample)
-                except WireError:
-                    continue
-                self._hear(message, sample.wall_ns)
+                for _, _, message in sound([sample]):
+                    self._take_message(message, sample.wall_ns)
 
-    def _hear(self, message: m.Message, wall_ns: int) -> None:
+    def _take_message(self, message: m.Message, wall_ns: int) -> None:
         match message:
             case m.Liveliness():
                 self._of(message.node).alive = message.alive
@@ -126,7 +122,7 @@ class Presence:
             advice.append("the final map is out: the team has ended")
         if not self.is_there("central"):
             advice.append(
-                "no centre: robots map on, nobody joins their maps; start teamslam central"
+                "no centre: robots go on mapping, their maps are not joined; start teamslam central"
             )
         world = self.is_there("world")
         for robot in [] if world else self.robots:
@@ -162,8 +158,9 @@ class Presence:
 
 
 def _remedy(member: Member, *, behind: bool) -> str:
-    """What to do about a driver whose stamps are not the others': of recorded data, and of a lag
-    that changes, no clock is to be set.
+    """The remedy for a driver whose stamps differ from the others'.
+
+    Recorded data, and a lag that changes, need no setting of a clock.
     """
     if abs(member.clock_s or 0.0) > PAST_S:
         if not behind:
@@ -175,12 +172,12 @@ def _remedy(member: Member, *, behind: bool) -> str:
     if behind and abs(member.drift) > DRIFT:
         way = "catches up" if member.drift > 0.0 else "falls further behind"
         return (
-            f"it lags and {way}: its program hands over what lies back; started again, it may go "
+            f"it lags and {way}: its program delivers old measurements; started again, it may go "
             "on after robot.last_time"
         )
     return (
         "set its machine's clock (NTP, PTP), or stamp with the clock that the others have; or its "
-        "program lags behind what it measures"
+        "program lags behind its measurements"
         if behind
         else "set its machine's clock (NTP, PTP), or stamp with the clock that the others have"
     )

@@ -1,4 +1,4 @@
-"""Learns the figures of the odometry's and the sensor's models from measurements.
+"""Learn the figures of the odometry's and the sensor's models from measurements.
 
 Where the data have the true poses and landmarks, every figure is a maximum-likelihood estimate
 against them. Constants of the sensor are learnt for each robot separately where robots differ
@@ -35,7 +35,7 @@ from sim.calibration.detections import claim_notes, detection_figures, windows_o
 from sim.calibration.figures import (
     CalibrationError,
     Figure,
-    jackknifed,
+    jackknife,
     with_figures,
 )
 from sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
@@ -87,7 +87,7 @@ class Calibration:
     team: tuple[str, ...] = ()
 
 
-def calibrated(
+def calibrate_models(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
     """Learn from all worlds together, starting from the scenario's models (one for all robots).
@@ -133,8 +133,8 @@ def _by_truth(
     def fit(part: Sequence[Reference]) -> Mapping[str, float]:
         return sensor.fit_sensor(part, depth=depth)
 
-    of_sensor = jackknifed(fit, data, sensor.UNITS)
-    of_sensor += jackknifed(
+    of_sensor = jackknife(fit, data, sensor.UNITS)
+    of_sensor += jackknife(
         lambda part: claims.landmark_factor(part, scenario.robots[0].sensor), data, claims.UNITS
     )
     placed = claims.mount_note(data, scenario.robots[0].sensor)
@@ -268,14 +268,14 @@ def _motion_figures(data: Sequence[Reference], scenario: Scenario) -> tuple[Figu
     if not data:
         raise CalibrationError("no robot has both odometry and a known path")
     if all(each.intervals.claimed.all() for each in data):
-        return jackknifed(claims.odometry_factor, data, claims.UNITS)
+        return jackknife(claims.odometry_factor, data, claims.UNITS)
 
     slow_below = given.slow_below if motion.creep(data, given.slow_below) else 0.0
 
     def fit(part: Sequence[Reference]) -> Mapping[str, float]:
         return motion.fit_motion(part, given.yaw_rate_limit, slow_below)
 
-    return jackknifed(fit, data, motion.UNITS)
+    return jackknife(fit, data, motion.UNITS)
 
 
 def _positions(world: WorldStreams) -> dict[int, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Compares the covariances that measurements carry, and the sensor's mount, with the truth.
+"""Compare the covariances that measurements carry, and the sensor's mount, with the truth.
 
 Covariances of odometry or of landmark measurements are taken to be right up to a factor: the median
 of the squared Mahalanobis errors over the median of chi-square. Errors of odometry are taken over

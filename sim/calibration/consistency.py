@@ -1,4 +1,4 @@
-"""Learns how consistent submaps are from the maps of single robots, without the truth.
+"""Learn how consistent submaps are from the maps of single robots, without the truth.
 
 A robot's own map a and the map b of the others share no measurement. If the covariances are right,
 
@@ -23,9 +23,9 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 
 from central.config import CentralConfig
-from central.desk.evaluation.errors import map_errors, moved, rigid_alignment
+from central.desk.evaluation.errors import map_errors, rigid_alignment, transform_points
 from central.tick_fold import join_settings
-from sim.calibration.figures import Figure, nested
+from sim.calibration.figures import Figure, nest_figures
 from sim.scenarios.scenario import Scenario
 from team.estimation.consistency import covariance_scale
 from team.estimation.contribution import InitialPoseFactor, Stream
@@ -66,7 +66,7 @@ def central_figures(
     the monitor's normal scale, and by the true landmarks of each world the landmarks' own sigma.
     """
     progress("maps of single robots against the rest of their team")
-    fields = nested(msgspec.to_builtins(scenario.central), strays, CentralConfig)
+    fields = nest_figures(msgspec.to_builtins(scenario.central), strays, CentralConfig)
     for table in ("bias_sigma", "common_bias_sigma"):
         fields_of_table = msgspec.to_builtins(getattr(scenario.central, table))
         fields[table] = fields_of_table | msgspec.to_builtins(fields[table])
@@ -129,10 +129,10 @@ def landmark_sigma(
     teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
 ) -> Figure | None:
     """The σ [m] under which the shapes of the joined maps are as far from the true landmarks as
-    their covariances P + σ² I say: Σ χ²(σ) = Σ dof.
+    their covariances P + σ² I predict: Σ χ²(σ) = Σ dof.
 
-    What is left between map and truth where the robots' maps agree among themselves is common to
-    all robots: they measure another point than the one that was surveyed. teams: the fold of each
+    Where the robots' maps agree among themselves, the remaining difference between map and truth is
+    common to all robots: they measure another point than the surveyed one. teams: the fold of each
     world with its true landmarks. The standard deviation is half of what Σ χ² = Σ dof ± √(2 Σ dof)
     leaves. None where no map has a shape; 0 where the covariances alone are wide enough.
     """
@@ -263,7 +263,7 @@ def _between(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]
     turn = np.kron(np.eye(len(a)), np.array([[c, -s], [s, c]]))
     difference = np.hstack([np.eye(2 * len(a)), -turn])
     of_difference = difference @ covariance @ difference.T
-    shape = map_errors(a, of_difference, moved(a_from_b, b)).shape
+    shape = map_errors(a, of_difference, transform_points(a_from_b, b)).shape
     dof = 2 * len(a) - 3
     assert shape is not None
     return Disagreement(0.5 * dof * shape.nees_per_landmark, dof)

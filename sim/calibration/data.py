@@ -48,7 +48,7 @@ class Reference:
 
     @property
     def robot(self) -> str:
-        """The robot's id, the last word of the name."""
+        """The robot's id, the last part of the name."""
         return self.name.rpartition(" ")[2]
 
     def between(self, begin_ns: int, end_ns: int) -> "Reference":

@@ -1,4 +1,4 @@
-"""Learns from detections without identities how many are clutter and how many are missed.
+"""Learn from detections without identities how many are clutter and how many are missed.
 
 Each window is associated anew, without any identity (`team.estimation.association`). After the scan
 that found a landmark first, every scan that looks at its place is a trial: with n of them, v
@@ -54,7 +54,7 @@ UNITS = {
 
 
 class WindowLooks(NamedTuple):
-    """What the scans of one window saw again.
+    """The repeated detections in the scans of one window.
 
     trials, again: for each landmark, the number of scans that looked at its place after its first
     detection, and of those of them that detected it. further: number of its other detections.
@@ -224,7 +224,7 @@ def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
 def claim_notes(
     figures: Sequence[Figure], central: Sequence[Figure], settings: AssociationSettings
 ) -> tuple[str, ...]:
-    """Warnings where what is claimed does not hold, in words."""
+    """Warnings where claimed covariances do not hold, in words."""
     value = {each.name: each.value for each in (*figures, *central)}
     notes = []
     inside, between = value.get("errors_over_claims", 1.0), value.get("covariance_factor", 1.0)

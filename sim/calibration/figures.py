@@ -28,7 +28,7 @@ Fit = Callable[[Sequence[T]], Mapping[str, float]]
 
 
 class CalibrationError(ValueError):
-    """The data do not determine a figure; the text says what is missing."""
+    """The data do not determine a figure; the text names the missing data."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
     return groups
 
 
-def jackknifed(
+def jackknife(
     fit: Fit[Reference], data: Sequence[Reference], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
     """The fit of all data, with the uncertainty of `left_out` over robots or stretches of time."""
@@ -120,10 +120,10 @@ def with_figures(
         msgspec.structs.replace(
             robot,
             motion=msgspec.convert(
-                nested(msgspec.to_builtins(robot.motion), of_motion, MotionModel), MotionModel
+                nest_figures(msgspec.to_builtins(robot.motion), of_motion, MotionModel), MotionModel
             ),
             sensor=msgspec.convert(
-                nested(
+                nest_figures(
                     msgspec.to_builtins(robot.sensor),
                     (*of_sensor, *of_robots.get(robot.id, ())),
                     Sensor,
@@ -136,7 +136,7 @@ def with_figures(
     return msgspec.structs.replace(scenario, robots=robots)
 
 
-def nested(
+def nest_figures(
     below: Mapping[str, object], figures: Sequence[Figure], declared: type[msgspec.Struct]
 ) -> dict[str, object]:
     """The fields of a model overlaid with figures: `forward.per_m` is a field of `forward`.

@@ -1,4 +1,4 @@
-"""Learns which constants single robots' sensors have, and how they vary from world to world.
+"""Learn which constants single robots' sensors have, and how they vary from world to world.
 
 A constant of robot r in world w is v = m + a_r + e_rw. Each robot's value is its mean over the
 worlds, shrunk towards the mean of all robots by the uncertainty that the spread s of e leaves:

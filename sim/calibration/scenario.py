@@ -11,7 +11,7 @@ import tomli_w
 
 from central.config import CentralConfig
 from sim.calibration.calibrate import Calibration
-from sim.calibration.figures import Figure, nested
+from sim.calibration.figures import Figure, nest_figures
 from sim.scenarios.document import own_document
 from sim.scenarios.scenario import Scenario, builtin_names
 from sim.world.config import FolderWorld, LiveWorld
@@ -37,7 +37,7 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
     differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
     by_robot = calibration.robots or calibration.clocks or (calibration.by_truth and differ)
     for robot in scenario.robots if by_robot or isinstance(world, LiveWorld) else ():
-        fields = nested({}, calibration.robots.get(robot.id, ()), Sensor)
+        fields = nest_figures({}, calibration.robots.get(robot.id, ()), Sensor)
         own = [f"sensor = {_inline(fields)}"] if fields else []
         clock = calibration.clocks.get(robot.id)
         if clock is not None:
@@ -63,7 +63,7 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
     for name, figures, declared in _parts(calibration):
         comments += [f"# {name}.{f.name}: {f.value:.5g} {_uncertainty(f)}" for f in figures]
         first, *inner = name.split(".")
-        learnt = nested({}, [_rounded(figure) for figure in figures], declared)
+        learnt = nest_figures({}, [_rounded(figure) for figure in figures], declared)
         if not learnt:
             continue
         below = document.setdefault(first, {})
@@ -76,7 +76,7 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
         new: Fields = {"id": robot_id}
         robot = next((each for each in robots if each.get("id") == robot_id), new)
         of_robot = [_rounded(figure) for figure in figures]
-        robot["sensor"] = nested(robot.get("sensor", {}), of_robot, Sensor)
+        robot["sensor"] = nest_figures(robot.get("sensor", {}), of_robot, Sensor)
         if robot is new:
             robots.append(robot)
     for robot_id, clock in calibration.clocks.items():
@@ -139,7 +139,7 @@ def _inline(value: object) -> str:
 
 
 def _table(figures: Sequence[Figure], declared: type[msgspec.Struct]) -> list[str]:
-    fields = nested({}, figures, declared)
+    fields = nest_figures({}, figures, declared)
     lines = []
     for figure in figures:
         if figure.name in fields:

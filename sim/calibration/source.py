@@ -1,11 +1,11 @@
-"""Reads the measurements of a calibration: a data set's, or those of a log."""
+"""Read the measurements of a calibration: a data set's, or those of a log."""
 
 from pathlib import Path
 
 import msgspec
 
 from sim.datasets.kinds import UTIAS_MARKER
-from sim.datasets.tables import opened as opened_set
+from sim.datasets.tables import open_data_set as opened_set
 from sim.datasets.utias_log import present_robots
 from sim.recorded.streams import measurements_in
 from sim.scenarios.scenario import Scenario, builtin_names, load, with_options

@@ -1,1 +1,1 @@
-"""The command line: a module for each group of commands, and what they have in common."""
+"""The command line: a module for each group of commands, and their common options."""

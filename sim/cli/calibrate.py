@@ -39,7 +39,7 @@ def calibrate(
     from rich.console import Console
     from rich.table import Table
 
-    from sim.calibration.calibrate import calibrated
+    from sim.calibration.calibrate import calibrate_models
     from sim.calibration.figures import CalibrationError
     from sim.calibration.scenario import scenario_toml, within
     from sim.calibration.source import measurements_of, own_scenario
@@ -64,7 +64,7 @@ def calibrate(
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
     try:
-        found = calibrated(worlds, start, lambda text: typer.echo(text, err=True))
+        found = calibrate_models(worlds, start, lambda text: typer.echo(text, err=True))
     except CalibrationError as error:
         fail(str(error), FAILED)
     table = Table("part", "figure", "value", "± (1 σ)", "unit")

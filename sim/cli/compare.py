@@ -21,7 +21,7 @@ def compare(
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
 ) -> None:
-    """Runs side by side: a column for each in a table, and a picture with -o."""
+    """Compare runs side by side: a column for each in a table, and a picture with -o."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

@@ -109,7 +109,7 @@ def driver(
                     if translated.refusal:
                         fail(f"{ros2}: {translated.refusal}", WRONG_USE)
                 until = time.monotonic() + LAST_S
-                while time.monotonic() < until:  # what is on its way; a topic need not fall silent
+                while time.monotonic() < until:  # messages on their way; the topic may go on
                     for sample in foreign.receive(LAST_S):
                         translated.put(sample)
                 translated.deliver()
@@ -125,7 +125,7 @@ def driver(
 
 
 def _log_totals(translated: "Ros2Driver") -> None:
-    """Log what was taken and dropped in all, and the warnings that remain."""
+    """Log the totals of messages taken and dropped, and the remaining warnings."""
     for topic, count in translated.taken.items():
         _LOG.info("%s: %d messages", topic, count)
     for reason, count in translated.dropped.items():

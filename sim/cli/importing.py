@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.options import WRONG_USE, counted, fail, parsed_start
+from sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
 
 app = typer.Typer()
 ROS2_PROFILE = b"ros2"
@@ -53,7 +53,7 @@ def import_(
     import re
 
     from sim.datasets.folder_files import ROBOT_NAME
-    from sim.importing.source import Request, imported, proposal
+    from sim.importing.source import Request, import_data, proposal
 
     if output is None:
         fail(proposal(source[0]) + "give the folder for the data set: -o FOLDER", WRONG_USE)
@@ -71,7 +71,7 @@ def import_(
         truth=truth,
     )
     try:
-        report = imported(request, output)
+        report = import_data(request, output)
         elapsed_s = time.monotonic() - began
         notes = dict.fromkeys([*report.notes, *_as_read(output)])  # each once
     except BaseException:  # half a data set is none, and the next attempt may have its folder
@@ -81,7 +81,7 @@ def import_(
         typer.echo(note)
     if report.messages:
         rate = report.messages / elapsed_s
-        typer.echo(f"{counted(report.messages, 'message')}, {rate:,.0f} a second")
+        typer.echo(f"{count_noun(report.messages, 'message')}, {rate:,.0f} a second")
     typer.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
 
 
@@ -100,11 +100,11 @@ def _is_bag_folder(path: Path) -> bool:
 
 def imported_into(path: Path, folder: Path) -> Path:
     """Import a bag or a log; returns the folder, and prints what was imported."""
-    from sim.importing.source import Request, imported
+    from sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
         fail(f"{folder} is not empty: give another --output", WRONG_USE)
-    for note in imported(Request(sources=[path]), folder).notes:
+    for note in import_data(Request(sources=[path]), folder).notes:
         typer.echo(note, err=True)
     typer.echo(f"imported {path} into {folder}", err=True)
     return folder
@@ -124,11 +124,11 @@ def readable(path: Path) -> Iterator[Path]:
     if not (path.suffix == ".db3" or _is_bag_folder(path) or _is_ros2_mcap(path)):
         yield path
         return
-    from sim.importing.source import Request, imported
+    from sim.importing.source import Request, import_data
 
     with TemporaryDirectory() as place:
         folder = Path(place) / path.stem
-        for note in imported(Request(sources=[path]), folder).notes:
+        for note in import_data(Request(sources=[path]), folder).notes:
             typer.echo(note, err=True)
         yield folder
 
@@ -142,7 +142,7 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 
 def _as_read(folder: Path) -> list[str]:
-    """What there is of each robot, and what its tables have that can not be used."""
+    """The measurements of each robot, and the notes on unusable rows of its tables."""
     from central.desk.evaluation.clocks import separate_times_warning
     from sim.datasets.tables import DatasetError
     from sim.scenarios.scenario import load, with_options
@@ -159,11 +159,11 @@ def _as_read(folder: Path) -> list[str]:
         lines.append(warning)
     for stream in streams.streams:
         seen, teammates = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)
-        driven = counted(len(stream.intervals.end_ns), "odometry interval")
+        driven = count_noun(len(stream.intervals.end_ns), "odometry interval")
         pose = "known" if stream.start is not None else "not known"
         lines.append(
-            f"{stream.robot}: {driven}, {counted(seen, 'measurement')}, "
-            f"{counted(teammates, 'sighting')}, initial pose {pose}"
+            f"{stream.robot}: {driven}, {count_noun(seen, 'measurement')}, "
+            f"{count_noun(teammates, 'sighting')}, initial pose {pose}"
         )
         lines += [f"{stream.robot}: {note}" for note in stream.notes]
     return lines

@@ -38,12 +38,13 @@ def keys(
         typer.Option(help="The router is to forget this node.", metavar="NODE"),
     ] = None,
     replay: Annotated[
-        bool, typer.Option("--replay", help="One for `teamslam replay`, which may say all.")
+        bool,
+        typer.Option("--replay", help="One for `teamslam replay`, which may publish on all keys."),
     ] = False,
 ) -> None:
     """Make the certificates of a team: an authority, and one for each process and robot.
 
-    What is there already is kept: so a robot is added by naming it. docs/security.md says which
+    Existing certificates are kept, so a robot is added by naming it. docs/security.md says which
     files go where.
     """
     from team.keys.authority import make_keys

@@ -36,6 +36,7 @@ from sim.cli.options import (
     scenario_of,
     set_aside,
 )
+from sim.cli.results import print_evaluation, print_nis, print_written, read_run
 from sim.cli.steps import Steps
 from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
 from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
@@ -225,7 +226,7 @@ def _keep_showing(url: str, log: Path) -> None:
     """Keep the page until the user ends the command."""
     from team.shell import process
 
-    with process("launch", endless=True) as stop:  # who reads of Ctrl-C may press it at once
+    with process("launch", endless=True) as stop:  # the line names Ctrl-C, which may follow at once
         typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
         stop.wait()
 
@@ -233,7 +234,7 @@ def _keep_showing(url: str, log: Path) -> None:
 def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
     """The scenario with the robots that its data set has, a note on the others, and the streams.
 
-    A data set is read before any process starts. What is simulated needs none of this.
+    A data set is read before any process starts; a simulated world is not.
     """
     from sim.world.config import LiveWorld, SimulatedWorld
 
@@ -281,7 +282,7 @@ def _check_writable(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         is_new = not path.exists()
         path.open("a").close()
-        if is_new:  # whoever waits for the file is to find it whole
+        if is_new:  # a reader that waits for the file must find it whole
             path.unlink()
     except OSError as error:
         fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
@@ -321,7 +322,7 @@ def _keep_earlier(log: Path) -> None:
 
 
 KERNELS_TO_ESTIMATE = 5
-"""The first kernels take longer than most: they say nothing of the rest."""
+"""The first kernels take longer than most, so no time is estimated from them."""
 
 
 class _Compiling:
@@ -367,12 +368,11 @@ def _compile(scenario: Scenario) -> None:
 def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
-    """Write the report and say what was written; where that fails, as on a full disk, note it."""
+    """Write the report and print its files; an error, as of a full disk, fails the run."""
     from central.desk.report.page import write_report
 
     try:
-        for path in write_report(run, outcome.folder, figures):
-            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        print_written(write_report(run, outcome.folder, figures), console)
     except OSError as error:
         outcome.failures.append(
             f"{outcome.folder}: can not write the report: {error.strerror}; "
@@ -386,14 +386,10 @@ def _conclude(
     """Evaluate the log, print the result and write the report; ends with 1 if anything failed."""
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
-    from central.desk.evaluation.history import history
+    from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
     from central.desk.evaluation.states import not_in_the_map
-    from central.desk.export.take_home import taken_home
     from central.desk.names import in_order
-    from central.desk.report.run import Run, nis_line, run_figures
-    from central.desk.report.tables import summary_tables
-    from central.desk.verification.recorded import recorded
+    from central.desk.report.run import run_figures
     from team.recording.parts import join
     from team.recording.reader import LogError, open_log
 
@@ -417,26 +413,17 @@ def _conclude(
     try:
         log = replace(open_log(outcome.log), reading=steps.share)
         plain = evaluate(log.samples())
-        evaluation = with_holes(plain, log)
+        evaluation = add_holes(plain, log)
     except (LogError, OSError) as error:
         outcome.failures += [*outcome.deaths, f"the log can not be evaluated: {error}"]
         figures = extra
     else:
         figures = to_json(evaluation, extra)
-        for table in summary_tables(evaluation):
-            console.print(table)
-        for note in evaluation.notes:
-            console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        print_evaluation(evaluation, console)
         if report:
-            steps.begin("reading what the robots received")
-            messages = recorded(log)
-            steps.begin("smoothing the paths")
-            home = taken_home(messages, steps.robot)
-            steps.begin("reading the run's history")
-            run = Run(evaluation, history(log.samples()), log.metadata, taken_home=home)
+            run = read_run(log, evaluation, steps, proves_ledger=False)
             typer.echo("drawing the pictures and writing the report", err=True)
-            if (line := nis_line(run.history)) is not None:
-                console.print(line, highlight=False, soft_wrap=True)
+            print_nis(run, console)
             _write_report(run, outcome, {**figures, **run_figures(run)}, console)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")

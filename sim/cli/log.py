@@ -12,7 +12,7 @@ from sim.cli.options import (
     FAILED,
     WRONG_USE,
     LogArgument,
-    counted,
+    count_noun,
     fail,
     refuse_existing,
     tell_holes,
@@ -57,7 +57,7 @@ def info(
         Path | None, typer.Option("--json", help="Write the figures of every key, too.")
     ] = None,
 ) -> None:
-    """What is in a log: channels, messages, bytes, rates, span in team time, metadata."""
+    """Show the contents of a log: channels, messages, bytes, rates, span in team time, metadata."""
     import json
     from dataclasses import asdict
 
@@ -66,11 +66,11 @@ def info(
 
     from team.recording.check import holes
     from team.recording.reader import open_log
-    from team.recording.summary import summarised
+    from team.recording.summary import summarise_log
 
     opened = open_log(log)
     lacks = holes(opened)
-    summary = summarised(opened)
+    summary = summarise_log(opened)
     span = summary.span_ns()
     console = Console()
     messages, size = (sum(getattr(k, name) for k in summary.keys) for name in ("messages", "bytes"))
@@ -103,14 +103,14 @@ def info(
 
 @app.command()
 def check(log: LogArgument) -> None:
-    """Whether a log is whole and sound: checksums, schemas, counters, order, every message.
+    """Check that a log is whole and sound: checksums, schemas, counters, order, every message.
 
     Exit status 1 when anything is wrong; each finding is one line.
     """
-    from team.recording.check import checked
+    from team.recording.check import check_log
     from team.recording.reader import open_log
 
-    findings = checked(open_log(log))
+    findings = check_log(open_log(log))
     for finding in findings:
         typer.echo(one_line(str(finding)))
     if findings:
@@ -132,7 +132,7 @@ def cut(
 ) -> None:
     """Write a stretch of team time, or some channels, as a log of its own.
 
-    Configurations and true landmarks that were said before the stretch hold in it and are kept.
+    Configurations and true landmarks from before the stretch are kept, since they hold in it.
     """
     import math
 
@@ -155,7 +155,7 @@ def merge(
     logs: Annotated[list[Path], typer.Argument(help="Logs of one team: of robots, or parts.")],
     output: NewLog,
 ) -> None:
-    """Put logs together: by team time, what several of them have once."""
+    """Merge logs by team time; messages that several of them have are written once."""
     from team.recording.merge import merge as merge_logs
     from team.recording.reader import open_log
 
@@ -202,7 +202,7 @@ def export(
         return
     exported = _exporter(form)(opened, output, chosen)
     for path, rows in exported.rows.items():
-        typer.echo(f"{path}: {counted(rows, 'row')}")
+        typer.echo(f"{path}: {count_noun(rows, 'row')}")
     if exported.unsound:
         typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
 
@@ -237,7 +237,7 @@ def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> 
     """Messages, bytes, rate of one key, first and last time [s after start_ns], by key or channel.
 
     The rate of a channel is the mean of those of its keys; a key that begins before start_ns, as
-    what is said at team time zero of a data set, has none.
+    a configuration at team time zero, has none.
     """
     from rich.table import Table
     from rich.text import Text

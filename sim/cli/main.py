@@ -1,4 +1,4 @@
-"""`teamslam`: the command line. Every command imports what it needs when it runs."""
+"""`teamslam`: the command line. Every command imports its modules when it runs."""
 
 import os
 import sys

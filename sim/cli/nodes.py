@@ -23,7 +23,7 @@ from sim.cli.options import (
     Seed,
     SpeedText,
     check_names,
-    connected,
+    connect_bus,
     fail,
     over_tls,
     own_keys,
@@ -115,7 +115,7 @@ def world(
     pace = parsed_speed(speed)
     resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
     streams = streams_of(resolved)
-    with process("world") as stop, connected(resolved.team, connect, keys, "world", stop) as bus:
+    with process("world") as stop, connect_bus(resolved.team, connect, keys, "world", stop) as bus:
         _connected(resolved, connect)
         for text in scenario_warnings(resolved):
             _LOG.warning("%s", text)
@@ -183,7 +183,7 @@ def robot(
     with (
         process(f"robot-{name}") as stop,
         nullcontext() if log is None else own_log(log, resolved.team) as tap,
-        connected(resolved.team, connect, keys, f"robot-{name}", stop) as bus,
+        connect_bus(resolved.team, connect, keys, f"robot-{name}", stop) as bus,
     ):
         bus.tap = tap
         _connected(resolved, connect)
@@ -272,7 +272,7 @@ def central(
     )
     with (
         process("central") as stop,
-        connected(resolved.team, connect, keys, "central", stop) as bus,
+        connect_bus(resolved.team, connect, keys, "central", stop) as bus,
     ):
         _connected(resolved, connect)
         try:
@@ -361,13 +361,13 @@ def record(
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
     configurations = []
-    if resolved.is_live:  # what a recorder of other teams does not need: it takes 105 MB
+    if resolved.is_live:  # other teams' recorders save its 105 MB
         from team.wire.digest import configured
 
         configurations = [configured("world", 0, 0, resolved)]
     with (
         process("recorder", endless=True) as stop,
-        connected(resolved.team, connect, keys, "recorder", stop) as bus,
+        connect_bus(resolved.team, connect, keys, "recorder", stop) as bus,
     ):
         recorder, inventory = next_part(output, resolved.team, metadata)
         _connected(resolved, connect)

@@ -114,7 +114,7 @@ def check_pieces(scenario: Scenario) -> None:
         )
 
 
-def connected(
+def connect_bus(
     team: str,
     connect: str,
     keys: Path | None,
@@ -132,7 +132,7 @@ def connected(
 
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
-    """The node's certificate and key, checked; warns of what will soon expire."""
+    """The node's certificate and key, checked; warns of a certificate that will soon expire."""
     from team.keys.credentials import credentials_of
 
     own = credentials_of(folder, node, team)
@@ -183,7 +183,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def warn_of_holes(log: "Log") -> None:
-    """Warn on stderr of what a log lacks, since results made of it lack it, too."""
+    """Warn on stderr of the messages that a log lacks, since results computed from it lack them."""
     from team.recording.check import holes
 
     tell_holes(log.path, holes(log))
@@ -194,7 +194,7 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
     for finding in found[:MOST_HOLES]:
         typer.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:
-        more = counted(len(found) - MOST_HOLES, "more finding")
+        more = count_noun(len(found) - MOST_HOLES, "more finding")
         typer.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
 
 
@@ -210,7 +210,7 @@ def set_aside(file: Path) -> Path:
     return aside
 
 
-def counted(count: int, what: str) -> str:
+def count_noun(count: int, what: str) -> str:
     """A count with its noun: `1 robot`, `3 robots`."""
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 

@@ -12,7 +12,7 @@ from sim.cli.options import (
     Keys,
     TeamOption,
     check_names,
-    connected,
+    connect_bus,
     fail,
     signer_of,
 )
@@ -40,7 +40,7 @@ def map_(
     from team.wire.codec import decoded
     from team.wire.messages import FoldRequest, FusedMap
 
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
         except BusError as error:
@@ -73,7 +73,7 @@ def withdraw(
     from central.desk.orders import withdraw as order
 
     check_names(team, robot)
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
         except WithdrawError as error:
@@ -98,14 +98,13 @@ def verdict(
         float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """Tell a running team that two landmarks without names are one, or that they are two.
+    """Give a running team the verdict that two landmarks without names are one, or two.
 
     The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
     until it is withdrawn.
     """
     from central.desk.evaluation.verdicts import contradicting, in_words
-    from central.desk.orders import NoRobotError, WithdrawError
-    from central.desk.verdicts import judge, local_landmark
+    from central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
     from team.wire.messages import Judgement
 
     if word not in ("same", "different"):
@@ -116,8 +115,8 @@ def verdict(
     except ValueError as error:
         fail(str(error), WRONG_USE)
     if one == two:
-        fail(f"{first} is one landmark, whatever is said of it", WRONG_USE)
-    with connected(team, connect, keys, "operator") as bus:
+        fail(f"{first} is one landmark, and needs no verdict", WRONG_USE)
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             judgement = Judgement(first=one, second=two, same=word == "same")
             signer = signer_of(keys, "operator", team)
@@ -137,12 +136,12 @@ def verdict(
         )
     if chain:
         remedy = f"`teamslam verdict {opposite} {first} {second} --withdraw` withdraws that"
-        contradiction = f"{first} and {second} were said to be {opposite}, too"
+        contradiction = f"{first} and {second} have an earlier verdict, {opposite}"
         if word == "same":
             fail(f"{contradiction}, which is what holds; {remedy}", FAILED)
         typer.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
     landmarks = len(ids(fused.ids, "ids"))
-    are = "are no more said to be" if withdraw else "are"
+    are = "have no verdict any more that they are" if withdraw else "are"
     typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
 
 
@@ -168,7 +167,7 @@ def end(
     from central.desk.orders import WithdrawError, end_team, give_up
 
     check_names(team, without)
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         try:
             if without is None:
                 end_team(bus, reason, patience)

@@ -15,19 +15,18 @@ from sim.cli.options import (
     Keys,
     LogArgument,
     SpeedText,
-    connected,
-    counted,
+    connect_bus,
+    count_noun,
     fail,
     parsed_speed,
     refuse_existing,
     refuse_open_door,
     warn_of_holes,
 )
+from sim.cli.results import print_evaluation, print_nis, print_written, read_run
 from sim.cli.steps import Steps
 
 if TYPE_CHECKING:
-    from central.desk.ledger import Ledger
-    from central.desk.verification.recorded import Recorded
     from team.recording.reader import Log
 
 app = typer.Typer()
@@ -71,7 +70,7 @@ def replay(
     with (
         process("replay") as stop,
         hub as endpoint,
-        connected(opened.team, endpoint, keys, "replay", stop) as bus,
+        connect_bus(opened.team, endpoint, keys, "replay", stop) as bus,
     ):
         if connect is None:
             typer.echo(f"listening at {endpoint}", err=True)
@@ -110,13 +109,9 @@ def report(
     """A page, pictures, tables and figures of a run, from its log alone."""
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import evaluate, to_json, with_holes
-    from central.desk.evaluation.history import history
-    from central.desk.export.take_home import taken_home
+    from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
     from central.desk.report.page import write_pictures, write_report
-    from central.desk.report.run import Run, nis_line, run_figures
-    from central.desk.report.tables import summary_tables
-    from central.desk.verification.recorded import recorded
+    from central.desk.report.run import run_figures
     from team.recording.reader import open_log
 
     _check_folder(output)
@@ -124,23 +119,16 @@ def report(
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
     steps.begin("scoring the run")
-    evaluation = with_holes(evaluate(opened.samples()), opened)
-    steps.begin("reading what the robots received")
-    messages = recorded(opened)
-    found, why = _ledger(messages, steps) if ledger else (None, Run.no_ledger)
+    evaluation = add_holes(evaluate(opened.samples()), opened)
+    run = read_run(opened, evaluation, steps, proves_ledger=ledger)
     console = Console()
-    steps.begin("smoothing the paths")
-    home = taken_home(messages, steps.robot)
-    steps.begin("reading the run's history")
-    run = Run(evaluation, history(opened.samples()), opened.metadata, found, why, home)
     steps.begin("drawing")
     if look or form or picture:
         style = Style(
             look or Look.SCREEN, form or (Form.PDF if look else Form.PNG), picture, width_in
         )
         drawn = write_pictures(run, output, style)
-        for path in drawn.values():
-            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        print_written(drawn.values(), console)
         if picture is not None:
             if not drawn:
                 fail(f"{log} has nothing to draw in the picture {picture}", FAILED)
@@ -148,18 +136,13 @@ def report(
     figures = to_json(
         evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
     )
-    for table in summary_tables(evaluation):
-        console.print(table)
-    for note in evaluation.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-    if (line := nis_line(run.history)) is not None:
-        console.print(line, highlight=False, soft_wrap=True)
-    if found is not None:
+    print_evaluation(evaluation, console)
+    print_nis(run, console)
+    if (found := run.ledger) is not None:
         verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()
         console.print(f"ledger: {verdict}", highlight=False, soft_wrap=True)
     try:
-        for path in write_report(run, output, figures):
-            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        print_written(write_report(run, output, figures), console)
     except OSError as error:
         fail(f"-o {output}: can not write: {error.strerror}; give another folder", FAILED)
     if json_file is not None:
@@ -187,18 +170,6 @@ def _check_folder(path: Path) -> None:
         fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
 
 
-def _ledger(messages: "Recorded", steps: Steps) -> "tuple[Ledger | None, str]":
-    """The ledger of a log, or the reason why there is none."""
-    from central.desk.ledger import ledger
-    from central.desk.verification.recorded import RerunError
-
-    steps.begin("proving the ledger (--no-ledger leaves it out)")
-    try:
-        return ledger(messages, steps.robot), ""
-    except RerunError as error:
-        return None, str(error)
-
-
 @app.command()
 def repair(
     log: LogArgument,
@@ -206,19 +177,19 @@ def repair(
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from sim.importing.source import is_own_log
-    from team.recording.bag_repair import bag_repaired
+    from team.recording.bag_repair import repair_bag
     from team.recording.reader import log_file
-    from team.recording.repair import repaired
+    from team.recording.repair import repair_log
 
     refuse_existing(output)
     log = log_file(log)
     if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
-        bag = bag_repaired(log, output)
-        typer.echo(f"{output}: {counted(bag.messages, 'message')}")
+        bag = repair_bag(log, output)
+        typer.echo(f"{output}: {count_noun(bag.messages, 'message')}")
         for damage in bag.damaged:
             typer.echo(f"lost: {damage}", err=True)
         return
-    result = repaired(log, output)
+    result = repair_log(log, output)
     until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
     typer.echo(f"{output}: {result.messages} messages{until}")
     for damage in result.damaged:

@@ -174,15 +174,10 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from rich.table import Table
     from rich.text import Text
 
+    from central.desk.compare import compare_rows, draw_maps, largest_move_m, same_final_map
     from central.desk.evaluation.evaluation import evaluate, to_json
     from central.desk.evaluation.history import history
     from central.desk.evaluation.states import not_in_the_map
-    from central.desk.side_by_side import (
-        comparison_picture,
-        comparison_rows,
-        largest_move_m,
-        same_final_map,
-    )
     from central.desk.verification.recorded import RerunError
     from sim.cli.importing import readable
     from sim.recorded.changed_run import changed_run
@@ -200,10 +195,10 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         changed = recorded if plain else evaluate(computed)
     except RerunError as error:
         fail(f"{path}: {error}", FAILED)
-    columns = ("", "computed") if plain else ("", "recorded", "recomputed")
-    table = Table(*columns)
-    for row in comparison_rows(recorded, changed):
-        table.add_row(*(Text(cell) for cell in row[: len(columns)]))
+    runs = {"computed": changed} if plain else {"recorded": recorded, "recomputed": changed}
+    table = Table("", *runs)
+    for figure, cells in compare_rows(runs):
+        table.add_row(Text(figure), *map(Text, cells))
     console = Console()
     console.print(table)
     _print_warnings(recorded, changed, history(computed), console)
@@ -224,7 +219,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         picture = output / "maps.png"
-        if comparison_picture(recorded, changed, picture):
+        if draw_maps({"recorded": recorded, "recomputed": changed}, picture):
             console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
     if changed.map is None:
         fail("the changed run ended without a final map", FAILED)
@@ -235,7 +230,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 def _print_warnings(
     recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
 ) -> None:
-    """Print what `launch` says of its run, here of the one that was computed."""
+    """Print the warnings and notes of the computed run, as `launch` does."""
     from central.desk.report.run import nis_line
 
     lines = [f"warning: {warning}" for warning in changed.warnings]
@@ -313,10 +308,10 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
 def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console
-    from rich.table import Table
 
     from central.desk.ledger import ledger
     from central.desk.names import in_order
+    from central.desk.report.tables import disposition_sheet, terminal_table
     from central.desk.verification.recorded import RerunError, recorded
     from team.recording.reader import open_log
 
@@ -327,15 +322,9 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     except RerunError as error:
         fail(f"{log}: {error}", FAILED)
     robots = in_order({robot for robot, _ in found.entries})
-    table = Table("disposition")
-    for robot in [*robots, "all"]:
-        table.add_column(robot, justify="right")
-    of_robots = [found.totals(robot) for robot in robots]
-    for disposition, count in found.totals().items():
-        counts = [*(totals.get(disposition, 0) for totals in of_robots), count]
-        table.add_row(disposition, *(f"{n:,}" for n in counts))
     console = Console()
-    console.print(table)
+    sheet = disposition_sheet({robot: found.totals(robot) for robot in robots})
+    console.print(terminal_table(sheet))
     used = sum(1 for maps in found.maps.values() if maps)
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
     if not opened.complete:

@@ -12,7 +12,7 @@ from sim.cli.options import (
     Robots,
     ScenarioArgument,
     Seed,
-    counted,
+    count_noun,
     fail,
     scenario_of,
 )
@@ -37,7 +37,7 @@ def scenarios(
         return
     for name in builtin_names():
         found = load(name)
-        team = counted(len(found.robots), "robot")
+        team = count_noun(len(found.robots), "robot")
         typer.echo(f"{name:12} {team:10} {found.estimator} with {found.fusion}")
 
 

@@ -14,7 +14,7 @@ from sim.cli.options import (
     Keys,
     TeamOption,
     check_names,
-    connected,
+    connect_bus,
     fail,
 )
 
@@ -31,7 +31,7 @@ def status(
     ] = 3.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write it as JSON, too.")] = None,
 ) -> None:
-    """Show the nodes of a running team: rates, clocks, which waits for which, and what to do."""
+    """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
     from rich.console import Console
     from rich.table import Table
 
@@ -39,7 +39,7 @@ def status(
 
     check_names(team)
     presence = Presence()
-    with connected(team, connect, keys, "operator") as bus:
+    with connect_bus(team, connect, keys, "operator") as bus:
         presence.take(bus, seconds)
         others = [] if presence.members else bus.other_teams()
     if not presence.members:

@@ -1,15 +1,15 @@
-"""Says how far a long piece of work is."""
+"""Progress of long work as plain lines on stderr, for terminals and log files alike."""
 
 import time
 
 import typer
 
 PATIENCE_S = 3.0
-"""Time [s] between two lines, and before the first one: short work says nothing."""
+"""Time [s] between two lines, and before the first one, so that short work prints none."""
 
 
 class Steps:
-    """Prints on stderr, now and then, what is being done and how far it is."""
+    """Print the current step and its progress, at most one line in PATIENCE_S."""
 
     def __init__(self) -> None:
         self._what = ""
@@ -18,18 +18,18 @@ class Steps:
     def begin(self, what: str) -> None:
         """Name the next step."""
         self._what = what
-        self.at("")
+        self.print_if_due("")
 
     def share(self, done: float) -> None:
-        """So much of the step is done, 0 to 1."""
-        self.at(f": {done:.0%}")
+        """Report the share of the step that is done, 0 to 1."""
+        self.print_if_due(f": {done:.0%}")
 
     def robot(self, name: str) -> None:
-        """The step has come to this robot."""
-        self.at(f": {name}")
+        """Report the robot that the step has reached."""
+        self.print_if_due(f": {name}")
 
-    def at(self, words: str) -> None:
-        """Say these words of the step, if it is time."""
+    def print_if_due(self, words: str) -> None:
+        """Print the step with these words, if a line is due."""
         now = time.monotonic()
         if now >= self._due:
             self._due = now + PATIENCE_S

@@ -12,8 +12,8 @@ COMMANDS = ("experiment", "batch-reference", "limit")
 
 
 def add_studies(app: typer.Typer) -> None:
-    """Register the commands of the studies; where these are missing, each command says so and
-    exits with 2.
+    """Register the commands of the studies; where these are missing, each command reports it
+    and exits with 2.
     """
     try:
         studies = import_module(f"{STUDIES}.commands")

@@ -17,7 +17,7 @@ from sim.cli.options import (
     Keys,
     LogArgument,
     ScenarioArgument,
-    connected,
+    connect_bus,
     fail,
     refuse_existing,
     scenario_of,
@@ -25,7 +25,7 @@ from sim.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from central.desk.view.session import Shown
+    from central.desk.view.server import Shown
     from team.recording.reader import Log
 
 _LOG = logging.getLogger("teamslam")
@@ -44,7 +44,7 @@ app = typer.Typer()
 
 @app.command()
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
-    """Publish what Foxglove, Lichtblick and Rerun draw, once a second of team time.
+    """Publish the views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
     The recorder stores it beside the team's own messages. It ends after the final map.
     """
@@ -54,7 +54,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
     resolved = scenario_of(scenario)
     with (
         process("viewer", endless=True) as stop,
-        connected(resolved.team, connect, keys, "viewer", stop) as bus,
+        connect_bus(resolved.team, connect, keys, "viewer", stop) as bus,
     ):
         _LOG.info("connected to team %s at %s", resolved.team, connect)
         peers = [each.id for each in resolved.robots] if resolved.peers else []
@@ -114,7 +114,7 @@ def shown_on_page(
     log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
 ) -> Iterator["Shown"]:
     """Serve a log, print where, and open the page if that is requested or there is a display."""
-    from central.desk.view.session import session
+    from central.desk.view.server import session
 
     with session(log, host, port, foxglove_port, growing=growing) as shown:
         typer.echo(f"page      {shown.url}")

@@ -179,7 +179,7 @@ def cells_of(numbers: Float[np.ndarray, "R C"]) -> Sequence[Sequence[object]]:
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """What parts the columns in the first line that names them: a comma, else ; or a tab."""
+    """The delimiter of the columns in the first line that names them: a comma, else ; or a tab."""
     first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
     return next((mark for mark in (",", ";", "\t") if mark in first), ",")
 
@@ -254,12 +254,12 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
 
 
 def _unit_of(seconds: Decimal) -> str:
-    """What a time since 1970 that was read as seconds was probably given in, and the remedy."""
+    """The probable unit of a Unix time that was read as seconds, and the remedy."""
     unit, scale = "nanoseconds", "1e-9"
     for each, by in (("microseconds", "1e-6"), ("milliseconds", "1e-3")):
         if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:
             unit, scale = each, by
-    return f"; of {unit} a map of columns makes seconds (scale = {scale})"
+    return f"; to convert from {unit}, add a column map (scale = {scale})"
 
 
 def _landmark(text: str) -> int:

@@ -9,14 +9,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import UInt32
+from jaxtyping import Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable, cells_of, read_table
-from sim.datasets.folder_files import shown
+from sim.datasets.folder_files import name_table
 from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
+from sim.datasets.scans import on_circle
 from sim.datasets.some_rows import covariances_of
 from sim.datasets.tables import File
-from sim.datasets.utias_rows import on_circle
 from sim.world.identities import in_order
 from sim.world.streams import NO_LABEL, Detections
 
@@ -36,23 +36,44 @@ def detections_of(place: File, robot: str) -> Detections | None:
     lacking = [column for column in ("t_s", *POLAR) if not table.has(column)]
     if lacking:
         raise table.fault(f"no column {', '.join(lacking)}; it needs t_s,{','.join(POLAR)}")
-    stamps = table.stamps("t_s")
-    if (np.diff(stamps) < 0).any():
-        raise table.fault("its rows are not in order of time")
     ranges, bearings = table.numbers(*POLAR).T
-    if (ranges < 0.0).any():
-        raise table.error(int(np.argmax(ranges < 0.0)), "range_m", "below 0")
-    claims = table.has(*POLAR_COVARIANCE)
-    first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
+    return scans_of(
+        table,
+        table.stamps("t_s"),
+        ranges.copy(),
+        on_circle(bearings),
+        labels_of(_read(place, FILES[1], robot, LABELS), len(table)),
+        covariances_of(table, POLAR_COVARIANCE) if table.has(*POLAR_COVARIANCE) else None,
+        table.known_numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
+    )
+
+
+def scans_of(
+    table: CsvTable,
+    stamps_ns: Int64[np.ndarray, " R"],
+    ranges: Float[np.ndarray, " R"],
+    bearings: Float[np.ndarray, " R"],
+    labels: UInt32[np.ndarray, " R"],
+    covariances: Float[np.ndarray, "R 3"] | None,
+    signatures: Float[np.ndarray, " R"] | None,
+) -> Detections:
+    """Scans without identities: one for each stamp, its rows in the order of the table. Raises
+    DatasetError.
+    """
+    if (np.diff(stamps_ns) < 0).any():
+        raise table.fault("its rows are not in order of time")
+    for row in np.flatnonzero(ranges < 0.0)[:1].tolist():
+        raise table.error(row, "range_m", "below 0")
+    first = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[:1] - 1))
     return Detections(
-        stamps_ns=stamps[first],
-        offsets=np.append(first, len(stamps)).astype(np.int64),
-        ids=_labels(_read(place, FILES[1], robot, LABELS), len(stamps)),
-        ranges=ranges.copy(),
-        bearings=on_circle(bearings),
-        covariances=covariances_of(table, POLAR_COVARIANCE) if claims else None,
+        stamps_ns=stamps_ns[first],
+        offsets=np.append(first, len(stamps_ns)).astype(np.int64),
+        ids=labels,
+        ranges=ranges,
+        bearings=bearings,
+        covariances=covariances,
         hidden=np.ones(len(first), np.bool_),
-        signatures=table.known_numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
+        signatures=signatures,
     )
 
 
@@ -114,10 +135,11 @@ def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTabl
     file = place / name
     if not file.is_file():
         return None
-    return read_table(file, shown(place, file, robot), columns)
+    return read_table(file, name_table(place, file, robot), columns)
 
 
-def _labels(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:
+def labels_of(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:
+    """The label of each row of detections.csv, NO_LABEL where there is none."""
     if table is None:
         return np.full(rows, NO_LABEL, np.uint32)
     if not table.has(*LABELS):

@@ -24,8 +24,9 @@ from jaxtyping import Float, Int64
 from sim.datasets import folder_tables as rows
 from sim.datasets.csv_table import CsvTable, read_table
 from sim.datasets.detections_table import detections_of, together
-from sim.datasets.folder_files import EXPECTED, left_out, opened_folder, shown
+from sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
 from sim.datasets.folder_odometry import intervals_of
+from sim.datasets.scans import Scans
 from sim.datasets.some_rows import POSE_COVARIANCE
 from sim.datasets.tables import DatasetError, File
 from sim.world.config import FolderWorld, starts_unknown
@@ -35,7 +36,6 @@ from sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
-    robot_stream,
 )
 from team.config import RobotConfig
 
@@ -73,7 +73,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
     clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
-    with opened_folder(world.path) as (root, folders):
+    with open_folder(world.path) as (root, folders):
         missing = [name for name in clocks if name not in folders]
         if missing:
             raise DatasetError(
@@ -117,9 +117,9 @@ class RobotRows:
     robot: str
     start: StartPose | None
     intervals: Intervals
-    seen: rows.Scans
+    seen: Scans
     empty_ns: Int64[np.ndarray, " E"]
-    teammates: rows.Scans
+    teammates: Scans
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]
@@ -205,7 +205,7 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     file = place / f"{kind}.csv"
     if not file.is_file():
         return None
-    table = read_table(file, shown(place, file, robot), TABLES[kind])
+    table = read_table(file, name_table(place, file, robot), TABLES[kind])
     for column in REQUIRED[kind]:
         if not table.has(column):
             raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")
@@ -214,13 +214,13 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
 
 def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
     known = len(read.truth) > 0
-    return robot_stream(
+    return RobotStream(
         robot=read.robot,
         start_ns=read.start_ns,
         start=None if starts_unknown(world, read.robot) else read.start,
         intervals=read.intervals,
-        observations=together(_with_empty(read.seen.grouped(), read.empty_ns), read.unnamed),
-        sightings=read.teammates.grouped(),
+        landmark_detections=together(_with_empty(read.seen.grouped(), read.empty_ns), read.unnamed),
+        teammate_detections=read.teammates.grouped(),
         teammates=tuple(clocks),
         truth_ns=read.truth_ns if known else None,
         truth=read.truth if known else None,

@@ -26,7 +26,7 @@ class NoTablesError(DatasetError):
 
 
 @contextmanager
-def opened_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
+def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
     """The data set's folder, and each robot's by name; raises DatasetError."""
     place = Path(path)
     if not place.exists():
@@ -62,7 +62,7 @@ def has_tables(path: str | Path) -> bool:
     if not Path(path).exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}; or a UTIAS set, or a bag")
     try:
-        with opened_folder(str(path)):
+        with open_folder(str(path)):
             return True
     except DatasetError as error:
         if isinstance(error, NoTablesError):
@@ -74,7 +74,7 @@ def has_tables(path: str | Path) -> bool:
 
 def robots_of(path: str) -> tuple[str, ...]:
     """The names of a folder's robots: r2 before r10; raises DatasetError."""
-    with opened_folder(path) as (_, robots):
+    with open_folder(path) as (_, robots):
         return tuple(robots)
 
 
@@ -102,7 +102,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def shown(place: File, file: File, robot: str) -> str:
+def name_table(place: File, file: File, robot: str) -> str:
     """A table as errors name it: with its robot's folder, where it lies in one."""
     return f"{robot}/{file.name}" if place.name == robot else file.name
 

@@ -12,8 +12,8 @@ from sim.datasets.folder_tables import (
     STEERED,
     Rows,
 )
+from sim.datasets.scans import on_circle
 from sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
-from sim.datasets.utias_rows import on_circle
 from sim.world.streams import Intervals, moved
 from team.config import Bounds
 from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
@@ -41,7 +41,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     Speeds hold from t_s to the next row's, and the last row only ends the last interval; with a
     column duration_s they are the means over the time that ends at t_s. Poses are of t_s; an
     increment ends at t_s and begins at the row before. A car's wheel speed and steering hold as
-    speeds do. A covariance is of the motion that its row tells (a pose's: of the motion since the
+    speeds do. A covariance is of the motion in its row (a pose's: of the motion since the
     row before), of an error in the frame of its end; speeds that have one become increments. With a
     column duration_s, rows of speeds and rows of increments may be in one table.
     """
@@ -95,14 +95,14 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
 
 def pace_notes(duration_ns: Int64[np.ndarray, " I"]) -> list[str]:
-    """A note on odometry whose usual interval says that its times are not in seconds."""
+    """A note on odometry whose usual interval indicates times that are not in seconds."""
     usual_s = 1e-9 * float(np.median(duration_ns)) if len(duration_ns) else SHORTEST_S
     if SHORTEST_S <= usual_s <= LONGEST_S:
         return []
     usual = f"{usual_s:,.0f}" if usual_s > 1.0 else f"{usual_s:.3g}"
     return [
-        f"{PACE} {usual} s apart: times are taken for seconds; of times in other units a "
-        "map of columns makes seconds (scale = 1e-3 for milliseconds)"
+        f"{PACE} {usual} s apart: times are taken for seconds; to convert from other units, add a "
+        "column map (scale = 1e-3 for milliseconds)"
     ]
 
 
@@ -218,8 +218,8 @@ def _judge_speeds(
     turning = rate[rate > 0.0]
     if len(turning) > 1 and np.median(turning) > WHIRLING_RAD_S:
         raise rows.table.fault(
-            f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: of "
-            "degrees a map of columns makes radians (scale = 0.017453292519943295)"
+            f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: to "
+            "convert from degrees, add a column map (scale = 0.017453292519943295)"
         )
     bounds = Bounds()
     fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)

@@ -4,20 +4,19 @@ Rows that are not used are dropped, and a note counts them with the reason and t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable
+from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from sim.datasets.some_rows import (
     POSE_COVARIANCE,
     covariances_of,
     numbers_in,
     pose_covariances,
 )
-from sim.datasets.utias_rows import counted, first_of_each, on_circle
-from sim.world.streams import Detections, StartPose, grouped
+from sim.world.streams import StartPose
 
 SPEEDS = ("forward_m_s", "yaw_rate_rad_s")
 POSES = ("x_m", "y_m", "theta_rad")
@@ -88,37 +87,8 @@ class Rows:
 
     def _note(self, count: int, what: str, table: CsvTable, row: int) -> None:
         where = "first at" if count > 1 else "at"
-        note = counted(count, self.thing, what)
+        note = count_note(count, self.thing, what)
         self.notes.append(f"{note} ({table.name}, {where} line {table.lines[row]})")
-
-
-@dataclass(frozen=True)
-class Scans:
-    """Measurements of landmarks, or of teammates by index, in order of time."""
-
-    stamps_ns: Int64[np.ndarray, " R"]
-    ids: UInt32[np.ndarray, " R"]
-    ranges: Float[np.ndarray, " R"]
-    bearings: Float[np.ndarray, " R"]
-    points: Float[np.ndarray, "R 2"] | None = None
-    covariances: Float[np.ndarray, "R 3"] | None = None
-
-    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
-        """The chosen rows."""
-        return Scans(
-            self.stamps_ns[chosen],
-            self.ids[chosen],
-            self.ranges[chosen],
-            self.bearings[chosen],
-            None if self.points is None else self.points[chosen],
-            None if self.covariances is None else self.covariances[chosen],
-        )
-
-    def grouped(self) -> Detections:
-        """One message per stamp and form."""
-        return grouped(
-            self.stamps_ns, self.ids, self.ranges, self.bearings, self.points, self.covariances
-        )
 
 
 def measurements_of(
@@ -159,9 +129,9 @@ def measurements_of(
 
     if len(found.ranges) and np.median(found.ranges) > FAR_M:
         rows.notes.append(
-            f"what it measures is {np.median(found.ranges):,.0f} m away most of the time "
-            f"({rows.table.name}): metres are meant; of millimetres a map of columns makes them "
-            "(scale = 0.001)"
+            f"the median range is {np.median(found.ranges):,.0f} m "
+            f"({rows.table.name}): ranges must be in metres; to convert from millimetres, add a "
+            "column map (scale = 0.001)"
         )
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
@@ -211,8 +181,8 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
         raise table.error(
             row,
             "bearing_rad",
-            f"{bearings[row]:g} is more than a whole turn; bearings are in radians: of degrees "
-            "a map of columns makes them (scale = 0.017453292519943295)",
+            f"{bearings[row]:g} is more than a whole turn; bearings must be in radians: to "
+            "convert from degrees, add a column map (scale = 0.017453292519943295)",
         )
     bearings, as_points = on_circle(bearings), ~np.isnan(points[:, 0])
     x, y = points[as_points].T

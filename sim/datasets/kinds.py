@@ -1,4 +1,4 @@
-"""Decides which kind of data set lies at a path."""
+"""Decide which kind of data set lies at a path."""
 
 from pathlib import Path
 from typing import Literal
@@ -19,9 +19,9 @@ def kind_of(path: str | Path) -> Kind:
     if folder_files.has_tables(path):
         return "folder"
     if (Path(path) / unlabelled.FILES[1]).is_file():
-        return "unlabelled"  # reading it says what is missing
+        return "unlabelled"  # its reader reports the missing file
     try:
-        with tables.opened(str(path), UTIAS_MARKER):
+        with tables.open_data_set(str(path), UTIAS_MARKER):
             return "utias"
     except tables.MarkerError:
         inner = _with_tables_within(Path(path))

@@ -1,4 +1,4 @@
-"""Text tables in a folder or a zip: fast to read, exact about what is wrong in them."""
+"""Text tables in a folder or a zip: fast to read, with exact errors."""
 
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -23,7 +23,7 @@ class MarkerError(DatasetError):
 
 
 @contextmanager
-def opened(path: str, marker: str) -> Iterator[Mapping[str, File]]:
+def open_data_set(path: str, marker: str) -> Iterator[Mapping[str, File]]:
     """The files by name of the one folder, in `path` (a folder or zip), that holds `marker`."""
     place = Path(path)
     if not place.exists():
@@ -71,7 +71,7 @@ def optional_table(
 
 
 def _damage(name: str, lines: list[str], columns: tuple[str, ...], otherwise: str) -> DatasetError:
-    """What is wrong with the first bad line."""
+    """The error of the first bad line."""
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].split()
         problem = _problem(words, columns) if words else None

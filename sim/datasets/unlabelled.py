@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from sim.datasets.csv_table import CsvTable, read_table
+from sim.datasets.detections_table import labels_of, scans_of
 from sim.datasets.folder_odometry import pace_notes
 from sim.datasets.tables import DatasetError
 from sim.world.config import UnlabelledWorld
@@ -26,7 +27,6 @@ from sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
-    robot_stream,
 )
 
 FILES = ("odometry.csv", "detections.csv")
@@ -94,7 +94,7 @@ def _table(root: Path, name: str, *needed: str) -> CsvTable:
 
 
 def _form(odometry: CsvTable) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The columns of odometry.csv and of detections.csv, by what is special to the former."""
+    """The columns of odometry.csv and detections.csv, by those that are special to the former."""
     own = {CAR: CAR[1:], STEPS + COVARIANCE: STEPS}
     form = max(own, key=lambda each: sum(odometry.has(column) for column in own[each]))
     if not any(odometry.has(column) for column in own[form]):
@@ -109,7 +109,9 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     odometry, detections = (
         _table(root, name, *needed) for name, needed in zip(FILES, (form, seen_form), strict=True)
     )
-    labels = _labels(root, len(detections))
+    labels = labels_of(
+        _table(root, "labels.csv") if (root / "labels.csv").is_file() else None, len(detections)
+    )
     take = _of_car if form == CAR else _of_steps
     intervals, seen = take(odometry, detections, labels)
     if not len(intervals.end_ns):
@@ -129,15 +131,15 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     notes = [f"{outside} scans are outside the time of the odometry"] if outside else []
     if form == CAR:
         notes += pace_notes(intervals.duration_ns)
-    return robot_stream(
+    return RobotStream(
         robot="r1",
         start_ns=start_ns,
         start=StartPose(np.zeros(3), None),
         intervals=intervals,
-        observations=seen,
-        sightings=_nothing(),
+        landmark_detections=seen,
+        teammate_detections=_nothing(),
         teammates=("r1",),
-        notes=notes,
+        notes=tuple(notes),
         positions_ns=gps_ns,
         positions=gps,
     )
@@ -163,7 +165,7 @@ def _of_car(
     )
     polar = detections.numbers("range_m", "bearing_rad")
     diameters = detections.numbers("diameter_m")[:, 0] if detections.has("diameter_m") else None
-    return intervals, _scans(detections, seen_ns, polar, labels, None, diameters)
+    return intervals, scans_of(detections, seen_ns, *_columns(polar), labels, None, diameters)
 
 
 def _of_steps(
@@ -185,7 +187,14 @@ def _of_steps(
     own = detections.numbers("c_xx", "c_xy", "c_yy")
     polar, claimed = _polar(points, own)
     stamps = (_steps(detections) + 1) * STEP_NS
-    return intervals, _scans(detections, stamps, polar, labels, claimed, None)
+    return intervals, scans_of(detections, stamps, *_columns(polar), labels, claimed, None)
+
+
+def _columns(
+    polar: Float[np.ndarray, "R 2"],
+) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+    """Ranges, and bearings in (−π, π]."""
+    return polar[:, 0].copy(), np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi)
 
 
 def _in_the_end(
@@ -217,43 +226,6 @@ def _polar(
     rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / ranges
     bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (ranges * ranges)
     return np.column_stack((ranges, np.arctan2(y, x))), np.column_stack((rr, rb, bb))
-
-
-def _scans(
-    table: CsvTable,
-    stamps: Int64[np.ndarray, " R"],
-    polar: Float[np.ndarray, "R 2"],
-    labels: UInt32[np.ndarray, " R"],
-    covariances: Float[np.ndarray, "R 3"] | None,
-    signatures: Float[np.ndarray, " R"] | None,
-) -> Detections:
-    """One message for each stamp; its rows in the order of the table."""
-    if (np.diff(stamps) < 0).any():
-        raise table.fault("its rows are not in order of time")
-    if (polar[:, 0] < 0.0).any():
-        raise table.fault("a range is negative")
-    first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
-    return Detections(
-        stamps_ns=stamps[first],
-        offsets=np.append(first, len(stamps)).astype(np.int64),
-        ids=labels,
-        ranges=polar[:, 0].copy(),
-        bearings=np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi),
-        points=None,
-        covariances=covariances,
-        hidden=np.ones(len(first), np.bool_),
-        signatures=signatures,
-    )
-
-
-def _labels(root: Path, rows: int) -> UInt32[np.ndarray, " R"]:
-    if not (root / "labels.csv").is_file():
-        return np.full(rows, NO_LABEL, np.uint32)
-    table = _table(root, "labels.csv", "landmark")
-    labels = table.numbers("landmark")[:, 0].astype(np.int64)
-    if len(labels) != rows:
-        raise table.fault(f"{len(labels)} rows, {rows} in detections.csv: row by row, one for each")
-    return np.where(labels < 0, NO_LABEL, labels).astype(np.uint32)
 
 
 def _named(seen: Detections) -> Detections:
@@ -325,20 +297,20 @@ def _piece(
     begin_ns, end_ns = int(own.end_ns[0] - own.duration_ns[0]), int(own.end_ns[-1])
     back = begin_ns - zero_ns
     seen = whole.landmark_detections
-    # What is seen at the end of an interval is that interval's, and at the first start its own.
+    # A scan at the end of an interval belongs to it; one at the first start to the first.
     first, last = np.searchsorted(seen.stamps_ns, [begin_ns + (index > 0), end_ns + 1])
     mine = seen.only(int(first), int(last))
     gps_ns, gps = whole.positions_ns, whole.positions
     if gps_ns is not None and gps is not None:
         inside = (gps_ns >= begin_ns) & (gps_ns <= end_ns)
         gps_ns, gps = gps_ns[inside] - back, gps[inside]
-    return robot_stream(
+    return RobotStream(
         robot=names[index],
         start_ns=zero_ns,
         start=None,
         intervals=replace(own, end_ns=own.end_ns - back),
-        observations=replace(mine, stamps_ns=mine.stamps_ns - back),
-        sightings=_nothing(),
+        landmark_detections=replace(mine, stamps_ns=mine.stamps_ns - back),
+        teammate_detections=_nothing(),
         teammates=names,
         notes=(*whole.notes, f"it begins {back * 1e-9:.2f} s into the log"),
         positions_ns=gps_ns,

@@ -3,21 +3,22 @@
 Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. A set is 17 text files: `Barcodes.dat`,
 `Landmark_Groundtruth.dat`, and of each robot N its odometry, measurements and ground truth.
 Measurements name a *barcode*; `Barcodes.dat` gives its subject: a robot (its number) or a landmark.
-What is not handed out is dropped, and counted in the notes with its reason.
+Dropped rows are counted in the notes with their reason.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt32
 
 from sim.datasets.errata import erratum_of
-from sim.datasets.tables import EXPECTED, DatasetError, File, opened, optional_table, table
+from sim.datasets.tables import EXPECTED, DatasetError, File, open_data_set, optional_table, table
 from sim.datasets.utias_log import Log, log_of, present_robots
 from sim.datasets.utias_rows import start_pose
 from sim.world.config import UtiasWorld, starts_unknown
-from sim.world.streams import RobotStream, StartPose, WorldStreams, grouped, robot_stream
+from sim.world.streams import RobotStream, StartPose, WorldStreams
 from team.config import RobotConfig
 
 ROBOTS = 5
@@ -37,7 +38,7 @@ def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
-    with opened(world.path, "Barcodes.dat") as files:
+    with open_data_set(world.path, "Barcodes.dat") as files:
         clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
         return _streams(world, clocks, files)
 
@@ -101,21 +102,21 @@ def _landmarks(
 def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: int) -> RobotStream:
     robots = list(clocks)
     numbers = np.array([int(robot[1:]) for robot in robots], dtype=np.uint32)
-    log = log.without(log.measurements.subjects == log.subject, "of itself")
-    subjects = log.measurements.subjects
+    log = log.without(log.measurements.ids == log.subject, "of itself")
+    subjects = log.measurements.ids
     stranger = (subjects <= last_robot) & ~np.isin(subjects, numbers)
     log = log.without(stranger, "of a robot that is not in the team")
-    seen = log.measurements.where(log.measurements.subjects > last_robot)
-    teammates = log.measurements.where(log.measurements.subjects <= last_robot)
-    index = (teammates.subjects[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
-    return robot_stream(
+    seen = log.measurements.where(log.measurements.ids > last_robot)
+    teammates = log.measurements.where(log.measurements.ids <= last_robot)
+    index = (teammates.ids[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
+    return RobotStream(
         robot=log.robot,
         start_ns=log.start_ns,
         start=_start(world, log),
         intervals=log.intervals,
-        observations=grouped(seen.stamps_ns, seen.subjects, seen.ranges, seen.bearings),
-        sightings=grouped(teammates.stamps_ns, index, teammates.ranges, teammates.bearings),
-        teammates=robots,
+        landmark_detections=seen.grouped(),
+        teammate_detections=replace(teammates, ids=index).grouped(),
+        teammates=tuple(robots),
         truth_ns=log.truth_ns if len(log.truth) else None,
         truth=log.truth if len(log.truth) else None,
         notes=(*log.notes, *_truth_notes(log)),

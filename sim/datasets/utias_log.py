@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from sim.datasets.scans import Scans, count_note
 from sim.datasets.tables import DatasetError, File, optional_table
-from sim.datasets.utias_rows import Measurements, counted, intervals_of, measurements_of, truth_of
+from sim.datasets.utias_rows import intervals_of, measurements_of, truth_of
 from sim.world.streams import Intervals
 
 TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
@@ -24,14 +25,14 @@ class Log:
     subject: int
     start_ns: int
     intervals: Intervals
-    measurements: Measurements
+    measurements: Scans
     truth_ns: Int64[np.ndarray, " T"]
     truth: Float[np.ndarray, "T 3"]
     notes: tuple[str, ...]
 
     def without(self, dropped: Bool[np.ndarray, " R"], reason: str) -> "Log":
         """The log without some measurements, and a note that counts them."""
-        note = counted(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
+        note = count_note(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
         notes = (*self.notes, note) if note else self.notes
         return replace(self, measurements=self.measurements.where(~dropped), notes=notes)
 

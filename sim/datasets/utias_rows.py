@@ -3,11 +3,11 @@ dropped.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
+from jaxtyping import Float, Int64
 
+from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from sim.world.streams import Intervals
 
 LONG_GAP_NS = 2_000_000_000
@@ -22,25 +22,6 @@ START_SPREAD_RAD = 0.2
 """Largest difference [rad] between headings of that ground truth (the base turns at most 0.58
 rad/s).
 """
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """Range-bearing measurements of one robot in order of time, by subject (landmark or robot)."""
-
-    stamps_ns: Int64[np.ndarray, " R"]
-    subjects: UInt32[np.ndarray, " R"]
-    ranges: Float[np.ndarray, " R"]
-    bearings: Float[np.ndarray, " R"]
-
-    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Measurements":
-        """The chosen rows."""
-        return Measurements(
-            self.stamps_ns[chosen],
-            self.subjects[chosen],
-            self.ranges[chosen],
-            self.bearings[chosen],
-        )
 
 
 def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
@@ -63,8 +44,8 @@ def intervals_of(
         yaw_rate=rows[:-1, 2][lasting],
     )
     notes = [
-        counted(backward, "odometry row", "earlier than the row before: sorted by time"),
-        counted(
+        count_note(backward, "odometry row", "earlier than the row before: sorted by time"),
+        count_note(
             int(np.count_nonzero(~lasting)),
             "odometry row",
             "dropped: another row has the same time, so it lasts no time",
@@ -78,7 +59,7 @@ def intervals_of(
 
 def measurements_of(
     rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
-) -> tuple[Measurements, tuple[str, ...]]:
+) -> tuple[Scans, tuple[str, ...]]:
     """Measurement rows (t, barcode, range, bearing) → measurements by subject."""
     rows, backward = _by_time(rows)
     codes = np.array(sorted(subject_of), dtype=np.float64)
@@ -86,18 +67,18 @@ def measurements_of(
     at = np.minimum(np.searchsorted(codes, rows[:, 1]), len(codes) - 1)
     known = codes[at] == rows[:, 1]
     positive = rows[:, 2] > 0.0
-    measurements = Measurements(
+    measurements = Scans(
         nanoseconds(rows[:, 0]), subjects[at], rows[:, 2].copy(), on_circle(rows[:, 3])
     )
     usable = known & positive
-    single = first_of_each(measurements.stamps_ns, measurements.subjects, usable)
+    single = first_of_each(measurements.stamps_ns, measurements.ids, usable)
     notes = (
-        counted(backward, "measurement", "earlier than the row before: sorted by time"),
-        counted(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
-        counted(
+        count_note(backward, "measurement", "earlier than the row before: sorted by time"),
+        count_note(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
+        count_note(
             int(np.count_nonzero(known & ~positive)), "measurement", "dropped: range not above 0"
         ),
-        counted(
+        count_note(
             int(np.count_nonzero(usable & ~single)),
             "measurement",
             "dropped: a second one of the same subject at the same time",
@@ -112,7 +93,9 @@ def truth_of(
     """Ground truth rows (t, x, y, θ) as they are, in order of time."""
     rows, backward = _by_time(rows)
     stamps = nanoseconds(rows[:, 0])
-    notes = [counted(backward, "ground truth row", "earlier than the row before: sorted by time")]
+    notes = [
+        count_note(backward, "ground truth row", "earlier than the row before: sorted by time")
+    ]
     gaps = np.diff(stamps)
     if np.any(gaps > LONG_GAP_NS):
         notes.append(f"ground truth has gaps, the longest of {gaps.max() * 1e-9:.1f} s")
@@ -147,29 +130,3 @@ def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], 
     """Rows in stable order of their first column, and how often it went backward."""
     backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
     return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward
-
-
-def first_of_each(
-    stamps_ns: Int64[np.ndarray, " R"],
-    subjects: UInt32[np.ndarray, " R"],
-    usable: Bool[np.ndarray, " R"],
-) -> Bool[np.ndarray, " R"]:
-    """Among the usable measurements, the first of each (stamp, subject)."""
-    rows = np.flatnonzero(usable)
-    order = rows[np.lexsort((subjects[rows], stamps_ns[rows]))]
-    again = (np.diff(stamps_ns[order]) == 0) & (np.diff(subjects[order].astype(np.int64)) == 0)
-    single = usable.copy()
-    single[order[1:][again]] = False
-    return single
-
-
-def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-    """The angles in (−π, π]; those that are in it already keep their bits."""
-    turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
-    turned = np.where(turned == -np.pi, np.pi, turned)
-    return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
-
-
-def counted(count: int, thing: str, what: str) -> str:
-    """A note such as "2 measurements dropped: unknown barcode"; empty for none."""
-    return f"{count} {thing}{'s' if count != 1 else ''} {what}" if count else ""

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.importing.bag_topics import UndecidedError, decided, listing
+from sim.importing.bag_topics import UndecidedError, decide_topics, listing
 from sim.importing.tables import RobotTables
 from team.ros2.bags import Bag, opened_bag
 from team.ros2.decoding import (
@@ -26,7 +26,7 @@ from team.ros2.translator import Translator
 class Imported:
     """The tables of a bag's robots.
 
-    notes: what was used, what was left out and why, in words. messages: number of messages that
+    notes: the topics used and left out, and why, in words. messages: number of messages that
     were read.
     """
 
@@ -35,14 +35,14 @@ class Imported:
     messages: int = 0
 
 
-def imported_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
+def import_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
     """The tables of a bag; raises BagError, UndecidedError.
 
     topics: each robot's topics; None: as their names and types propose them, if there is one way
     only. robot: the name of the bag's only robot.
     """
     with opened_bag(path) as bag:
-        chosen = topics or decided(bag, path, robot)
+        chosen = topics or decide_topics(bag, path, robot)
         _check_present(chosen, bag, path)
         return _translated(bag, chosen, path)
 
@@ -103,7 +103,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
 
 def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
     """A translator for each robot; where robots share a topic of detections, all transforms of the
-    bag are read first, since they tell whose a detection is.
+    bag are read first, since they decide to which robot a detection belongs.
     """
     frames = {name: _static_frames(bag, each.odometry) for name, each in topics.robots.items()}
     owners = Owners(topics.robots, frames)
@@ -128,7 +128,7 @@ def _stamped(record: Record, arrival_ns: int) -> Record:
 
 
 def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
-    """Takes the mount of the robot's first sensor into the tables; returns notes."""
+    """Take the mount of the robot's first sensor into the tables; returns notes."""
     if not translator.mounts:
         return []
     tables.mount = next(iter(translator.mounts.values())).pose

@@ -1,4 +1,4 @@
-"""Proposes which topics of a ROS 2 bag are what, by their names, types and frames."""
+"""Propose the use of the topics of a ROS 2 bag by their names, types and frames."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -22,9 +22,7 @@ SAMPLED_MESSAGES = 2000
 
 
 class UndecidedError(DatasetError):
-    """The names and types of a bag's topics do not decide which are used; the text says what to
-    type.
-    """
+    """The names and types of a bag's topics do not decide which are used; the text has a remedy."""
 
 
 class Proposal(NamedTuple):
@@ -37,13 +35,13 @@ class Proposal(NamedTuple):
     warnings: list[str]
 
 
-def proposed_topics(path: Path) -> str:
+def propose_topics(path: Path) -> str:
     """A bag's topics, and a proposal for the file that assigns them; raises BagError."""
     with opened_bag(path) as bag:
         return _question(path, bag, _proposed(bag, None))
 
 
-def decided(bag: Bag, path: Path, robot: str | None) -> Topics:
+def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
     """The topics of each robot by their names and types; raises UndecidedError where they do not
     decide.
     """

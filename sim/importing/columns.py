@@ -133,7 +133,7 @@ def load_map(path: Path) -> Map:
     return found
 
 
-def mapped(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
+def map_columns(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
     """The columns under our names, as text; raises DatasetError."""
     found = {}
     for ours, theirs in columns.items():
@@ -165,9 +165,9 @@ class _Guess(NamedTuple):
     rank: tuple[int, int]
 
 
-def proposed(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
-    """A map in TOML for these files as far as the columns' names determine it, and what it
-    lacks.
+def propose_map(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
+    """Propose a map in TOML for these files as far as the columns' names determine it; also the
+    columns that it lacks.
     """
     guesses: list[_Guess] = []
     lacking: list[str] = []

@@ -16,21 +16,21 @@ from sim.datasets.folder_tables import (
     POSES,
 )
 from sim.datasets.tables import DatasetError
-from sim.importing.columns import REQUIRED, TABLES, Map, Table, mapped, proposed
+from sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
 from sim.importing.tables import RobotTables
 
 QUATERNION = 8
 """Number of columns of a trajectory in TUM's format: t x y z qx qy qz qw."""
 
 
-def imported_files(
+def import_files(
     paths: Sequence[Path],
     columns: Map | None,
     robot: str,
     everyones: Collection[str] = (),
     command: str = "",
 ) -> tuple[RobotTables, list[str]]:
-    """One robot's tables from CSV files, and notes on what was used and left out.
+    """Import one robot's tables from CSV files; also notes on the files used and left out.
 
     everyones: the names of all robots' files; a table whose files only other robots have is left
     out. command: the command line to repeat with a map. Raises DatasetError; without a map its text
@@ -60,7 +60,7 @@ def _by_names(files: dict[str, CsvTable], command: str) -> Map:
         kind = Path(name).stem
         ours = kind in TABLES and set(table.columns) <= set(TABLES[kind])
         if not ours or not all(table.has(each) for each in REQUIRED[kind]):
-            text, lacking = proposed(files)
+            text, lacking = propose_map(files)
             raise DatasetError(
                 f"{name}: its columns are {', '.join(table.columns)}. Which are what? "
                 "Write it into a file, as columns.toml, beginning with this:\n\n"
@@ -98,7 +98,7 @@ def _take(
                 f"({whole.name}, first at line {whole.lines[first]})"
             )
             whole = whole.rows(chosen)
-    found = mapped(whole, table.columns)
+    found = map_columns(whole, table.columns)
     if kind == "detections":
         found = _polar(found, whole)
     tables.columns[kind] = list(found)

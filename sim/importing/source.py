@@ -1,4 +1,4 @@
-"""Imports a user's files, bag, log or data set into a data set's folder."""
+"""Import a user's files, bag, log or data set into a data set's folder."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -13,10 +13,10 @@ from sim.datasets.folder_tables import POSES
 from sim.datasets.folder_writer import write_folder
 from sim.datasets.kinds import kind_of
 from sim.datasets.tables import DatasetError
-from sim.importing.bag import imported_bag
-from sim.importing.bag_topics import proposed_topics
+from sim.importing.bag import import_bag
+from sim.importing.bag_topics import propose_topics
 from sim.importing.columns import load_map
-from sim.importing.files import imported_files, trajectory
+from sim.importing.files import import_files, trajectory
 from sim.importing.tables import RobotTables
 from sim.recorded.streams import measurements_in
 from sim.scenarios.scenario import Scenario, load, with_options
@@ -35,7 +35,7 @@ MEASURED = ("odometry", "observations", "sightings", "detections")
 
 @dataclass(frozen=True)
 class Request:
-    """What the user has asked for.
+    """A user's request for an import.
 
     sources: files or folders. starts: initial poses by robot (a pose, then two standard deviations
     or none); "" is the only robot. truth: a trajectory of the only robot.
@@ -53,8 +53,8 @@ class Request:
 class Report:
     """The result of an import.
 
-    robots: their names. notes: what was used and left out, in words. messages: number of messages
-    that were read from bags.
+    robots: their names. notes: the files and rows used and left out, in words. messages: number of
+    messages that were read from bags.
     """
 
     robots: list[str]
@@ -62,7 +62,7 @@ class Report:
     messages: int = 0
 
 
-def imported(request: Request, folder: Path) -> Report:
+def import_data(request: Request, folder: Path) -> Report:
     """Write the data set into `folder`; raises DatasetError, LogError, ScenarioError."""
     source = request.sources[0]
     for path in request.sources:
@@ -164,20 +164,20 @@ def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
     command += f" --robot {request.robot}" if request.robot else ""
     tables, notes = [], list[str]()
     for robot, paths in files.items():
-        of, found = imported_files(paths, columns, robot, everyones, command)
+        of, found = import_files(paths, columns, robot, everyones, command)
         tables.append(of)
         notes += found if len(files) == 1 else [f"{robot}: {note}" for note in found]
     return _written(tables, notes, request, folder)
 
 
 def proposal(path: Path) -> str:
-    """The topics of a bag, and a proposal for the file that assigns them; empty for what is
-    no bag.
+    """The topics of a bag, and a proposal for the file that assigns them; empty for a path
+    that is no bag.
     """
     if not is_bag(path) or is_own_log(path):
         return ""
     try:
-        return proposed_topics(path)
+        return propose_topics(path)
     except BagError as error:
         raise DatasetError(str(error)) from None
 
@@ -209,7 +209,7 @@ def _bags(request: Request, folder: Path) -> Report:
         raise DatasetError("--robot names one robot: import bags of several one by one")
     try:
         topics = load_topics(request.ros2) if request.ros2 else None
-        found = [imported_bag(path, topics, request.robot) for path in request.sources]
+        found = [import_bag(path, topics, request.robot) for path in request.sources]
     except (BagError, TopicsError) as error:
         raise DatasetError(str(error)) from None
     tables = [each for one in found for each in one.robots]

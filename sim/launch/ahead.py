@@ -1,4 +1,4 @@
-"""Starts the template, ahead of everything else that `launch` imports and computes.
+"""Start the template, ahead of everything else that `launch` imports and computes.
 
 What a team needs takes a second and a half to import and to load; meanwhile the launch reads its
 command line and its scenario on another core. This module imports next to nothing, so that the

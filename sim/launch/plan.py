@@ -8,7 +8,7 @@ from sim.scenarios.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What `launch` starts, with which files and options."""
+    """The processes of `launch`, with their files and options."""
 
     scenario: Scenario
     folder: Path

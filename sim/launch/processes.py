@@ -1,4 +1,4 @@
-"""Starts the processes of a team: forked from the warm template, or each from scratch."""
+"""Start the processes of a team: forked from the warm template, or each from scratch."""
 
 import json
 import os
@@ -75,7 +75,7 @@ class Process:
         return self.exit
 
     def measure(self) -> None:
-        """Note its share of memory and its peak so far, where the system tells (Linux)."""
+        """Note its share of memory and its peak so far, where the system reports it (Linux)."""
         with suppress(OSError, StopIteration):
             pss_mb = self._kilobytes("smaps_rollup", "Pss:") / 1e3
             peak_rss_mb = self._kilobytes("status", "VmHWM:") / 1e3

@@ -1,4 +1,4 @@
-"""Supervises the processes of a team: restarts those that die and gives up those without progress.
+"""Supervise the processes of a team: restarts those that die and gives up those without progress.
 
 The map does not need recorder and viewer: where they are given up the team goes on, and the run
 fails in the end. A robot that is given up is named as lost in the final map. Without router, world
@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from central.desk.orders import ordered
+from central.desk.orders import publish_order
 from sim.launch.supervisor import Ended, Supervised
 from sim.launch.watch import TURN_S, Watch
 from team.shell import lacking
@@ -125,7 +125,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
     if not _is_needed(service.name, watch):
         with suppress(BusError):  # named by `_receive`
-            ordered(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
+            publish_order(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
 
 
 class Leaving:

@@ -67,7 +67,7 @@ def become_a_process(prepare: Callable[[], object]) -> None:
     every process would do first.
     """
     end_with_parent(signal.SIGKILL)
-    gc.disable()  # what is imported stays
+    gc.disable()  # imported modules stay
     launch = os.getppid()
     write_command_line(sys.orig_argv[: sys.orig_argv.index(TEMPLATE) + 1])
     asked = socket.socket(fileno=int(sys.argv[2]))
@@ -84,7 +84,7 @@ def become_a_process(prepare: Callable[[], object]) -> None:
                 return
     pair = pair or _noted(_received(asked), launch)
     _load_kernels(pair[0], pair[1], asked)
-    # What lives now stays where it is: the collector of a forked process does not touch it.
+    # The collector of a forked process leaves the objects of now in place.
     gc.freeze()
     while True:
         if _serve(_received(asked), asked, launch):

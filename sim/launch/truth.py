@@ -1,4 +1,4 @@
-"""Compares a running team's poses and map with the truth as they arrive.
+"""Compare a running team's poses and map with the truth as they arrive.
 
 It computes `central.desk.evaluation`'s figures of what has arrived so far; without truth it stays
 empty. Poses and maps in a frame that no known initial pose fixes are not compared.

@@ -1,4 +1,4 @@
-"""Compiles the kernels once, before many processes need them: later processes read the cache."""
+"""Compile the kernels once, before many processes need them: later processes read the cache."""
 
 import hashlib
 import sys

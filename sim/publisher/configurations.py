@@ -1,4 +1,4 @@
-"""Checks that robots and centre run with the configurations that the world's scenario gives them.
+"""Check that robots and centre run with the configurations that the world's scenario gives them.
 
 Processes that were started by hand may have been given other options. The announcement of each
 robot and of the centre is compared with the scenario, field by field.

@@ -218,7 +218,7 @@ class WorldNode:
     def _take_liveliness(self, message: m.Liveliness) -> None:
         (self._alive.add if message.alive else self._alive.discard)(message.node)
         came = not self._recorder and "recorder" in self._alive
-        if came and self._began_at is not None:  # it says what its log has
+        if came and self._began_at is not None:  # its progress counts the messages in its log
             self._recorded, self._unrecorded = {}, self._out_of_reach
         self._recorder = "recorder" in self._alive
         for name, source in self._sources.items():

@@ -1,4 +1,4 @@
-"""Simulates a robot's radio at its bus: over a router, messages from robots out of reach are
+"""Simulate a robot's radio at its bus: over a router, messages from robots out of reach are
 dropped on arrival.
 
 The world, which alone knows all positions, announces in advance which robots reach each other

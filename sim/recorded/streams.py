@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.datasets.utias_rows import counted
+from sim.datasets.scans import count_note
 from sim.recorded.forms import forms_of, intervals_of, landmarks_of
 from sim.scenarios.scenario import Scenario, ScenarioError, loads
 from sim.world.streams import (
@@ -14,7 +14,6 @@ from sim.world.streams import (
     StartPose,
     WorldStreams,
     grouped,
-    robot_stream,
 )
 from team import translate
 from team.recording.reader import LogError, open_log
@@ -90,7 +89,7 @@ def recorded_streams(
     ]
     notes = [
         f"{robot}: "
-        + counted(
+        + count_note(
             sum(map(len, of.values())),
             "measurement",
             "left out: its stream began anew, and a data set has one stream of each robot",
@@ -118,17 +117,19 @@ def _stream(
     truth = sorted(truth, key=lambda each: each.stamp_ns)
     times = [stamps(each.stamps, "stamps") for each in truth]
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
-    return robot_stream(
+    return RobotStream(
         robot=robot,
         start_ns=measurements[0].stamp_ns,
         start=None if pose is None else StartPose(pose, covariance),
         intervals=intervals,
-        observations=landmarks_of(seen, labels),
-        sightings=_detections(sighted, [_indices(each, robots) for each in sighted]),
+        landmark_detections=landmarks_of(seen, labels),
+        teammate_detections=_detections(sighted, [_indices(each, robots) for each in sighted]),
         teammates=robots,
         truth_ns=np.concatenate(times) if times else None,
         truth=np.concatenate(poses) if poses else None,
-        notes=[f"its stream has {forms}; each stays in its own form" for forms in mixed if forms],
+        notes=tuple(
+            f"its stream has {forms}; each stays in its own form" for forms in mixed if forms
+        ),
     )
 
 

@@ -1,1 +1,1 @@
-"""Scenarios: what a user writes, its resolved form for processes, and the streams of its world."""
+"""Scenarios: the user's document, its resolved form for processes, and the streams of its world."""

@@ -1,4 +1,4 @@
-"""Checks scenarios: errors name the field's path, what is known there, and a remedy."""
+"""Check scenarios: errors name the field's path, its known values, and a remedy."""
 
 import difflib
 import math

@@ -1,4 +1,4 @@
-"""Converts a user's TOML document to the plain fields of a resolved scenario.
+"""Convert a user's TOML document to the plain fields of a resolved scenario.
 
 base = "thesis"            # optional: a built-in scenario that this file changes
 name, team, seed, estimator, fusion, exchange, peers, centre

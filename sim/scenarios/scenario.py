@@ -148,7 +148,7 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
     kind = _kind_of(path, "utias" if isinstance(world, UtiasWorld) else "folder")
     if kind != fields["kind"]:
         common = set(types_of(WORLDS[kind]))
-        common -= {"identities"}  # what a kind of set tells is its own
+        common -= {"identities"}  # a data set's identities are its own
         fields = {name: value for name, value in fields.items() if name in common}
     return fields | {"kind": kind, "path": path}
 

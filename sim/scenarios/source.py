@@ -9,7 +9,7 @@ import msgspec
 from sim.datasets.folder import folder
 from sim.datasets.folder_files import robots_of, scenario_in
 from sim.datasets.kinds import UTIAS_MARKER, kind_of
-from sim.datasets.tables import opened
+from sim.datasets.tables import open_data_set
 from sim.datasets.unlabelled import is_car, unlabelled
 from sim.datasets.utias import utias
 from sim.datasets.utias_log import present_robots
@@ -76,7 +76,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))
     else:
-        with opened(world.path, UTIAS_MARKER) as files:
+        with open_data_set(world.path, UTIAS_MARKER) as files:
             present = {f"r{number}" for number in present_robots(files)}
     remaining = tuple(robot for robot in scenario.robots if robot.id in present)
     missing = [robot.id for robot in scenario.robots if robot.id not in present]

@@ -1,5 +1,6 @@
 """A resolved scenario as TOML: the one that runs the team of a simulated world on its data set."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -13,32 +14,28 @@ from team.config import RobotConfig
 
 
 def data_set_scenario(scenario: Scenario) -> str:
-    """The same robots and centre for the data set in the folder of this text.
+    """The same robots and centre for the UTIAS data set in the folder of this text.
 
     The robots are called r1, r2, … as in every UTIAS world. Fields with their default are left out.
     """
-    head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
-    robots = [
-        {"id": f"r{i}"} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
-        for i, robot in enumerate(scenario.robots, 1)
-    ]
-    world = {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ())
-    central = _chosen(scenario.central, CentralConfig, TOP_LEVEL)
-    document = head | {"world": world} | ({"central": central} if central else {})
-    return tomli_w.dumps(document | {"robots": robots})
+    ids = [f"r{i}" for i in range(1, len(scenario.robots) + 1)]
+    return _text(scenario, ids, {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ()))
 
 
 def folder_scenario(scenario: Scenario) -> str:
     """The same robots and centre for the folder of CSV tables that contains this text."""
+    ids = [robot.id for robot in scenario.robots]
+    unknown = [robot for robot in ids if starts_unknown(scenario.world, robot)]
+    world: dict[str, Any] = {"kind": "folder", "path": "."}
+    return _text(scenario, ids, world | ({"unknown_starts": unknown} if unknown else {}))
+
+
+def _text(scenario: Scenario, ids: Sequence[str], world: Mapping[str, Any]) -> str:
     head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
     robots = [
-        {"id": robot.id} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
-        for robot in scenario.robots
+        {"id": name} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
+        for name, robot in zip(ids, scenario.robots, strict=True)
     ]
-    world: dict[str, Any] = {"kind": "folder", "path": "."}
-    unknown = [robot.id for robot in scenario.robots if starts_unknown(scenario.world, robot.id)]
-    if unknown:
-        world["unknown_starts"] = unknown
     central = _chosen(scenario.central, CentralConfig, TOP_LEVEL)
     document = head | {"world": world} | ({"central": central} if central else {})
     return tomli_w.dumps(document | {"robots": robots})

@@ -1,4 +1,4 @@
-"""The kinds of world that a scenario may have, and what is wrong with one of none of them."""
+"""The kinds of world that a scenario may have, and the error for one of none of them."""
 
 from sim.scenarios.checks import ScenarioError, check_fields, close, types_of
 from sim.scenarios.document import Fields, builtin_names
@@ -37,7 +37,7 @@ def check_world(world: Fields) -> None:
 
 
 def _which(kind: object) -> str:
-    """What is wrong with this kind of world, which is none that is known."""
+    """The error for an unknown kind of world."""
     known = ", ".join(f'"{each}"' for each in WORLDS)
     if kind is not None:
         return f"expected one of {known}, got {kind!r} at world.kind{close(kind, WORLDS)}"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams, with_observations
+from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def _hidden(
         untagged = _with_clutter(untagged, hiding, rng)
     both = in_order([*parts, untagged])
     # A scan that saw nothing stays a measurement, whichever kind it is.
-    return with_observations(stream, both)
+    return replace(stream, landmark_detections=both)
 
 
 def _rows(
@@ -142,7 +142,7 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
 def in_order(parts: list[Detections]) -> Detections:
     """The messages of all parts by time; at equal times those with identities first.
 
-    What only some parts have, as points or covariances, is NaN in the others' rows.
+    Columns that only some parts have, as points or covariances, are NaN in the others' rows.
     """
     if len(parts) == 1:
         return parts[0]

@@ -35,7 +35,6 @@ from sim.world.streams import (
     WorldStreams,
     grouped,
     moved,
-    robot_stream,
 )
 from team.config import RobotConfig, Sensor
 
@@ -176,14 +175,14 @@ def _stream(
     robot, drive = robots[index], drives[index]
     unknown = starts_unknown(world, robot.id)
     start = None if unknown else StartPose(drive.poses[0].copy(), None)
-    return robot_stream(
+    return RobotStream(
         robot=robot.id,
         start_ns=int(stamps_ns[0]),
         start=start,
         intervals=_odometry(world, robot, drive, stamps_ns, seed),
-        observations=_observations(world, robot, drive, landmarks, stamps_ns, seed),
-        sightings=_sightings(world, robots, drives, index, stamps_ns[1:], seed),
-        teammates=[other.id for other in robots],
+        landmark_detections=_observations(world, robot, drive, landmarks, stamps_ns, seed),
+        teammate_detections=_sightings(world, robots, drives, index, stamps_ns[1:], seed),
+        teammates=tuple(other.id for other in robots),
         truth_ns=stamps_ns,
         truth=drive.poses,
         clock_offset_ns=_clock_ns(robot),
@@ -278,7 +277,7 @@ def _with_claims(
     ],
     seed: int,
 ) -> Detections:
-    """Measurements of what is visible, each with a covariance of its own and an error of that
+    """Measurements of the visible points, each with a covariance of its own and an error of that
     covariance.
     """
     assert world.landmark_claims is not None

@@ -7,8 +7,7 @@ intervals of a robot are contiguous in time. So at equal stamps the measurements
 interval come before it. SI units, radians, bearings in (−π, π].
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -159,23 +158,23 @@ class SightingMeasurement(NamedTuple):
     bearings: Float[np.ndarray, " R"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobotStream:
-    """All measurements of one robot; the index into kinds, stamps_ns and rows is the measurement
-    counter.
+    """All measurements of one robot, numbered by (stamp, kind), the initial pose first; the index
+    into kinds, stamps_ns and rows is the measurement counter.
 
-    start: None when the initial pose is not known. rows: the measurement's row in the arrays of its
-    kind. truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was repaired or can
-    not be given, for users. clock_offset_ns: all stamps here are team time; the odometry's own
-    clock, whose stamps are published, reads this much less. positions: where another sensor, as a
-    GPS, measured the robot at positions_ns, in a frame of its own.
+    start: at start_ns, None when the initial pose is not known. rows: the measurement's row in the
+    arrays of its kind. truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was
+    repaired or can not be given, for users. clock_offset_ns: all stamps here are team time; the
+    odometry's own clock, whose stamps are published, reads this much less. positions: where another
+    sensor, as a GPS, measured the robot at positions_ns, in a frame of its own.
+
+    Raises ValueError for a measurement before the initial pose, or odometry that is not contiguous.
     """
 
     robot: str
+    start_ns: int
     start: StartPose | None
-    kinds: UInt8[np.ndarray, " N"]
-    stamps_ns: Int64[np.ndarray, " N"]
-    rows: Int64[np.ndarray, " N"]
     intervals: Intervals
     landmark_detections: Detections
     teammate_detections: Detections
@@ -186,6 +185,36 @@ class RobotStream:
     clock_offset_ns: int = 0
     positions_ns: Int64[np.ndarray, " G"] | None = None
     positions: Float[np.ndarray, "G 2"] | None = None
+    kinds: UInt8[np.ndarray, " N"] = field(init=False)
+    stamps_ns: Int64[np.ndarray, " N"] = field(init=False)
+    rows: Int64[np.ndarray, " N"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        intervals = self.intervals
+        parts = (
+            np.array([self.start_ns]),
+            self.landmark_detections.stamps_ns,
+            self.teammate_detections.stamps_ns,
+            intervals.end_ns,
+        )
+        stamps = np.concatenate(parts)
+        kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in parts])
+        rows = np.concatenate([np.arange(len(part), dtype=np.int64) for part in parts])
+        if stamps.min() < self.start_ns:
+            raise ValueError(
+                f"{self.robot}: a measurement at {stamps.min()} ns is before its start, "
+                f"{self.start_ns}"
+            )
+        begins = intervals.end_ns - intervals.duration_ns
+        for k in np.flatnonzero(begins[1:] != intervals.end_ns[:-1])[:1].tolist():
+            ends_s, begins_s = 1e-9 * intervals.end_ns[k], 1e-9 * begins[k + 1]
+            raise ValueError(
+                f"{self.robot}: odometry intervals are not contiguous in time: one ends at "
+                f"{ends_s:.3f} s, the next begins at {begins_s:.3f} s"
+            )
+        order = np.lexsort((kinds, stamps))
+        for name, values in (("kinds", kinds), ("stamps_ns", stamps), ("rows", rows)):
+            object.__setattr__(self, name, values[order])
 
     def __len__(self) -> int:
         """The number of measurements, the initial pose included."""
@@ -283,79 +312,6 @@ class WorldStreams:
         stamps = np.concatenate([each.stamps_ns for each in self.streams])
         by_time = np.lexsort((counter, stream, stamps))
         return stream[by_time], counter[by_time]
-
-
-def robot_stream(
-    robot: str,
-    start_ns: int,
-    start: StartPose | None,
-    intervals: Intervals,
-    observations: Detections,
-    sightings: Detections,
-    teammates: Sequence[str],
-    truth_ns: Int64[np.ndarray, " T"] | None = None,
-    truth: Float[np.ndarray, "T 3"] | None = None,
-    notes: Sequence[str] = (),
-    clock_offset_ns: int = 0,
-    positions_ns: Int64[np.ndarray, " G"] | None = None,
-    positions: Float[np.ndarray, "G 2"] | None = None,
-) -> RobotStream:
-    """Number the measurements of one robot by (stamp, kind), the initial pose first.
-
-    Raises ValueError for a measurement before the initial pose, or odometry that is not contiguous.
-    """
-    parts = (np.array([start_ns]), observations.stamps_ns, sightings.stamps_ns, intervals.end_ns)
-    stamps = np.concatenate(parts)
-    kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in parts])
-    rows = np.concatenate([np.arange(len(part), dtype=np.int64) for part in parts])
-    if stamps.min() < start_ns:
-        raise ValueError(
-            f"{robot}: a measurement at {stamps.min()} ns is before its start, {start_ns}"
-        )
-    begins = intervals.end_ns - intervals.duration_ns
-    for k in np.flatnonzero(begins[1:] != intervals.end_ns[:-1])[:1].tolist():
-        ends_s, begins_s = 1e-9 * intervals.end_ns[k], 1e-9 * begins[k + 1]
-        raise ValueError(
-            f"{robot}: odometry intervals are not contiguous in time: one ends at {ends_s:.3f} s, "
-            f"the next begins at {begins_s:.3f} s"
-        )
-    order = np.lexsort((kinds, stamps))
-    return RobotStream(
-        robot=robot,
-        start=start,
-        kinds=kinds[order],
-        stamps_ns=stamps[order],
-        rows=rows[order],
-        intervals=intervals,
-        landmark_detections=observations,
-        teammate_detections=sightings,
-        teammates=tuple(teammates),
-        truth_ns=truth_ns,
-        truth=truth,
-        notes=tuple(notes),
-        clock_offset_ns=clock_offset_ns,
-        positions_ns=positions_ns,
-        positions=positions,
-    )
-
-
-def with_observations(stream: RobotStream, observations: Detections) -> RobotStream:
-    """The stream with other measurements of landmarks, numbered anew."""
-    return robot_stream(
-        robot=stream.robot,
-        start_ns=int(stream.stamps_ns[0]),
-        start=stream.start,
-        intervals=stream.intervals,
-        observations=observations,
-        sightings=stream.teammate_detections,
-        teammates=stream.teammates,
-        truth_ns=stream.truth_ns,
-        truth=stream.truth,
-        notes=stream.notes,
-        clock_offset_ns=stream.clock_offset_ns,
-        positions_ns=stream.positions_ns,
-        positions=stream.positions,
-    )
 
 
 def grouped(

@@ -1,5 +1,5 @@
-"""Repairs an MCAP file of another program, as a ROS 2 bag whose recorder was killed: copies what is
-whole to a new, complete one.
+"""Repair an MCAP file of another program, such as a ROS 2 bag whose recorder was killed: copy its
+undamaged chunks to a new, complete file.
 """
 
 import struct
@@ -18,13 +18,13 @@ _FAULTS = (McapError, ValueError, struct.error, RuntimeError, MemoryError, Overf
 
 
 class BagReport(NamedTuple):
-    """The result of a repair: messages copied, and what was lost."""
+    """The result of a repair: messages copied, and the damage in words."""
 
     messages: int
     damaged: tuple[str, ...]
 
 
-def bag_repaired(path: Path, out: Path) -> BagReport:
+def repair_bag(path: Path, out: Path) -> BagReport:
     """Copy every message of an MCAP file's whole chunks to a new file with an index.
 
     Raises LogError where `path` is no MCAP file or has no whole message; then there is no new file.
@@ -71,7 +71,7 @@ def bag_repaired(path: Path, out: Path) -> BagReport:
 
 
 def _records(reader: StreamReader, damaged: list[str]) -> Iterator[McapRecord]:
-    """The records in order, those of chunks too; what can not be read is noted in `damaged`."""
+    """The records in order, those of chunks too; unreadable parts are noted in `damaged`."""
     records = reader.records
     while True:
         try:
@@ -79,7 +79,7 @@ def _records(reader: StreamReader, damaged: list[str]) -> Iterator[McapRecord]:
         except StopIteration:
             return
         except _FAULTS as error:
-            damaged.append(f"what is behind the last whole chunk ({type(error).__name__})")
+            damaged.append(f"the bytes behind the last whole chunk ({type(error).__name__})")
             return
         if not isinstance(record, Chunk):
             yield record

@@ -1,4 +1,4 @@
-"""Checks a log: whether it is whole, complete and sound; each finding is one line."""
+"""Check a log: whether it is whole, complete and sound; each finding is one line."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 from team.recording.counters import Counters
 from team.recording.cut import CUT
-from team.recording.declared import declared, misdeclared
+from team.recording.declared import find_misdeclaration, read_declarations
 from team.recording.inventory import MISSING, Inventory
 from team.recording.last_words import LastWords
 from team.recording.reader import Log, LogError
-from team.recording.records import index_damage
-from team.recording.repair import REPAIRED, salvaged
+from team.recording.records import check_index
+from team.recording.repair import REPAIRED, read_undamaged
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
@@ -32,7 +32,7 @@ class Finding(NamedTuple):
         return f"{self.where}: {self.what}"
 
 
-def checked(log: Log) -> list[Finding]:
+def check_log(log: Log) -> list[Finding]:
     """All defects of a log: of the file, its schemas, counters and messages; none if the log is
     sound.
 
@@ -43,7 +43,7 @@ def checked(log: Log) -> list[Finding]:
     found = _of_file(log)
     evidence = _evidence(log)
     unsound: dict[str, tuple[int, str]] = {}
-    for chunk in salvaged(log):
+    for chunk in read_undamaged(log):
         if isinstance(chunk, LogError):
             found.append(Finding(FILE, chunk.what))
             continue
@@ -53,9 +53,9 @@ def checked(log: Log) -> list[Finding]:
                 count, first = unsound.get(sample.key, (0, reason))
                 unsound[sample.key] = (count + 1, first)
             evidence.take(sample)
-    declarations = declared(log)
+    declarations = read_declarations(log)
     for key in sorted(declarations):
-        wrong = misdeclared(declarations[key])
+        wrong = find_misdeclaration(declarations[key])
         if wrong is not None:
             found.append(Finding(key, wrong))
     found += evidence.findings()
@@ -73,7 +73,7 @@ def holes(log: Log) -> list[Finding]:
     """
     evidence = _evidence(log)
     damaged = [] if log.complete else [Finding(FILE, UNFINISHED)]
-    for chunk in salvaged(log):
+    for chunk in read_undamaged(log):
         if isinstance(chunk, LogError):
             damaged.append(Finding(FILE, chunk.what))
             continue
@@ -156,9 +156,9 @@ _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
 """Channels whose publisher has received the end of the streams."""
-NO_END = "missing: how many measurements there were is not known"
+NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
-NO_FINAL = "repaired, and without a final map: what came after its recorder died is not in it"
+NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
 
 
@@ -167,7 +167,7 @@ def _of_file(log: Log) -> list[Finding]:
     for each in log.files:
         if each.complete:
             with each.path.open("rb") as file:
-                damage = index_damage(file)
+                damage = check_index(file)
             found += [] if damage is None else [Finding(FILE, damage)]
     return found
 

@@ -32,7 +32,7 @@ class Counters:
         self._replies = 0
 
     def take(self, sample: Sample) -> None:
-        """Adds the counter of one more sample."""
+        """Add the counter of one more sample."""
         if sample.counter == NO_COUNTER:
             self._replies += 1
             return

@@ -1,4 +1,4 @@
-"""Exports a log as CSV: one table per channel, with numbers that can be read back exactly.
+"""Export a log as CSV: one table per channel, with numbers that can be read back exactly.
 
 An array is a list of numbers separated by spaces, a digest hexadecimal, a list or a table JSON.
 """
@@ -19,7 +19,7 @@ from team.wire.messages import Digest, Message
 
 
 def export_csv(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
-    """Writes `<channel>.csv` for each of the channels (None: all) that has a message into `folder`.
+    """Write `<channel>.csv` for each of the channels (None: all) that has a message into `folder`.
 
     Raises `LogError` for a damaged log, OSError where the folder can not be written.
     """

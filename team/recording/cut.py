@@ -1,11 +1,11 @@
-"""Cuts an interval of team time, or some channels, out of a log, into a log of its own."""
+"""Cut an interval of team time, or some channels, out of a log, into a log of its own."""
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from team.recording.reader import Log, LogError
 from team.recording.recorder import Recorder
-from team.recording.summary import summarised
+from team.recording.summary import summarise_log
 from team.wire import channels as ch
 from team.wire.bus import Sample
 
@@ -25,7 +25,7 @@ def cut(
     to_s: float | None = None,
     channels: Collection[ch.Channel] | None = None,
 ) -> int:
-    """Writes the samples of [from_s, to_s) on these channels to a new log `out`; returns their
+    """Write the samples of [from_s, to_s) on these channels to a new log `out`; returns their
     number.
 
     Times are seconds of team time since the first measurement; None: no bound. Adjacent cuts
@@ -33,7 +33,7 @@ def cut(
     The metadata is copied, with a note of the cut. Raises `LogError` when no sample is left or the
     log is damaged, before `out` is created, and `RecorderError` when `out` exists.
     """
-    summary = summarised(log)
+    summary = summarise_log(log)
     if summary.damaged:
         raise LogError(log.path, summary.damaged[0], "`teamslam log repair` saves the rest")
     span = summary.span_ns()

@@ -12,7 +12,14 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from team.recording.reader import Log
-from team.recording.records import MALFORMED, Frame, LogError, expanded, frames, records
+from team.recording.records import (
+    MALFORMED,
+    Frame,
+    LogError,
+    expand_chunk,
+    read_frames,
+    read_records,
+)
 from team.recording.schemas import schema_of
 from team.wire.channels import VIEW, channel_of
 from team.wire.messages import Message, tag_of
@@ -27,7 +34,7 @@ class Declared(NamedTuple):
     text: bytes
 
 
-def declared(log: Log) -> dict[str, Declared]:
+def read_declarations(log: Log) -> dict[str, Declared]:
     """The declaration of each key, the last one where there are several; damaged parts are left
     out.
     """
@@ -54,7 +61,7 @@ def _declared_in(path: Path, team: str, found: dict[str, Declared]) -> None:
             continue
 
 
-def misdeclared(of: Declared) -> str | None:
+def find_misdeclaration(of: Declared) -> str | None:
     """The defect of a key's declaration; None for a sound one.
 
     A later version of the program may append fields: the shorter of two field lists has to be the
@@ -88,12 +95,12 @@ def _declarations(path: Path) -> Iterator[Frame]:
     opcodes = (Opcode.SCHEMA, Opcode.CHANNEL)
     with path.open("rb") as file:
         try:
-            for frame in frames(file, path):
+            for frame in read_frames(file, path):
                 if frame.opcode in opcodes:
                     yield frame
                 elif frame.opcode == Opcode.CHUNK:
                     try:
-                        every = records(expanded(frame.body))
+                        every = read_records(expand_chunk(frame.body))
                         inside = [each for each in every if each.opcode in opcodes]
                     except (*MALFORMED, ValueError, zstandard.ZstdError):
                         continue

@@ -1,4 +1,4 @@
-"""The numbered streams of a log: which numbers it contains, and which ones it is known to lack.
+"""The numbered streams of a log: numbers present and numbers missing.
 
 A robot's measurements are numbered by their source across all sensor channels, its submaps by the
 robot; `world/end`, or each driver's head, gives the total number of measurements, `progress` and
@@ -56,21 +56,21 @@ class Numbered:
         return len(self._sums)
 
     def take(self, number: int, payload: bytes) -> bool:
-        """Adds a payload; returns False if it is present already, with the same content."""
+        """Add a payload; returns False if it is present already, with the same content."""
         found = zlib.crc32(payload)
         there = self._sums[number] if number < self.whole else self._beyond.get(number)
         if there is not None:
             self.contradicted += there != found
             return there != found
         self.count += 1
-        self.know(number)
+        self.note_number(number)
         self._beyond[number] = found
         while (following := self._beyond.pop(self.whole, None)) is not None:
             self._sums.append(following)
         return True
 
-    def know(self, newest: int) -> None:
-        """Records that a message has mentioned this number."""
+    def note_number(self, newest: int) -> None:
+        """Note a number that a message names."""
         self.newest = max(self.newest, newest)
 
     @property
@@ -96,13 +96,13 @@ class Inventory:
     _contents: set[int] = field(default_factory=set, init=False)
 
     def remember(self, sample: Sample) -> None:
-        """Adds a sample of an earlier part of the log, which may be repeated."""
+        """Add a sample of an earlier part of the log, which may be repeated."""
         self._earlier.add(_name(sample))
         self.received.take(sample)
         self.take(sample)
 
     def is_new(self, sample: Sample) -> bool:
-        """Adds a sample; returns False where it is in the log already, or in an earlier part of
+        """Add a sample; returns False where it is in the log already, or in an earlier part of
         it.
         """
         self.received.take(sample)
@@ -114,7 +114,7 @@ class Inventory:
         return self.take(sample)
 
     def take(self, sample: Sample) -> bool:
-        """Adds a sample; returns False where its stream contains it already."""
+        """Add a sample; returns False where its stream contains it already."""
         found = ch.channel_of(sample.key)
         if found is None:
             return True
@@ -131,30 +131,34 @@ class Inventory:
             kind: Kind = "submaps" if channel is ch.SUBMAP else "measurements"
             return self._of(kind, robot, named[0]).take(named[1], sample.payload)
         if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD, ch.ROBOT_HEAD):
-            self._hear(sample)
+            self._note_totals(sample)
         return True
 
     def _of(self, kind: Kind, robot: str, incarnation: int) -> Numbered:
         return self.streams.setdefault(NumberedStream(kind, robot, incarnation), Numbered())
 
-    def _hear(self, sample: Sample) -> None:
+    def _note_totals(self, sample: Sample) -> None:
         try:
             message = opened(sample)[2]
         except WireError:
-            return  # whoever opens it will say so
+            return  # the reader of the message reports it
         match message:
             case m.Progress() | m.Done():
-                self._of("measurements", message.robot, message.incarnation).know(
+                self._of("measurements", message.robot, message.incarnation).note_number(
                     message.measurements - 1
                 )
-                self._of("submaps", message.robot, message.incarnation).know(message.submaps - 1)
+                self._of("submaps", message.robot, message.incarnation).note_number(
+                    message.submaps - 1
+                )
             case m.StreamHead():
-                self._of("measurements", message.robot, message.incarnation).know(
+                self._of("measurements", message.robot, message.incarnation).note_number(
                     message.measurements - 1
                 )
             case m.End():
                 for end in message.streams:
-                    self._of("measurements", end.robot, end.incarnation).know(end.measurements - 1)
+                    self._of("measurements", end.robot, end.incarnation).note_number(
+                        end.measurements - 1
+                    )
             case _:
                 pass
 
@@ -225,6 +229,6 @@ def numbered_in(payload: bytes) -> tuple[int, int] | None:
             unpacker.skip()
         incarnation, number = unpacker.unpack(), unpacker.unpack()
     except (ValueError, msgpack.UnpackException):
-        return None  # unsound ones are recorded as they came; whoever opens them will say so
+        return None  # recorded unchanged; the reader of the message reports it
     sound = all(isinstance(n, int) and n >= 0 for n in (incarnation, number))
     return (incarnation, number) if sound else None

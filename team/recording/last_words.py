@@ -1,4 +1,4 @@
-"""Finds the processes of a log that ended without announcing it, so that messages may be missing.
+"""Find the processes of a log that ended without announcing it, so that messages may be missing.
 
 A process counts its publications and publishes the totals when it ends (`Tally`). A process that
 was killed does not: its last publications may never have left its machine, and no received counter
@@ -30,19 +30,19 @@ class LastWords:
     """By node, the numbers of statuses in its processes' final totals, by their beginnings."""
 
     def take_status(self, node: str, sample: Sample) -> None:
-        """Adds a status of a node."""
+        """Add a status of a node."""
         if sample.counter != NO_COUNTER:
             status = sample.counter, min(sample.wall_ns, 2**63 - 1), sample.stamp_ns
             self._statuses[node].append(status)
 
     def take_tally(self, tally: Tally) -> None:
-        """Adds the final totals of a process."""
+        """Add the final totals of a process."""
         totals = dict(zip(tally.keys, tally.counts, strict=True))
         count = totals.get(ch.STATUS.key(tally.node), 0)
         self._totals[tally.node][tally.since_ns] = count
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """A key, and what is unknown about its process; empty where no process published totals.
+        """A key, and the gap in the record of its process; empty where no process published totals.
 
         A log of nodes in memory has no such totals.
         """
@@ -59,6 +59,6 @@ class LastWords:
                     last_s = stamps_ns[life[-1]] * 1e-9
                     yield (
                         ch.TALLY.key(node),
-                        f"no last word of the process that spoke until {last_s:.1f} s: "
-                        "it was killed or cut off, and what it said after that may be missing",
+                        f"the process with messages until {last_s:.1f} s announced no totals: "
+                        "it was killed or cut off, and its later messages may be missing",
                     )

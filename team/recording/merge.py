@@ -1,4 +1,4 @@
-"""Merges the logs of several robots, or the parts of one log, into one log."""
+"""Merge the logs of several robots, or the parts of one log, into one log."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -23,7 +23,7 @@ class Merged(NamedTuple):
 
 
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
-    """Writes each sample of the logs once to a new log `out`, in the order of team time.
+    """Write each sample of the logs once to a new log `out`, in the order of team time.
 
     Equal stamps stay in the order of the logs and of each file. Samples of equal key, counter, wall
     clock and payload are one publication that several recorders wrote; a restarted robot announces

@@ -1,4 +1,4 @@
-"""Opens one file of a log: the run that it is of, and whether its recorder finished it."""
+"""Open one file of a log: the run that it is of, and whether its recorder finished it."""
 
 import os
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from mcap.records import Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from team.recording.recorder import METADATA
-from team.recording.records import FOOTER_SIZE, MALFORMED, LogError, frames
+from team.recording.records import FOOTER_SIZE, MALFORMED, LogError, read_frames
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def _opened(file: IO[bytes], path: Path) -> LogFile:
 
 
 def _metadata(file: IO[bytes], path: Path) -> dict[str, str]:
-    for frame in frames(file, path):
+    for frame in read_frames(file, path):
         if frame.opcode == Opcode.METADATA:
             try:
                 record = Metadata.read(ReadDataStream(BytesIO(frame.body)))

@@ -17,7 +17,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class OwnLog:
-    """Writes samples to a log, each once, and knows what was lost in a crash: a bus's `Tap`.
+    """Write samples to a log, each once, and list the messages lost in a crash: a bus's `Tap`.
 
     failed: whether the log could not be written any more, which was reported.
     """
@@ -28,7 +28,7 @@ class OwnLog:
         self.failed = False
 
     def __call__(self, samples: list[Sample]) -> None:
-        """Writes those samples that are new."""
+        """Write those samples that are new."""
         if self.failed:
             return
         try:

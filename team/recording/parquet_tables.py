@@ -1,4 +1,4 @@
-"""Exports a log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and the like.
+"""Export a log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and the like.
 
 Arrays are lists of numbers, a digest is hexadecimal, a list or a table of parts JSON. pyarrow is
 the extra `parquet`: only this module imports it, and only when it is called.

@@ -28,7 +28,7 @@ def parts_of(path: Path) -> list[Path]:
     A file of a part's name that belongs to another log is not among them.
     """
     numbered = _numbered_parts(path)
-    opened = {number: readable(part) for number, part in numbered.items()}
+    opened = {number: open_part(part) for number, part in numbered.items()}
     first = next((log for log in opened.values() if log is not None), None)
     joined = _joined(opened.get(1))
     return [
@@ -41,16 +41,16 @@ def parts_of(path: Path) -> list[Path]:
 def next_number(path: Path) -> int:
     """The number of the next part of the log at `path`: larger than that of each earlier one."""
     numbered = _numbered_parts(path)
-    return max((_joined(readable(path)), *numbered)) + 1 if numbered else 1
+    return max((_joined(open_part(path)), *numbered)) + 1 if numbered else 1
 
 
 def joined_leftovers(path: Path) -> list[Path]:
     """The files of parts that were joined into the log at `path` and that a crash has left."""
-    first = readable(path)
+    first = open_part(path)
     return [
         part
         for number, part in _numbered_parts(path).items()
-        if 1 < number <= _joined(first) and _is_of(first, readable(part), part)
+        if 1 < number <= _joined(first) and _is_of(first, open_part(part), part)
     ]
 
 
@@ -89,7 +89,7 @@ def _is_of(first: LogFile | None, log: LogFile | None, path: Path) -> bool:
     )
 
 
-def readable(path: Path) -> LogFile | None:
+def open_part(path: Path) -> LogFile | None:
     """One file as a log; None where it is none, as of a recorder that ended before it began."""
     with suppress(LogError):
         return open_file(path)

@@ -22,13 +22,13 @@ from team.recording.part_files import (
     LOG_ID,
     joined_leftovers,
     next_number,
+    open_part,
     part_of,
     parts_of,
-    readable,
 )
 from team.recording.reader import Log, LogError, log_of, open_log
 from team.recording.recorder import Recorder, RecorderError
-from team.recording.repair import salvaged
+from team.recording.repair import read_undamaged
 from team.wall_clock import wall_clock, was_set_since
 from team.wire.channels import FINAL_MAP, TEAM_FINAL
 
@@ -54,7 +54,7 @@ def check_continues(
     for part in parts:
         if part.is_file() and part.stat().st_size == 0:
             continue
-        log = readable(part)
+        log = open_part(part)
         if log is None:
             raise LogError(part, "exists, and is no log of ours", remedy)
         if (log.team, log.metadata.get("scenario")) != (team, metadata.get("scenario")):
@@ -94,7 +94,7 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
     earlier = parts_of(path)
     if earlier and shutil.disk_usage(path.parent).free < ROOM:
         raise RecorderError(f"{path}: the disk is full; make room")
-    before = next((log for log in map(readable, earlier) if log is not None), None)
+    before = next((log for log in map(open_part, earlier) if log is not None), None)
     log_id = secrets.token_hex(8) if before is None else before.metadata.get(LOG_ID)
     named = {} if log_id is None else {LOG_ID: log_id}
     part = part_of(path, next_number(path))
@@ -111,8 +111,8 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
     """The inventory of these parts; damaged chunks are left out."""
     inventory = Inventory(has_earlier_parts=bool(parts))
     for part in parts:
-        file = readable(part)
-        for chunk in () if file is None else salvaged(log_of([file])):
+        file = open_part(part)
+        for chunk in () if file is None else read_undamaged(log_of([file])):
             if not isinstance(chunk, LogError):
                 for sample in chunk:
                     inventory.remember(sample)
@@ -120,7 +120,7 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
 
 
 def join(path: Path) -> list[Path]:
-    """Joins the parts of a log to one; returns the parts that remain, a single one on success.
+    """Join the parts of a log to one; returns the parts that remain, a single one on success.
 
     Their undamaged chunks are copied in the order of arrival. Where the disk is full nothing
     changes. To be called again after a crash: what is joined already is not joined twice.
@@ -130,7 +130,7 @@ def join(path: Path) -> list[Path]:
     whole = path.with_name(path.name + JOINING)
     whole.unlink(missing_ok=True)
     parts = parts_of(path)
-    opened = [readable(part) for part in parts]
+    opened = [open_part(part) for part in parts]
     logs = [log for log in opened if log is not None]
     unreadable = (p for p, log in zip(parts, opened, strict=True) if log is None)
     if len(parts) < 2 or not logs or any(part.stat().st_size for part in unreadable):
@@ -142,7 +142,7 @@ def join(path: Path) -> list[Path]:
     try:
         with Recorder(whole, logs[0].team, {**logs[0].metadata, **joined}) as recorder:
             for log in logs:
-                for chunk in salvaged(log_of([log])):
+                for chunk in read_undamaged(log_of([log])):
                     if not isinstance(chunk, LogError):
                         recorder.write(chunk)
     except RecorderError:
@@ -157,7 +157,7 @@ def join(path: Path) -> list[Path]:
 
 
 def _write_through(path: Path) -> None:
-    """Waits until a file, or the names in a folder, are on the disk: power may fail."""
+    """Wait until a file, or the names in a folder, are on the disk: power may fail."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

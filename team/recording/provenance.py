@@ -40,8 +40,10 @@ def kernel_fingerprint() -> str:
 
 
 def arithmetic() -> str:
-    """What the bits depend on beside the program and its libraries: the same on every processor of
-    an architecture. The C library's logarithm is in the tails of NumPy's normal numbers.
+    """The platform on which the bits depend beside the program and its libraries; the same on every
+    processor of an architecture.
+
+    The C library's logarithm is in the tails of NumPy's normal numbers.
     """
     return " ".join((machine(), *libc_ver())).strip()
 

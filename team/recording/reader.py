@@ -1,4 +1,4 @@
-"""Reads the samples of a log, also of one in several parts or whose recorder was killed."""
+"""Read the samples of a log, also of one in several parts or whose recorder was killed."""
 
 import struct
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel as LogChannel
 
 from team.recording.opening import LogFile, open_file
-from team.recording.part_files import parts_of, readable
+from team.recording.part_files import open_part, parts_of
 from team.recording.recorder import Count
 from team.recording.records import (
     LARGEST_CHUNK,
@@ -24,10 +24,10 @@ from team.recording.records import (
     DamagedChunkError,
     Frame,
     LogError,
-    expanded,
-    frames,
-    index,
-    places,
+    expand_chunk,
+    locate_records,
+    read_frames,
+    read_index,
 )
 from team.wire.bus import Sample
 from team.wire.channels import VIEW, Channel, channel_of
@@ -68,12 +68,6 @@ class Log:
                 raise chunk
             yield from chunk
 
-    def in_time_order(self, channels: Collection[Channel] | None = None) -> list[Sample]:
-        """The samples in the order of team time, equal stamps in that of the file; all in
-        memory.
-        """
-        return sorted(self.samples(channels), key=lambda sample: sample.stamp_ns)
-
     def counts(self) -> dict[str, Count]:
         """Messages and payload bytes of each key, by reading the whole log."""
         counts: dict[str, Count] = {}
@@ -99,7 +93,7 @@ class Log:
         with part.path.open("rb") as file:
             # The index repeats the channels: a chunk that introduced one may be damaged.
             keys = self._indexed(file, part.path, names) if part.complete else {}
-            for frame in frames(file, part.path):
+            for frame in read_frames(file, part.path):
                 if frame.opcode == Opcode.CHUNK:
                     self.reading((before + frame.offset) / whole)
                     try:
@@ -117,7 +111,7 @@ class Log:
     ) -> dict[int, str | None]:
         keys: dict[int, str | None] = {}
         with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels themselves
-            for frame in index(file, path):
+            for frame in read_index(file, path):
                 if frame.opcode == Opcode.CHANNEL:
                     self._introduce(frame.body, names, keys)
         return keys
@@ -132,9 +126,9 @@ class Log:
         """The samples of a chunk, on channels of these names; channels that it declares are added
         to `keys`.
         """
-        samples, data, size = [], expanded(frame.body), _MESSAGE.size
+        samples, data, size = [], expand_chunk(frame.body), _MESSAGE.size
         unpack = _MESSAGE.unpack_from
-        for opcode, start, end in places(data):
+        for opcode, start, end in locate_records(data):
             if opcode == _OF_MESSAGE:
                 if start + size > end:
                     raise ValueError("a message without its times")
@@ -169,7 +163,7 @@ def open_log(path: str | Path) -> Log:
     Its parts are read as one log.
     """
     path = log_file(Path(path))
-    opened = [file for part in parts_of(path)[1:] if (file := readable(part)) is not None]
+    opened = [file for part in parts_of(path)[1:] if (file := open_part(part)) is not None]
     try:
         opened.insert(0, open_file(path))
     except LogError:

@@ -1,4 +1,4 @@
-"""Counts what a recorder has of each key, separately for each process that publishes on it.
+"""Count a recorder's samples of each key, separately for each process that publishes on it.
 
 A process counts its publications on a key from 0, so a process that was started again begins anew.
 Consecutive samples are one run; a gap that is filled later is a run of its own.

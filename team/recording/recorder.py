@@ -1,4 +1,4 @@
-"""Writes samples into an MCAP file, with their payload bytes unchanged.
+"""Write samples into an MCAP file, with their payload bytes unchanged.
 
 Channel: the full key, encoding `msgpack`, the JSON Schema of its message; for a view, encoding and
     schema of the tools that draw it. Log time: team time. Publish time: the publisher's wall clock.
@@ -49,7 +49,7 @@ class Count(NamedTuple):
 
 
 class Recorder:
-    """Writes one log, on a thread of its own, whose errors are raised by the next call.
+    """Write one log, on a thread of its own, whose errors are raised by the next call.
 
     Raises `RecorderError` when the file can not be created; it never overwrites one.
     """
@@ -85,7 +85,7 @@ class Recorder:
         self.close()
 
     def write(self, samples: Iterable[Sample]) -> None:
-        """Queues samples for the writing thread; raises `RecorderError` once that has failed."""
+        """Queue samples for the writing thread; raises `RecorderError` once that has failed."""
         self._check()
         if self._closed:
             raise RecorderError(f"{self.path} is closed")
@@ -101,7 +101,7 @@ class Recorder:
         return self._queue.qsize()
 
     def close(self) -> None:
-        """Writes the queued samples, then the index; raises `RecorderError` if that failed."""
+        """Write the queued samples, then the index; raises `RecorderError` if that failed."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)
@@ -141,7 +141,7 @@ class Recorder:
                 flushed, unflushed = time.monotonic(), False
 
     def _bound_chunk(self, sample: Sample) -> None:
-        """Ends the chunk before it spans more than CHUNK_NS of recorded time.
+        """End the chunk before it spans more than CHUNK_NS of recorded time.
 
         A flipped bit costs a chunk. Late samples, out of their order, may make a chunk of
         CHUNK_LEAST messages span more.

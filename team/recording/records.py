@@ -1,4 +1,4 @@
-"""Reads the records of an MCAP file, one after another, as untrusted input.
+"""Read the records of an MCAP file, one after another, as untrusted input.
 
 Every length and every chunk's CRC is checked before use, and a chunk that claims a larger expanded
 size than a recorder can have written is refused before it is expanded.
@@ -76,14 +76,14 @@ class Frame(NamedTuple):
     body: bytes
 
 
-def index(file: IO[bytes], path: Path) -> Iterator[Frame]:
+def read_index(file: IO[bytes], path: Path) -> Iterator[Frame]:
     """The records of the summary section, which begins where the footer says (0: there is none)."""
     file.seek(_FRAME.size - FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
     (start,) = struct.unpack("<Q", file.read(8))
-    return frames(file, path, start) if start else iter(())
+    return read_frames(file, path, start) if start else iter(())
 
 
-def index_damage(file: IO[bytes]) -> str | None:
+def check_index(file: IO[bytes]) -> str | None:
     """The defect of a complete file's index; None when its CRC fits its bytes.
 
     The CRC spans the summary section and the footer up to the CRC itself; 0: none was written.
@@ -103,7 +103,7 @@ def index_damage(file: IO[bytes]) -> str | None:
     return None
 
 
-def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
+def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
     """The whole records of the file from `start`; a record that is cut off ends it.
 
     Where the bytes at a record's place are no record, its length or the one before it is damaged:
@@ -117,7 +117,7 @@ def frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterat
         opcode, length = _FRAME.unpack(head)
         none = opcode not in _OPCODES or _LENGTHS.get(opcode, length) != length
         if none or offset + _FRAME.size + length > size:
-            # Damage, or zeros or half a record: what a machine that went down leaves behind.
+            # Damage; zeros or half a record, as after a power failure.
             following = _next_chunk(file, before + 1, size)
             if following is None:
                 return
@@ -151,19 +151,19 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
     return None
 
 
-def records(data: bytes) -> Iterator[Frame]:
+def read_records(data: bytes) -> Iterator[Frame]:
     """The records of an expanded chunk; raises ValueError where one exceeds it or there are too
     many.
 
     Small records take many times their size as Python objects, so their number is bounded as well.
     """
-    for opcode, start, end in places(data):
+    for opcode, start, end in locate_records(data):
         yield Frame(start - FRAME_SIZE, opcode, data[start:end])
 
 
-def places(data: bytes) -> list[tuple[int, int, int]]:
-    """Of each record of an expanded chunk its opcode, and where its bytes begin and end; raises as
-    `records`.
+def locate_records(data: bytes) -> list[tuple[int, int, int]]:
+    """The opcode of each record of an expanded chunk, and its first and last byte; raises as
+    `read_records`.
     """
     found: list[tuple[int, int, int]] = []
     offset, size, head = 0, len(data), _FRAME.size
@@ -180,7 +180,7 @@ def places(data: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def expanded(body: bytes) -> bytes:
+def expand_chunk(body: bytes) -> bytes:
     """The records in a chunk record's body.
 
     Raises ValueError, before anything is expanded, for a body that our recorder can not have

@@ -1,4 +1,4 @@
-"""Repairs a log: copies the undamaged chunks of a damaged or unfinished log to a new, complete
+"""Repair a log: copies the undamaged chunks of a damaged or unfinished log to a new, complete
 one.
 """
 
@@ -24,7 +24,7 @@ class Report(NamedTuple):
     damaged: tuple[str, ...]
 
 
-def salvaged(log: Log) -> Iterator[list[Sample] | LogError]:
+def read_undamaged(log: Log) -> Iterator[list[Sample] | LogError]:
     """The samples of every undamaged chunk; in the place of a damaged one its error, which is not
     raised.
     """
@@ -34,8 +34,8 @@ def salvaged(log: Log) -> Iterator[list[Sample] | LogError]:
         yield error
 
 
-def repaired(path: str | Path, out: str | Path) -> Report:
-    """Copies every undamaged chunk of the log at `path` to a new, complete log `out`.
+def repair_log(path: str | Path, out: str | Path) -> Report:
+    """Copy every undamaged chunk of the log at `path` to a new, complete log `out`.
 
     The metadata is copied; of a log that its recorder did not finish with a note. Raises `LogError`
     when `path` is no log, `RecorderError` when `out` exists.
@@ -45,7 +45,7 @@ def repaired(path: str | Path, out: str | Path) -> Report:
     damaged: list[str] = []
     note = {} if log.complete else {REPAIRED: log.path.name}
     with Recorder(out, log.team, {**log.metadata, **note}) as recorder:
-        for chunk in salvaged(log):
+        for chunk in read_undamaged(log):
             if isinstance(chunk, LogError):
                 damaged.append(chunk.what)
                 continue

@@ -111,7 +111,9 @@ class RecordLoop:
             if channel.recorded and channel is not ALIVE:
                 bus.subscribe(channel, whole=True)
         orders = tuple(channel.name for channel in ORDERS if channel.recorded)
-        bus.request(KEPT, "", KeptRequest(stamp_ns=0, channels=orders))  # who gave them has left
+        bus.request(
+            KEPT, "", KeptRequest(stamp_ns=0, channels=orders)
+        )  # who gave them may have left
         bus.watch_alive()
         bus.declare_alive(NODE)
 
@@ -130,8 +132,8 @@ class RecordLoop:
         return self._has_map or (self._are_peers and not self._unconcluded)
 
     def take(self, samples: list[Sample]) -> None:
-        """Writes these samples; reports progress of the robots that are due, or of all when there
-        are none.
+        """Write these samples; report the progress of the robots that are due, or of all where
+        there are no samples.
 
         A new submap is reported at once: its robot does not leave before it is in the log. Progress
         is credit: while the writing thread is far behind, nothing is reported.
@@ -164,7 +166,7 @@ class RecordLoop:
         return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
 
     def _noted_tally(self, sample: Sample) -> Tally | None:
-        """Notes the totals of a process that is leaving; None for other samples."""
+        """Store the totals of a leaving process; None for other samples."""
         if TALLY.owner(sample.key) is None:
             return None
         with suppress(WireError):
@@ -175,13 +177,13 @@ class RecordLoop:
         return None
 
     def _report_lacking(self, tally: Tally) -> None:
-        """Reports to a process that is leaving what the log lacks of its messages."""
+        """Report to a leaving process the messages of it that the log lacks."""
         found = self._inventory.received.lacking(tally, self._bus.awaited())
         has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
         self._bus.publish(Outgoing(RECORDED, tally.node, has))
 
     def _write(self, samples: list[Sample]) -> None:
-        """Writes to the log, if that is possible: the run goes on without it."""
+        """Write to the log where that is possible; the run continues without it."""
         if self._recorder is None:
             return
         try:
@@ -199,7 +201,7 @@ class RecordLoop:
         self._retry_s = time.monotonic() + _RETRY_S
 
     def _go_on(self, now_s: float) -> None:
-        """Opens a new part of a log that could not be written; the samples missed meanwhile are
+        """Open a new part of a log that could not be written; the samples missed meanwhile are
         requested.
         """
         if self._recorder is not None or self._more is None or now_s < self._retry_s:
@@ -215,13 +217,13 @@ class RecordLoop:
         self._bus.again()
         _LOG.warning("recording goes on in %s", self._recorder.path)
 
-    def tell(self, scenario: Sequence[Configuration]) -> None:
-        """Writes the messages that a world would have published, where there is none."""
+    def write_scenario(self, scenario: Sequence[Configuration]) -> None:
+        """Write the configurations of a team without a world, which a world would publish."""
         announced = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
         self._write([each for each in announced if self._inventory.is_new(each)])
 
     def close(self) -> None:
-        """Completes the log; raises `RecorderError` if it can not be written."""
+        """Complete the log; raises `RecorderError` if it can not be written."""
         try:
             if self._recorder is not None:
                 self._recorder.close()
@@ -230,9 +232,9 @@ class RecordLoop:
         if self._failure is not None:
             raise self._failure
 
-    def mend(self, now_s: float) -> None:
-        """Requests from sources and robots what has been missing for a while, without waiting for
-        the reply.
+    def request_missing(self, now_s: float) -> None:
+        """Request the messages that have been missing for a while from sources and robots, without
+        waiting for replies.
         """
         self._go_on(now_s)
         for stream in self._patience.due(self._inventory.gaps, now_s):
@@ -260,7 +262,7 @@ class RecordLoop:
 
     @property
     def lacking(self) -> list[str]:
-        """Describes what the log lacks."""
+        """The messages that the log lacks, in words."""
         numbered = [f"{key}: {what}" for key, what in self._inventory.findings()]
         others = [
             f"{key}: {intervals(lost)}"
@@ -287,7 +289,7 @@ class RecordLoop:
     def _noted_alive(self, sample: Sample, node: str) -> Sample:
         try:
             came = _is_alive(sample.payload)
-        except WireError as error:  # a name that no node has: recorded as it came
+        except WireError as error:  # a name of no node: recorded unchanged
             _LOG.warning("%.80s: %s", sample.key, error)
             return msgspec.structs.replace(sample, stamp_ns=self._newest_ns)
         (self._alive.add if came else self._alive.discard)(node)
@@ -297,10 +299,8 @@ class RecordLoop:
         message = Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
         return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
-    def look(self, end: TheEnd) -> None:
-        """Requests an end that was missed, and removes processes that left without an
-        announcement.
-        """
+    def check_end(self, end: TheEnd) -> None:
+        """Request an end that was missed, and remove processes that left unannounced."""
         missed = end.missed()
         if missed and not self._has_ended:
             self.take(missed)
@@ -308,7 +308,7 @@ class RecordLoop:
             self._alive = {node for node in self._alive if self._bus.is_alive(node)}
 
     def status(self, *, last: bool = False) -> Status:
-        """Publishes and logs the recorder's status; returns it. The last one lists what the log
+        """Publish and log the recorder's status; the last one lists the messages that the log
         lacks.
         """
         for tally in [] if last or self._is_far_behind else self._leaving.values():
@@ -346,7 +346,7 @@ def record(
     scenario: Sequence[Configuration] = (),
     peers: Collection[str] = (),
 ) -> int:
-    """Records until the final map is present and all other nodes have left, or until `stop`; then
+    """Record until the final map is present and all other nodes have left, or until `stop`; then
     closes.
 
     Returns the number of messages written.
@@ -360,19 +360,19 @@ def record(
     stop = threading.Event() if stop is None else stop
     loop = RecordLoop(bus, recorder, expected, inventory, more, peers)
     with closing(loop):
-        loop.tell(scenario)
+        loop.write_scenario(scenario)
         due = time.monotonic()
         remind_due = due + _REMIND_S
         end = TheEnd(bus, NODE, ENDS if peers else (FINAL_MAP,))
         while not stop.is_set():
             if loop.finished:
-                # A token goes with a higher priority than data: what it overtook is on its way.
+                # A token has a higher priority than data: overtaken messages still arrive.
                 if not (samples := bus.receive(_QUIET_S)):
                     break
                 loop.take(samples)
             loop.take(samples := bus.receive(_WAIT_S))
-            loop.mend(time.monotonic())
-            loop.look(end)
+            loop.request_missing(time.monotonic())
+            loop.check_end(end)
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATUS_S
                 status = loop.status()
@@ -390,7 +390,7 @@ def record(
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:
-    """Publishes samples again, with the same bytes, at `speed` × team time; returns their number.
+    """Publish samples again, with the same bytes, at `speed` × team time; returns their number.
 
     Each sample is due at a time relative to the first one, so that delays do not accumulate. Ends
     when `stop` is set.

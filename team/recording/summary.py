@@ -1,4 +1,4 @@
-"""Summarises a log: messages, bytes, rates and times of each key, and the span of its
+"""Summarise a log: messages, bytes, rates and times of each key, and the span of its
 measurements.
 """
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from team.recording.reader import Log, LogError
-from team.recording.repair import salvaged
+from team.recording.repair import read_undamaged
 from team.wire.bus import Sample
 from team.wire.channels import SENSORS, VIEW, channel_of
 
@@ -33,7 +33,7 @@ class KeySummary:
         return (self.messages - 1) * 1e9 / (self.last_ns - self.first_ns)
 
     def take(self, sample: Sample) -> None:
-        """Counts one more sample."""
+        """Count one more sample."""
         self.messages += 1
         self.bytes += len(sample.payload)
         self.first_ns = min(self.first_ns, sample.stamp_ns)
@@ -59,11 +59,11 @@ class Summary(NamedTuple):
         return min(each.first_ns for each in chosen), max(each.last_ns for each in chosen)
 
 
-def summarised(log: Log) -> Summary:
-    """Summarises every whole chunk of a log, damaged or not, in one pass."""
+def summarise_log(log: Log) -> Summary:
+    """Summarise every whole chunk of a log, damaged or not, in one pass."""
     found: dict[str, KeySummary] = {}
     damaged = []
-    for chunk in salvaged(log):
+    for chunk in read_undamaged(log):
         if isinstance(chunk, LogError):
             damaged.append(chunk.what)
             continue

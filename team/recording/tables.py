@@ -47,7 +47,7 @@ class Exported:
     ) -> Iterator[tuple[Sample, Channel, Message]]:
         """Every sound message of the given channels (None: all); the others are counted.
 
-        A viewer's own messages have no fields that this program knows: they are left out.
+        Views have no fields of the team's messages and are left out.
         """
         for sample in log.samples(channels):
             if channel_of(sample.key) is None:

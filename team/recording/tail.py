@@ -1,4 +1,4 @@
-"""Follows a log: its samples while its recorder writes them, chunk by chunk."""
+"""Follow a log: its samples while its recorder writes them, chunk by chunk."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,7 +7,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from team.recording.reader import Log, LogError, open_log
-from team.recording.records import FRAME_SIZE, MALFORMED, frames
+from team.recording.records import FRAME_SIZE, MALFORMED, read_frames
 from team.wire.bus import Sample
 
 MOST = 20_000
@@ -16,7 +16,7 @@ MOST = 20_000
 
 @dataclass
 class Tail:
-    """Reads a log that may still grow, or does not exist yet; no sample is returned twice.
+    """Read a log that may still grow, or does not exist yet; no sample is returned twice.
 
     log: once it exists.
     ended: whether its recorder has finished it, and all of it is read.
@@ -40,7 +40,7 @@ class Tail:
         found: list[Sample] = []
         with self.path.open("rb") as file:
             start = () if self._offset is None else (self._offset,)
-            for frame in frames(file, self.path, *start):
+            for frame in read_frames(file, self.path, *start):
                 self._offset = frame.offset + FRAME_SIZE + len(frame.body)
                 if frame.opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     self.ended = True

@@ -1,4 +1,4 @@
-"""Buffers the messages of a live robot's topics for its driver, and counts those that were lost.
+"""Buffers the messages of a live robot's topics for its driver, and count the lost ones.
 
 rmw_zenoh attaches to each publication its publisher's counter and name, in one of two forms:
 

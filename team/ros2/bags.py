@@ -85,7 +85,7 @@ def opened_bag(path: Path) -> Iterator[Bag]:
     try:
         reader = AnyReader(_parts(path) or [path], default_typestore=types())
         reader.open()
-    except Exception as error:  # the library and what it reads with raise all there is
+    except Exception as error:  # the library passes on the exceptions of its own readers
         remedy = "`ros2 bag reindex` may repair it"
         there = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
         files = [each for each in there if each.suffix == ".mcap"]

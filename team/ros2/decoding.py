@@ -1,6 +1,6 @@
-"""Decodes a ROS 2 message (type, CDR bytes) into a frozen record; a pure function.
+"""Decode a ROS 2 message (type, CDR bytes) into a frozen record; a pure function.
 
-What can not be decoded, or has numbers that are not finite, raises `DamagedError`.
+Undecodable bytes, and numbers that are not finite, raise `DamagedError`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -93,7 +93,7 @@ Record = OdometryRecord | SpeedRecord | PoseRecord | TagsRecord | TransformsReco
 
 FAULTS = (SerdeError, ValueError, IndexError, KeyError, OverflowError, MemoryError, TypeError,
           AssertionError, AttributeError)  # fmt: skip
-"""What the library raises for bytes that are no message."""
+"""The library's exceptions for bytes that are no message."""
 
 
 def decode(kind: str, data: bytes | memoryview, store: Typestore | None = None) -> Record:
@@ -225,4 +225,4 @@ READERS: Mapping[str, Callable[[Any], Record]] = {
         m, [_tag(each.id, each.pose.pose, each.pose.covariance) for each in m.markers]
     ),
 }
-"""What is understood, by type."""
+"""The reader of each message type."""

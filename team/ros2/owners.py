@@ -1,4 +1,4 @@
-"""Assigns the frames of detections to robots, for topics that several robots share."""
+"""Assign the frames of detections to robots, for topics that several robots share."""
 
 from collections.abc import Iterable, Mapping
 

@@ -1,4 +1,4 @@
-"""Translates a robot's ROS 2 messages into its measurements, of a bag and live alike."""
+"""Translate a robot's ROS 2 messages into its measurements, of a bag and live alike."""
 
 import re
 from collections import Counter

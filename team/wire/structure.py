@@ -1,4 +1,4 @@
-"""Reads the structure of a MessagePack payload without creating what it contains: the tag, and the
+"""Read the structure of a MessagePack payload without creating what it contains: the tag, and the
 number and the nesting of its values.
 """
 

@@ -23,7 +23,7 @@ from central.peers.centre import PeerCentre
 from central.peers.robot import PeerRobot
 from team.config import FrontEnd, RobotConfig
 from team.containment import Boundary
-from team.recording.check import checked
+from team.recording.check import check_log
 from team.recording.reader import open_log
 from team.recording.recorder import Recorder
 from team.recording.shell import RecordLoop
@@ -136,6 +136,6 @@ def test_every_extreme_message_is_recorded_and_the_log_can_be_checked(tmp_path: 
         loop.status(last=True)
     assert sum(1 for _ in open_log(path).samples()) > 0
     before, began = peak_mib(), time.process_time()
-    assert checked(open_log(path))
+    assert check_log(open_log(path))
     assert time.process_time() - began < MOST_S
     assert peak_mib() - before < MOST_MIB

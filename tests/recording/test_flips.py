@@ -8,8 +8,8 @@ from mcap.opcode import Opcode
 
 from team.recording.reader import LogError, open_log
 from team.recording.recorder import Recorder
-from team.recording.records import frames
-from team.recording.repair import salvaged
+from team.recording.records import read_frames
+from team.recording.repair import read_undamaged
 from team.wire import channels as c
 from team.wire.bus import Sample
 from team.wire.codec import encoded
@@ -38,7 +38,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[Samp
 
 def saved(path: Path) -> list[Sample]:
     found: list[Sample] = []
-    for chunk in salvaged(open_log(path)):
+    for chunk in read_undamaged(open_log(path)):
         if not isinstance(chunk, LogError):
             found += chunk
     return found
@@ -48,7 +48,7 @@ def heads(path: Path) -> list[int]:
     """Where the opcodes and the lengths of chunks and of their indices are."""
     with path.open("rb") as file:
         kinds = (Opcode.CHUNK, Opcode.MESSAGE_INDEX)
-        offsets = [frame.offset for frame in frames(file, path) if frame.opcode in kinds]
+        offsets = [frame.offset for frame in read_frames(file, path) if frame.opcode in kinds]
     return [offset + k for offset in offsets for k in range(9)]
 
 
@@ -60,7 +60,7 @@ def test_a_flipped_bit_costs_a_second_of_recorded_time_at_the_most(
     path = tmp_path / "flipped.mcap"
     path.write_bytes(data)
     with path.open("rb") as file:
-        first = next(f.offset for f in frames(file, path) if f.opcode == Opcode.CHUNK)
+        first = next(f.offset for f in read_frames(file, path) if f.opcode == Opcode.CHUNK)
     places = list(range(first, len(data))) if where == "anywhere" else heads(path)
     rng = random.Random(3)
     losses = 0

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from sim.cli.main import app
 from sim.scenarios.scenario import dumps, load
-from team.recording.check import checked, holes
+from team.recording.check import check_log, holes
 from team.recording.inventory import Inventory
 from team.recording.part_files import part_of, parts_of
 from team.recording.parts import check_continues, join, next_part
@@ -150,7 +150,7 @@ def test_the_parts_of_a_log_are_read_as_one(path: Path) -> None:
     log = open_log(path)
     assert log.complete
     assert len(log.files) == 2
-    assert not [each for each in checked(log) if each.where == "file"]
+    assert not [each for each in check_log(log) if each.where == "file"]
 
 
 @pytest.mark.parametrize("written", [0, 8, 500, 10**9])
@@ -303,7 +303,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
             world.publish(Outgoing(c.OWN_POSE, "alpha", POSE))
             said += 1
         loop.take(bus.receive())
-        loop.mend(0.0)
+        loop.request_missing(0.0)
         return any("nothing is recorded" in each for each in loop.status().warnings)
 
     wait_until(stopped)
@@ -321,7 +321,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
         )
     )
     for now_s in (1e9, 2e9, 3e9):
-        loop.mend(now_s)
+        loop.request_missing(now_s)
         loop.take(bus.receive())
     loop.close()
     assert join(path) == [path]

@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from team.recording.check import checked
+from team.recording.check import check_log
 from team.recording.counters import Counters
 from team.recording.csv_tables import export_csv
 from team.recording.cut import CUT, cut
-from team.recording.declared import declared, misdeclared
+from team.recording.declared import find_misdeclaration, read_declarations
 from team.recording.merge import MERGED, merge
 from team.recording.reader import Log, LogError, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.schemas import schema_of
-from team.recording.summary import summarised
+from team.recording.summary import summarise_log
 from team.recording.tables import table_of
 from team.wire import channels as c
 from team.wire import messages as m
@@ -83,7 +83,7 @@ def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
 
 
 def found(log: Log) -> list[str]:
-    return [str(finding) for finding in checked(log)]
+    return [str(finding) for finding in check_log(log)]
 
 
 @pytest.fixture
@@ -184,7 +184,7 @@ def test_a_log_without_the_end_of_the_streams_says_so(path: Path, tmp_path: Path
         m.End(stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=10),)),
         0,
     )
-    lacking = "world/end: missing: how many measurements there were is not known"
+    lacking = "world/end: missing: the number of measurements is unknown"
     assert found(recorded(path, [*said, done])) == [lacking]
     assert found(recorded(tmp_path / "whole.mcap", [*said, done, end])) == []
     assert found(recorded(tmp_path / "cut.mcap", [*said, done], cut="said")) == []
@@ -208,7 +208,7 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
     second = [status(k, 20 + k) for k in range(2)]
     last = tally("robot/alpha", 19, 23, 2)
     (named,) = found(recorded(path, [*first, *second, last]))
-    assert named.startswith("robot/alpha/tally: no last word of the process that spoke until 2.0 s")
+    assert named.startswith("robot/alpha/tally: the process with messages until 2.0 s announced")
     both = [*first, *second, tally("robot/alpha", 9, 13, 3), last]
     assert found(recorded(path.with_name("both.mcap"), both)) == []
     assert found(recorded(path.with_name("memory.mcap"), first)) == []
@@ -371,7 +371,7 @@ def test_a_clock_that_is_set_between_two_lives_hides_no_loss_in_either(path: Pat
     assert missing_in(path, [*first, *second]) == []
     killed = [*first[:50], *second]
     (named,) = missing_in(path.with_name("killed.mcap"), killed)
-    assert named.startswith("robot/alpha/tally: no last word of the process that spoke until 49.0")
+    assert named.startswith("robot/alpha/tally: the process with messages until 49.0")
     lost = [*first, *second[:10], *second[12:]]
     assert missing_in(path.with_name("lost.mcap"), lost) == [
         "robot/alpha/status: 2 messages missing: 10–11"
@@ -464,7 +464,7 @@ def test_a_damaged_log_is_told_of_and_never_a_crash(
     with contextlib.suppress(LogError):
         log = open_log(path)
         lines = found(log)
-        assert not summarised(log).damaged or lines
+        assert not summarise_log(log).damaged or lines
         assert log.complete or lines
 
 
@@ -500,7 +500,7 @@ OTHER = schema_of(m.Submap).replace(b'"integer"', b'"number"')
 def test_a_schema_is_held_against_its_channel(
     path: Path, key: str, encoding: str, schema: str, text: bytes, told: str | None
 ) -> None:
-    found = misdeclared(declared(foreign(path, key, encoding, schema, text))[key])
+    found = find_misdeclaration(read_declarations(foreign(path, key, encoding, schema, text))[key])
     assert found is None if told is None else found is not None and found.startswith(told)
 
 
@@ -508,7 +508,7 @@ def test_a_schema_is_held_against_its_channel(
 
 
 def test_a_summary_counts_and_its_span_is_that_of_the_measurements(whole: Log) -> None:
-    summary = summarised(whole)
+    summary = summarise_log(whole)
     of = {each.key: each for each in summary.keys}
     assert {key: each.messages for key, each in of.items()} == {
         key: count.messages for key, count in whole.counts().items()
@@ -539,7 +539,7 @@ def test_two_parts_of_a_log_merge_to_the_log_in_time_order(
             parts.append(open_log(folder / f"{name}.mcap"))
     merged = merge(parts, folder / "m.mcap")
     again = open_log(folder / "m.mcap")
-    assert list(again.samples()) == log.in_time_order()
+    assert list(again.samples()) == sorted(log.samples(), key=lambda s: s.stamp_ns)
     assert merged.duplicates == (2 if len(parts) == 2 else 0)  # configurations hold in both
     assert [line for part in [*parts, again] for line in found(part)] == []
 

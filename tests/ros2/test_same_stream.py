@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim.datasets.folder import folder
-from sim.importing.bag import imported_bag
+from sim.importing.bag import import_bag
 from sim.publisher.node import WorldNode
 from sim.world.config import FolderWorld
 from team.config import RobotConfig
@@ -43,7 +43,7 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path: Path, use: str) -> None:
     topics = RobotTopics(odometry="/odom", detections=("/tags",), use=use)  # type: ignore[arg-type]
     drove = drive()
     bag = ros.write_bag(tmp_path / "bag", drove)
-    (tables,) = imported_bag(bag, Topics(robots={"r1": topics}), None).robots
+    (tables,) = import_bag(bag, Topics(robots={"r1": topics}), None).robots
     tables.start((1.0, 2.0, 0.5))
     tables.write(tmp_path / "set")
     robot = Driver(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from central.desk.view.session import session
+from central.desk.view.server import session
 from team.recording.recorder import Recorder
 from tests.browser import Page, browsing, chromium
 from tests.crowd import crowd

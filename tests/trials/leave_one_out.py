@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from sim.calibration.calibrate import calibrated
+from sim.calibration.calibrate import calibrate_models
 from sim.calibration.scenario import scenario_toml
 from sim.calibration.source import measurements_of
 from sim.scenarios.scenario import load
@@ -38,7 +38,7 @@ def _learn(others: list[Path], scenario: Path) -> None:
     read = [(other.name, *measurements_of(other)) for other in others]
     worlds = [(name, world) for name, world, _ in read]
     start = read[0][2]
-    found = calibrated(worlds, start, lambda said: print(f"  {said}", file=sys.stderr))
+    found = calibrate_models(worlds, start, lambda said: print(f"  {said}", file=sys.stderr))
     scenario.write_text(scenario_toml(found, start, [name for name, _ in worlds]), "utf-8")
 
 

@@ -10,7 +10,7 @@ import json
 import tempfile
 from pathlib import Path
 
-from central.desk.view.session import session
+from central.desk.view.server import session
 from team.recording.recorder import Recorder
 from tests.browser import browsing, chromium
 from tests.crowd import crowd

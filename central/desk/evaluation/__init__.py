@@ -1,1 +1,1 @@
-"""Evaluates a run from its log alone."""
+"""Evaluate a run from its log alone."""

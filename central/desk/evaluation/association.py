@@ -36,13 +36,13 @@ class Pairs:
 
     @property
     def precision(self) -> float | None:
-        """Of the pairs that were associated, the share that is right."""
+        """The share of right pairs among the associated ones."""
         associated = self.right + self.wrong
         return self.right / associated if associated else None
 
     @property
     def recall(self) -> float | None:
-        """Of the pairs of one label, the share that was associated."""
+        """The share of associated pairs among those of one label."""
         real = self.right + self.missed
         return self.right / real if real else None
 

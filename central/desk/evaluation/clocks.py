@@ -1,4 +1,4 @@
-"""Estimates by how much a robot's detections are stamped late against its odometry, without truth.
+"""Estimate by how much a robot's detections are stamped late against its odometry, without truth.
 
 A landmark that is measured at t_i and again at t_j is at the points b_i and b_j of the robot's
 base. With the motion D(τ) by odometry from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise: where

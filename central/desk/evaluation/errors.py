@@ -127,7 +127,9 @@ def map_errors(
     return MapErrors(
         count=count,
         rmse_m=rms(np.hypot(difference[:, 0], difference[:, 1])),
-        aligned_rmse_m=None if motion is None else distance_rmse(moved(motion, means), truth),
+        aligned_rmse_m=None
+        if motion is None
+        else distance_rmse(transform_points(motion, means), truth),
         truth_from_map=motion,
         nees_per_dof=nees(difference.ravel(), covariance) / (2 * count),
         band=chi2_interval(2 * count, BAND, 1),
@@ -148,7 +150,7 @@ def _shape_errors(
     covariance of the remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
     """
     count = len(means)
-    error = (means - moved(between(truth_from_map, np.zeros(3)), truth)).ravel()
+    error = (means - transform_points(between(truth_from_map, np.zeros(3)), truth)).ravel()
     centred = means - means.mean(axis=0)
     G = np.zeros((2 * count, 3))
     G[0::2, 0] = G[1::2, 1] = 1.0
@@ -186,7 +188,7 @@ def rigid_alignment(
     return procrustes(truth, points, np.ones(len(points)))
 
 
-def moved(
+def transform_points(
     a_from_b: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
     """The points of b in a."""
@@ -202,7 +204,7 @@ def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> f
     return rms(np.hypot(difference[:, 0], difference[:, 1]))
 
 
-def interpolated(
+def interpolate_truth(
     truth: Path, stamps_ns: Int64[np.ndarray, " K"]
 ) -> tuple[Float[np.ndarray, "K 3"], Bool[np.ndarray, " K"]]:
     """The true poses at the stamps, and which of them are known (the others are zero).
@@ -233,7 +235,7 @@ def pose_errors(
     path: Path, covariances: Float[np.ndarray, "K 3 3"], truth: Path
 ) -> PoseErrors | None:
     """The errors of a path's poses where the truth is known; None where it nowhere is."""
-    true_poses, known = interpolated(truth, path.stamps_ns)
+    true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None
     errors = path.poses[known] - true_poses[known]

@@ -1,4 +1,4 @@
-"""Evaluates a run: every figure from the samples of its log alone, against the truth in it.
+"""Evaluate a run: every figure from the samples of its log alone, against the truth in it.
 
 A figure that can not be computed (no truth, no such message) is None. Errors are in metres and
 radians; NEES is per degree of freedom, 1 where the covariance is right.
@@ -27,16 +27,15 @@ from central.desk.evaluation.errors import (
     Path,
     PoseErrors,
     distance_rmse,
-    interpolated,
+    interpolate_truth,
     map_errors,
-    moved,
     pose_errors,
     rigid_alignment,
+    transform_points,
 )
-from central.desk.evaluation.gospa import Gospa, gospa, half_spacing
 from central.desk.evaluation.gps import gps_median
-from central.desk.evaluation.log import Collected, Traffic, collected
-from central.desk.evaluation.matching import Matching, nearest
+from central.desk.evaluation.log import Collected, Traffic, collect_log
+from central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
 from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
 from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
 from central.desk.evaluation.running import TruthFrames
@@ -207,7 +206,7 @@ class Evaluation:
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
     """Compute the figures of one run, from its log's samples in the order of the log."""
-    log = collected(samples)
+    log = collect_log(samples)
     scenario = _scenario(log)
     truth = log.sound(log.last(ch.TRUTH_LANDMARKS))
     ids, positions = (
@@ -337,7 +336,7 @@ def _never_came(log: Collected) -> list[str]:
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
-    """What each node set aside, and the first exception, in words."""
+    """The messages that each node set aside, and the first exception, in words."""
     by_node: dict[str, list[m.Fault]] = {}
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
@@ -356,7 +355,7 @@ def _by_robot(log: Collected, name: str) -> dict[str, float]:
     return {k.removeprefix(name): v for k, v in status.figures.items() if k.startswith(name)}
 
 
-def with_holes(evaluation: Evaluation, log: Log) -> Evaluation:
+def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
     """The evaluation with a note for every gap of its log."""
     lost = tuple(f"the log is not whole, {finding}" for finding in holes(log))
     return replace(evaluation, notes=(*evaluation.notes, *lost))
@@ -529,7 +528,7 @@ def _map_result(
     truth, known = _truth_of(labels, true_ids, positions)
     matching = None
     if not label_of and truth_from_map is not None:
-        at = moved(truth_from_map, means)
+        at = transform_points(truth_from_map, means)
         matching = _match_unnamed(ids, at, true_ids, positions, truth, known)
     errors = _errors(means, covariance, truth, known)
     return MapResult(
@@ -591,7 +590,7 @@ def _gospa(
     cut_off_m = half_spacing(positions)
     if errors is None or errors.truth_from_map is None or not cut_off_m:
         return None
-    return gospa(moved(errors.truth_from_map, means), positions, cut_off_m)
+    return gospa(transform_points(errors.truth_from_map, means), positions, cut_off_m)
 
 
 def _own_map(
@@ -669,14 +668,14 @@ def _robot_result(
 
 def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> float | None:
     """RMSE of a path's positions after a rigid motion, where the truth is known."""
-    true_poses, known = interpolated(truth, path.stamps_ns)
+    true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None
-    return distance_rmse(moved(motion, path.poses[known, :2]), true_poses[known, :2])
+    return distance_rmse(transform_points(motion, path.poses[known, :2]), true_poses[known, :2])
 
 
 def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotion | None:
-    """What moves the team's map onto the truth, and by what; None where there is no map."""
+    """The rigid motion of the team's map onto the truth, and its source; None without a map."""
     if fused is None:
         return None
     if fused.errors is not None and fused.errors.truth_from_map is not None:
@@ -689,7 +688,7 @@ def _motion(logs: Iterable[RobotLog]) -> Float[np.ndarray, "3"] | None:
     """The rigid motion that aligns smoothed positions with true ones, where these are known."""
     true_places, places = [np.empty((0, 2))], [np.empty((0, 2))]
     for log in logs:
-        truth, known = interpolated(log.truth, log.smoothed.stamps_ns)
+        truth, known = interpolate_truth(log.truth, log.smoothed.stamps_ns)
         true_places.append(truth[known, :2])
         places.append(log.smoothed.poses[known, :2])
     return rigid_alignment(np.concatenate(true_places), np.concatenate(places))

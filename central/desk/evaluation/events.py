@@ -1,4 +1,4 @@
-"""Detects the events of a team, in words: robots that join, are lost or refused, and nodes'
+"""Detect the events of a team, in words: robots that join, are lost or refused, and nodes'
 warnings.
 """
 
@@ -220,7 +220,7 @@ def decision_words(decision: m.AssociationDecision) -> str:
 
 
 def _is_apart(reason: str) -> bool:
-    """Whether it says why a robot is not joined: the map's change says so once."""
+    """Whether a warning repeats a robot's reason for not being joined, which the map gives once."""
     return any(not_joined([reason]))
 
 

@@ -1,4 +1,4 @@
-"""Compares a path with the positions of another sensor, such as a GPS, whose frame and clock
+"""Compare a path with the positions of another sensor, such as a GPS, whose frame and clock
 differ.
 """
 

@@ -1,7 +1,7 @@
 """A run over its team time: consistency, traffic, latency and events, from one pass over its log.
 
-`evaluation` has the figures at the end, this module their history. Of each message only the plotted
-numbers are kept, some tens of bytes.
+`evaluation` has the figures at the end, this module their history. Only the plotted numbers of each
+message are kept, some tens of bytes.
 """
 
 from array import array
@@ -178,10 +178,10 @@ class _Gathering:
         self.traffic[sample.key].take(sample.stamp_ns, float(len(sample.payload)))
         if channel in ch.SENSORS:
             self._take_measurement(sample)
-        self.hear(sample, channel)
+        self.take_contents(sample, channel)
 
-    def hear(self, sample: Sample, channel: ch.Channel | None) -> None:
-        """Take a message's contents, whatever its channel."""
+    def take_contents(self, sample: Sample, channel: ch.Channel | None) -> None:
+        """Take the contents of a message of any channel."""
         if channel not in _CHANNELS:
             return
         try:
@@ -254,7 +254,7 @@ def history(samples: Iterable[Sample]) -> History:
         as_centre_sample = centre.of(sample)
         if as_centre_sample is not None:
             as_centre = ch.channel_of(as_centre_sample.key)
-            found.hear(as_centre_sample, None if as_centre is None else as_centre[0])
+            found.take_contents(as_centre_sample, None if as_centre is None else as_centre[0])
     stamps = [column.stamps for column in found.traffic.values()]
     span = found.span
     if span == _NO_SPAN:

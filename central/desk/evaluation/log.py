@@ -1,4 +1,4 @@
-"""Collects from a log's samples, in one pass, what an evaluation needs.
+"""Collect the contents of a log for an evaluation, in one pass.
 
 Most of a log is sensor measurements: each is counted by its head (robot, incarnation, measurement)
 and adds its stamp and numbers to its stream's `Timed`. All other messages are decoded and checked
@@ -54,7 +54,7 @@ _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, 
 
 
 class Head(msgspec.Struct, array_like=True, gc=False):
-    """The first fields of every measurement; what follows is skipped."""
+    """The first fields of every measurement; later fields are skipped."""
 
     tag: str
     stamp_ns: int
@@ -206,7 +206,7 @@ class Collected:
             self.timed[robot, message.incarnation].take(message)
 
 
-def collected(samples: Iterable[Sample]) -> Collected:
+def collect_log(samples: Iterable[Sample]) -> Collected:
     """Collect the contents of a log from its samples."""
     found = Collected()
     centre = PeersAsCentre()

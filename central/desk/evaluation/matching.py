@@ -1,12 +1,12 @@
-"""Matches landmarks without identities to true ones by distance, where no labels are known."""
+"""Match landmarks to true ones by distance: GOSPA of a map, and the true positions of landmarks
+without identities where no labels are known.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
 from scipy.optimize import linear_sum_assignment
-
-from central.desk.evaluation.gospa import half_spacing
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,68 @@ class Matching:
         return f"{self.by} within {self.gate_m:.3g} m, {self.matched} of {self.of} matched"
 
 
+@dataclass(frozen=True)
+class Gospa:
+    """The distance, its cut-off c, and its parts: RMS of the assigned pairs, and the numbers of
+    missed and false points.
+    """
+
+    distance_m: float
+    cut_off_m: float
+    localisation_m: float | None
+    missed: int
+    false: int
+
+
+def assign(
+    found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], gate_m: float
+) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """The one-to-one pairs within the gate of the least sum of squared distances: the rows of both
+    sets, and the squared distances [m²].
+    """
+    squared = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), gate_m**2)
+    rows, columns = linear_sum_assignment(squared)
+    near = squared[rows, columns] < gate_m**2
+    return rows[near], columns[near], squared[rows, columns][near]
+
+
 def nearest(
     means: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"]
 ) -> tuple[Int64[np.ndarray, " n"], Matching] | None:
     """The row of each landmark's true position, −1 where it has none, in the frame of the truth.
 
-    The pairs are those of the least sum of squared distances, one to one, within the gate: half of
-    the median distance of a true landmark from its nearest neighbour. None below two true ones.
+    The gate is half of the median distance of a true landmark from its nearest neighbour. None
+    below two true ones.
     """
     gate_m = half_spacing(true)
     if not gate_m:
         return None
-    squared = np.minimum(((means[:, None] - true[None]) ** 2).sum(axis=2), gate_m**2)
-    rows, columns = linear_sum_assignment(squared)
-    near = squared[rows, columns] < gate_m**2
+    rows, columns, _ = assign(means, true, gate_m)
     found = np.full(len(means), -1, np.int64)
-    found[rows[near]] = columns[near]
-    return found, Matching(gate_m, int(near.sum()), len(means))
+    found[rows] = columns
+    return found, Matching(gate_m, len(rows), len(means))
+
+
+def gospa(
+    found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], cut_off_m: float
+) -> Gospa:
+    """GOSPA of the found points, in the frame of the true ones.
+
+    One distance between two sets of points that counts misplaced, missed and false ones
+    (Rahmathullah, García-Fernández and Svensson 2017, p = 2, α = 2): over the best assignment of
+    pairs nearer than the cut-off c, GOSPA² = Σ d² + c²/2 · (missed + false).
+    """
+    assigned = assign(found, true, cut_off_m)[2]
+    missed, false = len(true) - len(assigned), len(found) - len(assigned)
+    total = float(assigned.sum()) + 0.5 * cut_off_m**2 * (missed + false)
+    rms = float(np.sqrt(assigned.mean())) if len(assigned) else None
+    return Gospa(float(np.sqrt(total)), cut_off_m, rms, missed, false)
+
+
+def half_spacing(true: Float[np.ndarray, "m 2"]) -> float | None:
+    """Half the median distance of a true landmark from its nearest neighbour: the cut-off."""
+    if len(true) < 2:
+        return None
+    apart = np.hypot(*(true[:, None] - true[None]).transpose(2, 0, 1))
+    np.fill_diagonal(apart, np.inf)
+    return 0.5 * float(np.median(apart.min(axis=1)))

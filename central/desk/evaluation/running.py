@@ -1,4 +1,4 @@
-"""Computes errors of running estimates against the truth as soon as that arrives."""
+"""Compute errors of running estimates against the truth as soon as that arrives."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from central.desk.evaluation.errors import (
     Path,
     PoseErrors,
     distance_rmse,
-    interpolated,
+    interpolate_truth,
     pose_errors,
 )
 from central.fused import START_POSES
@@ -179,7 +179,7 @@ class RunningErrors:
 
     def truth_at(self, stamp_ns: int) -> Float[np.ndarray, "3"] | None:
         """The true pose at a time; None where it is not known."""
-        poses, known = interpolated(self._path(stamp_ns), np.array([stamp_ns]))
+        poses, known = interpolate_truth(self._path(stamp_ns), np.array([stamp_ns]))
         return poses[0] if known[0] else None
 
     def forget(self, before_ns: int) -> None:

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from central.desk.evaluation.errors import (
     Path,
     distance_rmse,
-    interpolated,
-    moved,
+    interpolate_truth,
     on_circle,
     rigid_alignment,
     rms,
+    transform_points,
 )
 
 
@@ -43,16 +43,16 @@ class TrajectoryErrors:
         return asdict(self)
 
 
-def associated(path: Path, truth: Path) -> tuple[Path, Path]:
+def associate_truth(path: Path, truth: Path) -> tuple[Path, Path]:
     """The poses of the path that have truth, and the true poses at the same stamps."""
-    poses, known = interpolated(truth, path.stamps_ns)
+    poses, known = interpolate_truth(truth, path.stamps_ns)
     stamps = path.stamps_ns[known]
     return Path(stamps, path.poses[known]), Path(stamps, poses[known])
 
 
 def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
     """The errors of a path; None where no pose of it has truth."""
-    estimate, true = (each.poses for each in associated(path, truth))
+    estimate, true = (each.poses for each in associate_truth(path, truth))
     if not len(estimate):
         return None
     turned = on_circle(estimate[:, 2] - true[:, 2])
@@ -62,7 +62,9 @@ def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
         len(estimate),
         distance_rmse(estimate[:, :2], true[:, :2]),
         rms(turned),
-        None if motion is None else distance_rmse(moved(motion, estimate[:, :2]), true[:, :2]),
+        None
+        if motion is None
+        else distance_rmse(transform_points(motion, estimate[:, :2]), true[:, :2]),
         None if motion is None else rms(on_circle(turned + motion[2])),
         rms(np.hypot(relative[:, 0], relative[:, 1])) if len(relative) else None,
         rms(relative[:, 2]) if len(relative) else None,

@@ -1,4 +1,4 @@
-"""What an operator has said of pairs of landmarks without names, and what came of it."""
+"""An operator's verdicts on pairs of landmarks without names, and their effect on the map."""
 
 from collections.abc import Collection
 
@@ -87,7 +87,7 @@ def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
         return f"{text} (not in the map: withdrawn, or it does not have both)"
     chain = contradicting(judgement, rests_on)
     if judgement.same and len(chain) == 1:
-        return f"{text} (without effect: they were said to be two, too)"
+        return f"{text} (without effect: another verdict has them as two)"
     if len(chain) > 1:
         return f"{text} (contradicted: {', '.join(map(in_words, chain))}; two they stay)"
     return text

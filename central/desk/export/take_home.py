@@ -1,4 +1,4 @@
-"""Writes the results of a run, the map and the paths, as tables in common formats.
+"""Write the results of a run, the map and the paths, as tables in common formats.
 
 `map.csv` and `map.json` have a landmark a row, `paths/<robot>.csv` and `.tum` a pose a row. Metres,
 seconds, radians, all in the frame that the map names; numbers with all digits, so that they are
@@ -44,7 +44,7 @@ class TakenHome:
     measurements: Mapping[int, int]
 
 
-def taken_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
+def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
     """The paths at keyframe rate and the counts of a log; `progress` is called with each robot's
     name.
     """

@@ -10,7 +10,7 @@ import numpy as np
 
 from central.desk.evaluation.errors import Path
 from central.desk.evaluation.evaluation import Evaluation, evaluate
-from central.desk.evaluation.trajectories import associated
+from central.desk.evaluation.trajectories import associate_truth
 from team.recording.reader import Log, LogError
 
 KINDS = ("smoothed", "online")
@@ -48,7 +48,7 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
         paths = {"truth": robot.truth}
         for kind, path in zip(KINDS, (robot.smoothed_path, robot.online_path), strict=True):
             paths[kind] = path
-            paths[f"{kind}.truth"] = associated(path, robot.truth)[1]
+            paths[f"{kind}.truth"] = associate_truth(path, robot.truth)[1]
         for kind, path in paths.items():
             if len(path.stamps_ns):
                 written.append(folder / f"{name}.{kind}.tum")

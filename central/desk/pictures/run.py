@@ -19,7 +19,7 @@ from central.desk.drawing import (
     robot_colours,
     robot_labels,
 )
-from central.desk.evaluation.errors import Path, moved
+from central.desk.evaluation.errors import Path, transform_points
 from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.paths import SmoothedPath
 from central.desk.pictures.style import save
@@ -93,11 +93,11 @@ def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
 
     def moved_path(path: Path) -> Path:
         turned = path.poses[:, 2:] + back[2]
-        return Path(path.stamps_ns, np.hstack((moved(back, path.poses[:, :2]), turned)))
+        return Path(path.stamps_ns, np.hstack((transform_points(back, path.poses[:, :2]), turned)))
 
     return replace(
         evaluation,
-        true_landmarks=moved(back, evaluation.true_landmarks),
+        true_landmarks=transform_points(back, evaluation.true_landmarks),
         robots={n: replace(r, truth=moved_path(r.truth)) for n, r in evaluation.robots.items()},
     )
 
@@ -129,7 +129,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     left_out = len(shown) - len(names)
     more = f" · {left_out} more robots are not drawn" if left_out else ""
     more += f" · not in the team's frame: {', '.join(outside)}" if outside else ""
-    figure.suptitle(f"{_heading(evaluation)}: pose errors and what the robots believe{more}")
+    figure.suptitle(f"{_heading(evaluation)}: pose errors and their 3σ bounds{more}")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=10)
     save(figure, path)
@@ -207,7 +207,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     )  # fmt: skip
     blocks = landmark_blocks(fused.covariance)
     draw_ellipses(axis, fused.means, blocks, MAP_COLOUR, width=1.1, zorder=7)
-    named = fused.ids < UNNAMED  # the others' numbers tell nobody anything
+    named = fused.ids < UNNAMED  # numbers of landmarks without names have no meaning
     if 0 < np.count_nonzero(named) <= LABELLED_LANDMARKS:
         means = fused.means[named]
         for landmark, mean, offset in zip(

@@ -235,7 +235,7 @@ def traffic_picture(history: History, path: FilePath) -> bool:
         (
             axes[1][0],
             by_robot,
-            "what each robot's node says (its sensors' measurements are not in it)",
+            "messages of each robot's node, without its sensors' measurements",
         ),
     ):
         _draw_rates(axis, history, groups)

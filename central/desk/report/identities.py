@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from central.desk.evaluation.association import AssociationResult, Pairs
-from central.desk.report.tables import shown
+from central.desk.report.tables import Sheet, format_figure
 from team.wire import messages as m
 
 SCORE_HEADINGS = ("pairs of detections", "precision", "recall", "F1", "wrong\ndetections")
@@ -20,22 +20,23 @@ LISTED = 200
 """Most decisions in the table; report.json has all."""
 
 
-def score_rows(found: AssociationResult) -> list[tuple[str, ...]]:
+def score_sheet(found: AssociationResult) -> Sheet:
     """The scores inside windows and over all."""
-    return [_row("inside windows", found.inside), _row("over all", found.pairs)]
+    rows = [_row("inside windows", found.inside), _row("over all", found.pairs)]
+    return Sheet(SCORE_HEADINGS, rows, _score_note(found))
 
 
 def _row(name: str, pairs: Pairs) -> tuple[str, ...]:
     return (
         name,
-        shown(pairs.precision, ".5f", ""),
-        shown(pairs.recall, ".4f", ""),
-        shown(pairs.f1, ".4f", ""),
-        shown(pairs.wrong_percent, ".3f", " %"),
+        format_figure(pairs.precision, ".5f", ""),
+        format_figure(pairs.recall, ".4f", ""),
+        format_figure(pairs.f1, ".4f", ""),
+        format_figure(pairs.wrong_percent, ".3f", " %"),
     )
 
 
-def score_note(found: AssociationResult) -> str:
+def _score_note(found: AssociationResult) -> str:
     """The other results of the labels, in words."""
     return (
         f"{found.landmarks} landmarks without names in all submaps, with those that the final map "
@@ -47,13 +48,13 @@ def score_note(found: AssociationResult) -> str:
     )
 
 
-def decision_rows(decisions: Sequence[m.AssociationDecision]) -> list[tuple[str, ...]]:
+def decision_sheet(decisions: Sequence[m.AssociationDecision]) -> Sheet:
     """A row for each closure and merge: accepted and undone ones with the newest first, then those
     that wait.
     """
     made = [each for each in decisions if each.kind != "waits"]
     waits = [each for each in decisions if each.kind == "waits"]
-    return [
+    rows = [
         (
             f"{each.kind}: {each.about}",
             f"{each.stamp_ns * 1e-9:.1f}",
@@ -68,3 +69,4 @@ def decision_rows(decisions: Sequence[m.AssociationDecision]) -> list[tuple[str,
         )
         for each in [*reversed(made), *waits][:LISTED]
     ]
+    return Sheet(DECISION_HEADINGS, rows, DECISION_NOTE)

@@ -1,4 +1,4 @@
-"""Writes the report as a folder: one self-contained page, its pictures, the figures."""
+"""Write the report as a folder: one self-contained page, its pictures, the figures."""
 
 import base64
 import json
@@ -22,32 +22,19 @@ from central.desk.pictures.time import (
     timeline_picture,
     traffic_picture,
 )
-from central.desk.report.identities import (
-    DECISION_HEADINGS,
-    DECISION_NOTE,
-    SCORE_HEADINGS,
-    decision_rows,
-    score_note,
-    score_rows,
-)
+from central.desk.report.identities import decision_sheet, score_sheet
 from central.desk.report.run import Run
 from central.desk.report.tables import (
-    OWN_HEADINGS,
-    OWN_NOTE,
-    PATH_HEADINGS,
-    PATH_NOTE,
-    PEER_HEADINGS,
-    PEER_NOTE,
-    ROBOT_HEADINGS,
-    own_rows,
-    path_row,
-    peer_rows,
-    robot_note,
-    robot_row,
-    shown,
+    Sheet,
+    disposition_sheet,
+    format_figure,
+    is_unfused,
+    own_sheet,
+    path_sheet,
+    peer_sheet,
+    robot_sheet,
     team_rows,
     title_of,
-    unfused,
 )
 
 LISTED_EVENTS = 200
@@ -176,19 +163,14 @@ def _page(
 
 def _identities(run: Run) -> list[str]:
     """The section on landmarks without names: scores, closures and merges."""
-    parts = []
-    if (found := run.evaluation.association) is not None:
-        parts += [_table(SCORE_HEADINGS, score_rows(found)), _note(score_note(found))]
-    if decisions := run.evaluation.decisions:
-        parts += [_table(DECISION_HEADINGS, decision_rows(decisions)), _note(DECISION_NOTE)]
-    return parts
+    evaluation = run.evaluation
+    parts = [] if evaluation.association is None else _sheet(score_sheet(evaluation.association))
+    return parts + (_sheet(decision_sheet(evaluation.decisions)) if evaluation.decisions else [])
 
 
 def _peers(run: Run) -> list[str]:
     """Each robot's copy of the team's set, where there are peers."""
-    if not run.evaluation.peers:
-        return []
-    return [_table(PEER_HEADINGS, peer_rows(run.evaluation)), _note(PEER_NOTE)]
+    return _sheet(peer_sheet(run.evaluation)) if run.evaluation.peers else []
 
 
 def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
@@ -198,13 +180,13 @@ def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]
     rows = [
         (
             name,
-            shown(took.get("cpu_s"), ".2f", ""),
-            shown(took.get("peak_rss_mb"), ".0f", ""),
-            shown(took.get("pss_mb"), ".0f", ""),
+            format_figure(took.get("cpu_s"), ".2f", ""),
+            format_figure(took.get("peak_rss_mb"), ".0f", ""),
+            format_figure(took.get("pss_mb"), ".0f", ""),
         )
         for name, took in processes.items()
     ]
-    return [_table(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows), _note(PSS_NOTE)]
+    return _sheet(Sheet(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows, PSS_NOTE))
 
 
 def _notes(run: Run) -> str:
@@ -213,21 +195,13 @@ def _notes(run: Run) -> str:
 
 def _own_maps(run: Run) -> list[str]:
     """The robots' own maps, where there is no fused map."""
-    if not unfused(run.evaluation):
-        return []
-    return [_table(OWN_HEADINGS, own_rows(run.evaluation)), _note(OWN_NOTE)]
+    return _sheet(own_sheet(run.evaluation)) if is_unfused(run.evaluation) else []
 
 
 def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    arbitrary = run.evaluation.arbitrary_frame
-    rows = [robot_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
-    if not rows:
+    if not run.evaluation.robots:
         return []
-    return [
-        _table(ROBOT_HEADINGS, rows),
-        _note(robot_note(run.evaluation)),
-        _image(pictures, "errors"),
-    ]
+    return [*_sheet(robot_sheet(run.evaluation)), _image(pictures, "errors")]
 
 
 def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -241,14 +215,14 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         rows.append(
             (
                 name,
-                shown(None if of is None else of.per_dof, ".3f", ""),
+                format_figure(None if of is None else of.per_dof, ".3f", ""),
                 "–" if of is None else f"{int(of.dof.sum()):,}",
-                shown(cost.get(name), ".3f", ""),
-                shown(scale.get(name), ".2f", ""),
+                format_figure(cost.get(name), ".3f", ""),
+                format_figure(scale.get(name), ".2f", ""),
                 OUTSIDE
                 if robot is not None and robot.outside
-                else shown(None if online is None else online.nees_per_dof, ".3g", ""),
-                shown(None if online is None else online.coverage, ".0%", ""),
+                else format_figure(None if online is None else online.nees_per_dof, ".3g", ""),
+                format_figure(None if online is None else online.coverage, ".0%", ""),
             )
         )
     filled = [row for row in rows if any(cell != "–" for cell in row[1:])]
@@ -263,20 +237,20 @@ def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "online\nNEES/dof",
         "in\n95 %",
     )
-    return [_table(headings, filled), _note(NIS_NOTE), _image(pictures, "consistency")]
+    return [*_sheet(Sheet(headings, filled, NIS_NOTE)), _image(pictures, "consistency")]
 
 
 def _paths(run: Run) -> list[str]:
     arbitrary = run.evaluation.arbitrary_frame
-    rows = [path_row(n, robot, arbitrary=arbitrary) for n, robot in run.evaluation.robots.items()]
-    if all(cell in {"–", OUTSIDE} for row in rows for cell in row[1:]):
+    sheet = path_sheet(run.evaluation)
+    if all(cell in {"–", OUTSIDE} for row in sheet.rows for cell in row[1:]):
         return []
     absolute = [
         (
             name, kind, f"{errors.poses:,}",
-            shown(None if arbitrary else errors.ape_m, ".3f", ""),
-            shown(errors.ape_aligned_m, ".3f", ""),
-            _degrees(errors.ape_aligned_rad), shown(errors.rpe_m, ".3f", ""),
+            format_figure(None if arbitrary else errors.ape_m, ".3f", ""),
+            format_figure(errors.ape_aligned_m, ".3f", ""),
+            _degrees(errors.ape_aligned_rad), format_figure(errors.rpe_m, ".3f", ""),
             _degrees(errors.rpe_rad),
         )
         for name, of in run.trajectories().items()
@@ -292,15 +266,15 @@ def _paths(run: Run) -> list[str]:
         "RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
         "evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum gives the same."
     )
-    return [_table(PATH_HEADINGS, rows), _note(PATH_NOTE), _table(headings, absolute), _note(note)]
+    return [*_sheet(sheet), *_sheet(Sheet(headings, absolute, note))]
 
 
 def _measurements(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
-        tables = [_dispositions(ledgers)] if any(ledgers.values()) else []
-        return [*tables, _note(f"By the robots' own word. The ledger: {run.no_ledger}.")]
+        tables = _sheet(disposition_sheet(ledgers)) if any(ledgers.values()) else []
+        return [*tables, _note(f"As the robots report it. The ledger: {run.no_ledger}.")]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
@@ -309,18 +283,9 @@ def _measurements(run: Run) -> list[str]:
         verdict = f"{len(ledger.offenders)} offenders: {'; '.join(ledger.offenders[:5])}"
     return [
         f'<p class="{kind}">Ledger: {escape(verdict)}.</p>',
-        _dispositions({robot: ledger.totals(robot) for robot in robots}),
+        *_sheet(disposition_sheet({robot: ledger.totals(robot) for robot in robots})),
         _note(f"{len(ledger.maps)} submaps, {used} of them in a map"),
     ]
-
-
-def _dispositions(ledgers: Mapping[str, Mapping[str, int]]) -> str:
-    """A row for each disposition, a column for each robot."""
-    rows = []
-    for disposition in sorted(set().union(*ledgers.values())):
-        counts = [of.get(disposition, 0) for of in ledgers.values()]
-        rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
-    return _table(("disposition", *ledgers, "all"), rows)
 
 
 def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -334,7 +299,7 @@ def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     ]
     more = len(events) - len(rows)
     left = _note(f"{more} more in report.json") if more else ""
-    return [_image(pictures, "timeline"), _table(("", "who", "what"), rows, words=True), left]
+    return [_image(pictures, "timeline"), _table(("", "node", "event"), rows, words=True), left]
 
 
 def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -355,7 +320,7 @@ def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "Wall time [s] from the publication of a submap's last and first measurement to that of "
         "the first map that used it, by the publishers' clocks."
     )
-    return [_table(headings, rows), _note(note), _image(pictures, "latency")]
+    return [*_sheet(Sheet(headings, rows, note)), _image(pictures, "latency")]
 
 
 def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
@@ -403,6 +368,11 @@ def _note(text: str) -> str:
     return f'<p class="note">{escape(text)}</p>'
 
 
+def _sheet(sheet: Sheet) -> list[str]:
+    """A table, and its note below it."""
+    return [_table(sheet.headings, sheet.rows), *([_note(sheet.note)] if sheet.note else [])]
+
+
 def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, words: bool = False) -> str:
     head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
     body = "".join(
@@ -417,4 +387,4 @@ def _quantile(values: Float[np.ndarray, " n"], share: float) -> float:
 
 
 def _degrees(angle_rad: float | None) -> str:
-    return shown(None if angle_rad is None else degrees(angle_rad), ".2f", "")
+    return format_figure(None if angle_rad is None else degrees(angle_rad), ".2f", "")

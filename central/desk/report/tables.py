@@ -1,7 +1,8 @@
 """The tables of a report, for a terminal and for the page."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from math import degrees
+from typing import NamedTuple
 
 from rich import box
 from rich.console import JustifyMethod
@@ -16,7 +17,17 @@ ABSURD_NEES = 1000
 """Beyond this a NEES per dof is shown in words."""
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 _COUNT_AGAIN = ("kalman", "kalman-per-axis")
+LEFT = ("robot", "disposition")
+"""Headings of columns with words."""
 Rows = Sequence[tuple[str, str]]
+
+
+class Sheet(NamedTuple):
+    """A table for a terminal and for the page: headings, cells, and the note below it."""
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
 
 
 def summary_tables(evaluation: Evaluation) -> list[Table]:
@@ -24,31 +35,25 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     team = Table(title=Text(title_of(evaluation)), show_header=False)
     for name, value in team_rows(evaluation):
         team.add_row(Text(name), Text(value))
-    arbitrary = evaluation.arbitrary_frame
-    each = evaluation.robots.items()
-    rows = [robot_row(name, robot, arbitrary=arbitrary) for name, robot in each]
-    robots = _table(ROBOT_HEADINGS, rows, robot_note(evaluation))
-    if not evaluation.peers and unfused(evaluation):
-        return [team, robots, _table(OWN_HEADINGS, own_rows(evaluation), OWN_NOTE)]
-    tables = [team, robots]
-    if any(robot.smoothed is not None for _, robot in each):
-        paths = [path_row(name, robot, arbitrary=arbitrary) for name, robot in each]
-        tables.append(_table(PATH_HEADINGS, paths, PATH_NOTE))
-    if evaluation.peers:
-        tables.append(_table(PEER_HEADINGS, peer_rows(evaluation), PEER_NOTE))
-    return tables
+    sheets = [robot_sheet(evaluation)]
+    if not evaluation.peers and is_unfused(evaluation):
+        sheets.append(own_sheet(evaluation))
+    else:
+        if any(robot.smoothed is not None for robot in evaluation.robots.values()):
+            sheets.append(path_sheet(evaluation))
+        if evaluation.peers:
+            sheets.append(peer_sheet(evaluation))
+    return [team, *map(terminal_table, sheets)]
 
 
-def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> Table:
-    """A narrow table, whose cells go on in the next line where even that is too wide: a number that
-    is cut is a wrong one.
-    """
-    table = Table(caption=caption, box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for heading in headings:
-        side: JustifyMethod = "left" if heading == "robot" else "right"
+def terminal_table(sheet: Sheet) -> Table:
+    """The compact table of a sheet; long cells wrap, since a truncated number is wrong."""
+    table = Table(caption=sheet.note or None, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for heading in sheet.headings:
+        side: JustifyMethod = "left" if heading in LEFT else "right"
         table.add_column(Text(heading), justify=side, overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+    for row in sheet.rows:
+        table.add_row(*map(Text, row))
     return table
 
 
@@ -60,7 +65,7 @@ PEER_NOTE = (
 )
 
 
-def peer_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+def peer_sheet(evaluation: Evaluation) -> Sheet:
     """For each robot the SHA-256 of its final map, its part of the set, and the traffic for it."""
     rows: list[tuple[str, ...]] = []
     for name, peer in evaluation.peers.items():
@@ -77,14 +82,14 @@ def peer_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
                 name,
                 "none" if sha256 is None else sha256[:12],
                 f"{peer.submaps}",
-                shown(peer.complete_at_s, ".1f", ""),
-                shown(peer.uplink, ",.0f", ""),
-                shown(peer.downlink, ",.0f", ""),
-                shown(star, ",.0f", ""),
+                format_figure(peer.complete_at_s, ".1f", ""),
+                format_figure(peer.uplink, ",.0f", ""),
+                format_figure(peer.downlink, ",.0f", ""),
+                format_figure(star, ",.0f", ""),
                 ", ".join(over),
             )
         )
-    return rows
+    return Sheet(PEER_HEADINGS, rows, PEER_NOTE)
 
 
 def title_of(evaluation: Evaluation) -> str:
@@ -109,7 +114,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
         rows += [] if fused.matching is None else [("landmark errors", f"by {fused.matching}")]
         rows += [
             ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m{by}"),
-            ("after rigid alignment", shown(errors.aligned_rmse_m, ".3f", " m")),
+            ("after rigid alignment", format_figure(errors.aligned_rmse_m, ".3f", " m")),
         ]
         if not arbitrary:
             absurd = errors.nees_per_dof > ABSURD_NEES
@@ -121,8 +126,8 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("shape NEES/landmark", nees))
         if not arbitrary:
             rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
-    rows.append(("joint cost per dof", shown(fused.cost_per_dof, ".3f", "")))
-    rows.append(("covariance scale", shown(fused.covariance_scale, ".2f", ", 1 is right")))
+    rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f", "")))
+    rows.append(("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += _association_rows(evaluation)
     rows += [("joined", short(words)) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
@@ -182,10 +187,18 @@ def _association_rows(evaluation: Evaluation) -> Rows:
     if found is None:
         return rows
     pairs = found.pairs
+    precision, recall, f1, wrong = (
+        format_figure(value, form, unit)
+        for value, form, unit in (
+            (pairs.precision, ".4f", ""),
+            (pairs.recall, ".3f", ""),
+            (pairs.f1, ".3f", ""),
+            (pairs.wrong_percent, ".3f", " %"),
+        )
+    )
     scores = (
-        f"precision {shown(pairs.precision, '.4f', '')}, recall {shown(pairs.recall, '.3f', '')}, "
-        f"F1 {shown(pairs.f1, '.3f', '')}; {shown(pairs.wrong_percent, '.3f', ' %')} of the "
-        "detections are in a wrong landmark"
+        f"precision {precision}, recall {recall}, F1 {f1}; {wrong} of the detections are in a "
+        "wrong landmark"
     )
     many = found.merges_right + found.merges_wrong + found.merges_refused > 0
     merges = (
@@ -213,7 +226,7 @@ def _absurd(evaluation: Evaluation) -> str:
     return f"> {ABSURD_NEES}: over-confident{why}"
 
 
-def robot_note(evaluation: Evaluation) -> str:
+def _robot_note(evaluation: Evaluation) -> str:
     """The explanation of the robots' rows."""
     online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
     star = ", * of online ones" if online else ""
@@ -236,8 +249,14 @@ ROBOT_HEADINGS = (
 )  # fmt: skip
 
 
-def robot_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple[str, ...]:
-    """The cells under ROBOT_HEADINGS; in an arbitrary frame only the aligned errors."""
+def robot_sheet(evaluation: Evaluation) -> Sheet:
+    """Measurements and errors of each robot; in an arbitrary frame only the aligned errors."""
+    arbitrary = evaluation.arbitrary_frame
+    rows = [_robot_row(n, robot, arbitrary=arbitrary) for n, robot in evaluation.robots.items()]
+    return Sheet(ROBOT_HEADINGS, rows, _robot_note(evaluation))
+
+
+def _robot_row(name: str, robot: RobotResult, *, arbitrary: bool) -> tuple[str, ...]:
     used = robot.consumption
     errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
     position = None if errors is None else errors.position_rmse_m
@@ -249,10 +268,10 @@ def robot_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tupl
         str(used.steps),
         f"{'–' if used.used is None else used.used} of {used.published}",
         str(used.submaps),
-        OUTSIDE if outside else shown(position, ".3f", mark),
-        shown(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
-        shown(None if errors is None else errors.nees_per_dof, ".3g", mark),
-        shown(robot.uplink_bytes_per_step, ".1f", ""),
+        OUTSIDE if outside else format_figure(position, ".3f", mark),
+        format_figure(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
+        format_figure(None if errors is None else errors.nees_per_dof, ".3g", mark),
+        format_figure(robot.uplink_bytes_per_step, ".1f", ""),
     )
 
 
@@ -266,11 +285,17 @@ PATH_NOTE = (
 )
 
 
-def path_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple[str, ...]:
-    """Position errors, NEES and coverage of the smoothed and of the online path.
+def path_sheet(evaluation: Evaluation) -> Sheet:
+    """Position errors, NEES and coverage of the smoothed and of the online paths.
 
     In an arbitrary frame only the aligned errors.
     """
+    arbitrary = evaluation.arbitrary_frame
+    rows = [_path_row(n, robot, arbitrary=arbitrary) for n, robot in evaluation.robots.items()]
+    return Sheet(PATH_HEADINGS, rows, PATH_NOTE)
+
+
+def _path_row(name: str, robot: RobotResult, *, arbitrary: bool) -> tuple[str, ...]:
     cells = [name]
     for of, aligned, outside in (
         (robot.smoothed, robot.aligned_rmse_m, False),
@@ -280,10 +305,10 @@ def path_row(name: str, robot: RobotResult, *, arbitrary: bool = False) -> tuple
         cells += [
             OUTSIDE
             if outside
-            else shown(None if errors is None else errors.position_rmse_m, ".3f", ""),
-            shown(aligned, ".3f", ""),
-            shown(None if errors is None else errors.nees_per_dof, ".3g", ""),
-            shown(None if errors is None else errors.coverage, ".0%", ""),
+            else format_figure(None if errors is None else errors.position_rmse_m, ".3f", ""),
+            format_figure(aligned, ".3f", ""),
+            format_figure(None if errors is None else errors.nees_per_dof, ".3g", ""),
+            format_figure(None if errors is None else errors.coverage, ".0%", ""),
         ]
     return tuple(cells)
 
@@ -294,13 +319,13 @@ OWN_HEADINGS = (
 OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
-def unfused(evaluation: Evaluation) -> bool:
+def is_unfused(evaluation: Evaluation) -> bool:
     """Whether there is no fused map, and each robot has its own."""
     empty = evaluation.map is not None and not len(evaluation.map.ids)
     return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
 
 
-def own_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+def own_sheet(evaluation: Evaluation) -> Sheet:
     """Errors, NEES with its band, and coverage of every robot's own map."""
     rows = []
     for name, robot in evaluation.robots.items():
@@ -314,15 +339,24 @@ def own_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
                 name,
                 str(own.count),
                 f"{own.rmse_m:.3f}",
-                shown(own.aligned_rmse_m, ".3f", ""),
+                format_figure(own.aligned_rmse_m, ".3f", ""),
                 f"{own.nees_per_dof:.4g}",
                 f"{low:.2f}…{high:.2f}",
                 f"{own.coverage:.0%}",
             )
         )
-    return rows
+    return Sheet(OWN_HEADINGS, rows, OWN_NOTE)
 
 
-def shown(value: float | None, form: str, unit: str) -> str:
+def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
+    """Measurements by disposition, with a column for each robot."""
+    rows = []
+    for disposition in sorted(set().union(*ledgers.values())):
+        counts = [of.get(disposition, 0) for of in ledgers.values()]
+        rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
+    return Sheet(("disposition", *ledgers, "all"), rows)
+
+
+def format_figure(value: float | None, form: str, unit: str) -> str:
     """The number with its unit, a dash where there is none."""
     return "–" if value is None else f"{value:{form}}{unit}"

@@ -30,7 +30,7 @@ def landmarks_of(message: m.MapEstimate | m.FusedMap) -> Landmarks:
     return Landmarks(names, means, blocks)
 
 
-def around(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
+def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
     """The particles' positions (ahead [m], left [m]) as seen from their mean pose.
 
     A cloud lies along the robot's own poses, which have drifted from the team's frame; so it is
@@ -43,10 +43,12 @@ def around(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
     x, y = np.average(poses[:, :2], axis=0, weights=weights)
     c, s = (np.average(f(poses[:, 2]), weights=weights) for f in (np.cos, np.sin))
     heading = np.arctan2(s, c)
-    return placed(poses[:, :2] - (x, y), (0.0, 0.0, -float(heading)))
+    return place_points(poses[:, :2] - (x, y), (0.0, 0.0, -float(heading)))
 
 
-def placed(points: Float[np.ndarray, "P 2"], pose: Sequence[float]) -> Float[np.ndarray, "P 2"]:
+def place_points(
+    points: Float[np.ndarray, "P 2"], pose: Sequence[float]
+) -> Float[np.ndarray, "P 2"]:
     """Points that are seen from a pose (x, y, theta), in the frame of that."""
     x, y, theta = pose
     c, s = np.cos(theta), np.sin(theta)

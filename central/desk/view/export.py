@@ -1,4 +1,4 @@
-"""Computes the views of a recorded log: those that a viewer would have published, in their
+"""Compute the views of a recorded log: those that a viewer would have published, in their
 order.
 """
 

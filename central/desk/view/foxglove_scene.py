@@ -1,4 +1,4 @@
-"""Encodes drawable things as Foxglove's messages: the one module that imports its encoders.
+"""Encode drawable things as Foxglove's messages: the one module that imports its encoders.
 
 z is height: the plane of the map is z = 0. Rotations are about z, (0, 0, sin θ/2, cos θ/2).
 """

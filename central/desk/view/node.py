@@ -19,7 +19,7 @@ from central.desk.evaluation.events import Event, EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
 from central.desk.names import in_order
 from central.desk.view import foxglove_scene as fox
-from central.desk.view.drawn import Landmarks, Track, around, landmarks_of, placed
+from central.desk.view.drawn import Landmarks, Track, centre_particles, landmarks_of, place_points
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire import views
@@ -33,7 +33,7 @@ PATHS_EVERY = 10
 TRAIL_NS = 15_000_000_000
 """Length of the recent path that is sent with a robot; the rest is sent with the whole paths."""
 LAG_NS = 30_000_000_000
-"""A robot that is further behind the fastest is not waited for."""
+"""A robot that is further behind the fastest does not hold back the view."""
 MOST_PERIODS = 60
 """Most views for one message; of a longer jump in time the earlier part is left out."""
 FORGET_NS = 10_000_000_000
@@ -112,7 +112,7 @@ class ViewerNode:
     """One viewer of a team: `handle` until `finished`.
 
     The view's time is that of the slowest robot at work, so that all robots are shown at one time,
-    however far the others are ahead; no robot is waited for beyond LAG_NS.
+    however far the others are ahead; no robot holds it back by more than LAG_NS.
     """
 
     listens = (
@@ -230,7 +230,7 @@ class ViewerNode:
         elif message.node.startswith("robot/"):
             robot = self._of(message.node.removeprefix("robot/"))
             robot.status = message.figures
-            if robot.reached_ns is not None:  # a robot that sees nothing says nothing else
+            if robot.reached_ns is not None:  # a robot without detections publishes nothing else
                 robot.reached_ns = max(robot.reached_ns, message.stamp_ns)
 
     def _extend(self, points: Float[np.ndarray, "n 2"]) -> None:
@@ -331,7 +331,7 @@ class ViewerNode:
         out = []
         for name, robot in self._in_order():
             if robot.cloud is not None and robot.estimate is not None:
-                points = placed(around(robot.cloud), robot.pose().tolist())
+                points = place_points(centre_particles(robot.cloud), robot.pose().tolist())
                 weights = floats(robot.cloud.weights, "weights").astype(np.float64)
                 payload = fox.cloud(now_ns, points, weights, "weight")
                 out.append(Shown(views.PARTICLES.key(name), now_ns, payload))

@@ -23,7 +23,7 @@ import numpy as np
 from central.desk.drawing import ROBOT_COLOURS
 from central.desk.evaluation.events import EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
-from central.desk.view.drawn import around, landmarks_of
+from central.desk.view.drawn import centre_particles, landmarks_of
 from central.desk.view.landmark_sets import sets_of
 from central.desk.view.node import FORGET_NS
 from team.wire import channels as ch
@@ -86,10 +86,10 @@ class PageFrames:
     def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
         """The first frame; live: the log is being recorded."""
         title = title_of(team, metadata, name)
-        self._say("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
+        self._add_frame("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
     def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> None:
-        """Take one sample of the log, and its message if a viewer subscribes to it."""
+        """Convert one sample of the log, and its message if a viewer subscribes to it."""
         found = ch.channel_of(sample.key)
         channel = "" if found is None else found[0].name
         if self._origin_ns is None and channel in _BEGIN:
@@ -104,16 +104,16 @@ class PageFrames:
     def flush(self, now_ns: int | None = None) -> list[str]:
         """The frames since the last call; now_ns: the team time of the robots."""
         for robot, stream in self._streams.items():
-            self._tell_errors(stream)
+            self._add_errors(stream)
             for kind, (times, values) in stream.rows.items():
-                self._say(kind, r=robot, t=times, v=values)
+                self._add_frame(kind, r=robot, t=times, v=values)
             stream.rows = {}
         if self._traffic:
             rows = [[key, t, *counted] for (key, t), counted in sorted(self._traffic.items())]
             self._traffic = {}
-            self._say("bytes", v=rows)
+            self._add_frame("bytes", v=rows)
         if now_ns is not None:
-            self._say("now", t=self._t(now_ns))
+            self._add_frame("now", t=self._t(now_ns))
         out, self._out = self._out, []
         return out
 
@@ -121,11 +121,11 @@ class PageFrames:
         """The last frames; notes: faults of the log."""
         out = self.flush(self._newest_ns)
         for note in notes:
-            self._say("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
-        self._say("eof", complete=complete)
+            self._add_frame("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
+        self._add_frame("eof", complete=complete)
         return out + self.flush()
 
-    def _say(self, kind: str, **fields: object) -> None:
+    def _add_frame(self, kind: str, **fields: object) -> None:
         self._out.append(json.dumps({"k": kind, **fields}, separators=(",", ":")))
 
     def _t(self, stamp_ns: int) -> float:
@@ -140,7 +140,9 @@ class PageFrames:
         timeless = isinstance(message, m.Liveliness | m.Status)
         at_ns = self._newest_ns if timeless else message.stamp_ns
         for event in self._detector.take(message, at_ns):
-            self._say("ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text)
+            self._add_frame(
+                "ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text
+            )
         match message:
             case m.InitialPose():
                 self._frames.take(message)
@@ -155,14 +157,14 @@ class PageFrames:
             case m.TruthLandmarks():
                 self._truth = TrueLandmarks.of(message)
                 places = self._truth.positions.ravel().tolist()
-                self._say("truth_map", ids=self._truth.ids.tolist(), xy=places)
+                self._add_frame("truth_map", ids=self._truth.ids.tolist(), xy=places)
             case m.ParticleCloud():
-                t, seen = self._t(message.stamp_ns), around(message)
-                self._say("cloud", r=message.robot, t=t, v=_base64(seen.astype("<f4")))
+                t, seen = self._t(message.stamp_ns), centre_particles(message)
+                self._add_frame("cloud", r=message.robot, t=t, v=_base64(seen.astype("<f4")))
             case m.Trajectory():
                 times = [self._t(at) for at in stamps(message.stamps, "stamps").tolist()]
                 poses = floats(message.poses, "poses").tolist()
-                self._say("path", r=message.robot, t=times, v=poses)
+                self._add_frame("path", r=message.robot, t=times, v=poses)
             case _:
                 pass
 
@@ -179,7 +181,7 @@ class PageFrames:
         outside = self._has_map and not message.in_team_frame
         if outside != stream.outside:
             stream.outside = outside
-            self._say("outside", r=message.robot, t=self._t(message.stamp_ns), v=outside)
+            self._add_frame("outside", r=message.robot, t=self._t(message.stamp_ns), v=outside)
         if outside:
             return
         frame = "" if self._frames.has(message.frame) else message.frame
@@ -203,7 +205,7 @@ class PageFrames:
                 stream.add("truth", self._t(at), [_short(v) for v in pose])
         stream.errors.take_truth(message)
 
-    def _tell_errors(self, stream: _Stream) -> None:
+    def _add_errors(self, stream: _Stream) -> None:
         errors = stream.errors.known()
         stream.errors.forget((stream.pose_ns or 0) - FORGET_NS)
         if errors is None:
@@ -226,7 +228,7 @@ class PageFrames:
         if sets:
             support = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]
             unnamed = {"n": [count for count, _ in support], "why": [words for _, words in support]}
-        self._say(
+        self._add_frame(
             "map",
             t=self._t(message.stamp_ns),
             ids=_base64(landmarks.ids.astype("<u4")),
@@ -246,11 +248,11 @@ class PageFrames:
         if shown and self._figures_s.get(message.node) != news:
             self._figures_s[message.node] = news
             figures = {name: _short(value) for name, value in message.figures.items()}
-            self._say("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)
+            self._add_frame("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)
 
 
 def _short(value: float) -> float:
-    """The value in seven digits: more can not be seen."""
+    """Round to seven digits, the resolution of the page."""
     return float(f"{value:.7g}")
 
 

@@ -1,18 +1,18 @@
-"""The page's server: files and one stream of frames over a WebSocket, for this machine alone.
+"""Serve a log: the page with its stream of frames over a WebSocket, and Foxglove's WebSocket.
 
-A new connection gets every frame of the log from the first on, then the new ones. A page of another
-origin may not connect, nor one that uses another name for this machine (DNS rebinding).
+A new connection receives every frame of the log from the first on, then the new ones. A page of
+another origin may not connect, nor one that uses another name for this machine (DNS rebinding).
 """
 
 import asyncio
+import logging
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -21,10 +21,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from central.desk.view.export import Viewing, for_viewer
+from central.desk.view.foxglove_proxy import proxy, refuse
+from central.desk.view.foxglove_server import FoxgloveServer
 from central.desk.view.page_frames import PageFrames
 from team.recording.reader import LogError
 from team.recording.tail import Tail
-from team.wire.bus import BusError, Sample
+from team.wire.bus import BusError
 
 STREAM = "/stream"
 LOOK_S = 0.2
@@ -37,7 +39,6 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _POLICY = "default-src 'self'; connect-src 'self' ws: wss:; style-src 'self' 'unsafe-inline'"
-_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
 class ServerError(BusError):
@@ -55,29 +56,15 @@ def page_files() -> dict[str, tuple[str, bytes]]:
     return found
 
 
-@runtime_checkable
-class Audience(Protocol):
-    """Receives the views of a log as they are made."""
-
-    def begin(self, team: str) -> None:
-        """Receive the team's name."""
-
-    def say(self, view: Sample) -> None:
-        """Receive one view."""
-
-    def end(self) -> None:
-        """There are no more views."""
-
-
 @dataclass
 class Feed:
-    """Reads a log as it grows, and stores the frames of it.
+    """Reads a log as it grows, and stores its frames.
 
-    audience: receives every view, once, in order. error: why reading ended early.
+    foxglove: receives every view, once, in order. error: why reading ended early.
     """
 
     tail: Tail
-    audience: Audience | None = None
+    foxglove: FoxgloveServer | None = None
     frames: list[str] = field(default_factory=list)
     error: str | None = None
     ended: bool = False
@@ -85,9 +72,9 @@ class Feed:
     _viewing: Viewing = field(default_factory=Viewing)
     _greeted: bool = False
 
-    def look(self, *, growing: bool) -> bool:
-        """Read what is new; returns whether there was anything. A log that does not grow
-        ends here.
+    def read_more(self, *, growing: bool) -> bool:
+        """Read the new samples; returns whether there were any. A log that does not grow ends
+        here.
         """
         try:
             samples = self.tail.more()
@@ -95,31 +82,24 @@ class Feed:
             self.error, samples, growing = str(error), [], False
         if self.tail.log is not None and not self._greeted:
             self._greeted = True
-            if self.audience is not None:
-                self.audience.begin(self.tail.log.team)
             log = self.tail.log
+            if self.foxglove is not None:
+                self.foxglove.team = log.team
             self._page.hello(log.team, log.metadata, self.tail.path.name, live=growing)
         for sample in samples:
             input_ = for_viewer(sample)
             self._page.take(sample, input_)
             for view in self._viewing.take(sample, input_):
-                if self.audience is not None:
-                    self.audience.say(view)
+                if self.foxglove is not None:
+                    self.foxglove.publish(view)
         if samples:
             self.frames += self._page.flush(self._viewing.node.now_ns)
         elif self.tail.ended or not growing:
-            try:
-                if self.audience is not None:
-                    self.audience.end()
-            except (
-                BusError
-            ) as error:  # its port was taken meanwhile: the page is shown all the same
-                self.error = str(error)
-            self.frames += self._page.end(self._wrong(), complete=True)
+            self.frames += self._page.end(self._faults(), complete=True)
             self.ended = True
         return bool(samples)
 
-    def _wrong(self) -> list[str]:
+    def _faults(self) -> list[str]:
         """The faults of the log, in words."""
         found = [] if self.error is None else [self.error]
         if self.tail.damaged:
@@ -140,9 +120,9 @@ class PageServer:
         self._files = page_files()
         self._frame_ready = asyncio.Condition()
 
-    async def start(self, port: int) -> tuple[Server, int]:
-        """Listen; the server, and the port that it is bound to."""
-        server = await serve(
+    async def start(self, port: int) -> Server:
+        """Listen. Raises OSError."""
+        return await serve(
             self._stream,
             self._host,
             port,
@@ -150,27 +130,21 @@ class PageServer:
             compression=None,
             max_size=1024,
         )
-        return server, int(next(iter(server.sockets)).getsockname()[1])
 
     async def read(self, stop: asyncio.Event) -> None:
         """Read the log until its end or until `stop`."""
         while not (self._feed.ended or stop.is_set()):
-            some = await asyncio.to_thread(self._feed.look, growing=self._growing)
+            some = await asyncio.to_thread(self._feed.read_more, growing=self._growing)
             async with self._frame_ready:
                 self._frame_ready.notify_all()
             if not some:
                 await asyncio.sleep(LOOK_S)
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        host = request.headers.get("Host", "")
-        if self._host in ("127.0.0.1", "localhost", "::1") and not _is_loopback(host):
-            return connection.respond(HTTPStatus.FORBIDDEN, f"{host!r} is not this machine\n")
+        refused = refuse(self._host, connection, request)
         path = urlsplit(request.path).path
-        if path == STREAM:
-            origin = request.headers.get("Origin")
-            if origin is not None and urlsplit(origin).netloc != host:
-                return connection.respond(HTTPStatus.FORBIDDEN, "another page's origin\n")
-            return None
+        if refused is not None or path == STREAM:
+            return refused
         if path not in self._files:
             return connection.respond(HTTPStatus.NOT_FOUND, "no such file\n")
         kind, body = self._files[path]
@@ -212,45 +186,81 @@ class PageServer:
             await connection.ping()
 
 
-def _is_loopback(host: str) -> bool:
-    return host.rpartition(":")[0] in _LOOPBACK or host in _LOOPBACK
+@dataclass(frozen=True)
+class Shown:
+    """The addresses at which a log is shown; foxglove: empty without Foxglove's WebSocket."""
+
+    url: str
+    foxglove: str
+    feed: Feed
 
 
 @contextmanager
-def serving(feed: Feed, host: str, port: int, *, growing: bool) -> Iterator[str]:
-    """Serve the page on a thread until the context ends; yields its URL. Raises ServerError."""
-    ready = threading.Event()
-    ends: dict[str, object] = {}
+def session(
+    log: Path, host: str, port: int, foxglove_port: int, *, growing: bool
+) -> Iterator[Shown]:
+    """Show a log until the context ends; raises ServerError where a port is taken.
 
-    async def main() -> None:
-        stop = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        ends["stop"] = lambda: loop.call_soon_threadsafe(stop.set)
-        page = PageServer(feed, host, growing=growing)
-        try:
-            server, ends["port"] = await page.start(port)
-        except OSError as error:
-            ends["error"] = error
-            return
-        finally:
-            ready.set()
-        async with server:
+    growing: its recorder may still be running, or has not begun.
+    """
+    # The library logs every connection on the console otherwise.
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    with FoxgloveServer() as foxglove:
+        feed = Feed(Tail(log), foxglove)
+        with serving(feed, host, port, foxglove_port, growing=growing) as shown:
+            yield shown
+
+
+@contextmanager
+def serving(
+    feed: Feed, host: str, port: int, foxglove_port: int = 0, *, growing: bool
+) -> Iterator[Shown]:
+    """Serve the page, and Foxglove where the feed has it, on a thread until the context ends.
+
+    Raises ServerError.
+    """
+    runner, stop = asyncio.Runner(), asyncio.Event()
+    page = PageServer(feed, host, growing=growing)
+    at = f"[{host}]" if ":" in host else host
+    servers: list[Server] = []
+
+    async def serve_all() -> None:
+        async with AsyncExitStack() as listening:
+            for server in servers:
+                await listening.enter_async_context(server)
             await asyncio.gather(page.read(stop), stop.wait())
 
-    thread = threading.Thread(target=lambda: asyncio.run(main()), name="page", daemon=True)
-    thread.start()
-    ready.wait()
-    error = ends.get("error")
-    if isinstance(error, OSError):
-        raise ServerError(
-            f"can not serve the page at {host}:{port}: {error.strerror}; "
-            "choose another --port, 0 for any free one"
-        )
-    shown = f"[{host}]" if ":" in host else host
+    def run() -> None:
+        with runner:
+            runner.run(serve_all())
+
+    thread = threading.Thread(target=run, name="page", daemon=True)
     try:
-        yield f"http://{shown}:{ends['port']}/"
+        servers.append(runner.run(page.start(port)))
+        url, foxglove_url = f"http://{at}:{_port_of(servers[0])}/", ""
+        if feed.foxglove is not None:
+            servers.append(runner.run(proxy(host, foxglove_port, feed.foxglove.url)))
+            foxglove_url = f"ws://{at}:{_port_of(servers[1])}"
+    except OSError as error:
+        stop.set()  # a server that listens already is closed
+        run()
+        what, number, option = (
+            ("Foxglove", foxglove_port, "--foxglove-port")
+            if servers
+            else ("the page", port, "--port")
+        )
+        raise ServerError(
+            f"can not serve {what} at {host}:{number}: {error.strerror}; choose another {option}, "
+            "0 for any free one"
+        ) from error
+    loop = runner.get_loop()
+    thread.start()
+    try:
+        yield Shown(url, foxglove_url, feed)
     finally:
-        stop = ends["stop"]
-        assert callable(stop)
-        stop()
+        loop.call_soon_threadsafe(stop.set)
         thread.join(5.0)
+
+
+def _port_of(server: Server) -> int:
+    return int(next(iter(server.sockets)).getsockname()[1])

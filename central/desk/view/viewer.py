@@ -53,7 +53,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
                 if input_ is not None and isinstance(input_[1], FusedMap) and input_[1].final:
                     final = input_[1]
                 views = viewing.take(sample, input_)
-            except Exception as error:  # what it can not draw it leaves out
+            except Exception as error:  # a message that can not be drawn is left out
                 bus.publish(boundary.note(error, sample, ""))
                 continue
             for shown in views:

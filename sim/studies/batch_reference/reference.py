@@ -25,7 +25,7 @@ from central.desk.evaluation.errors import (
     MapErrors,
     Path,
     distance_rmse,
-    interpolated,
+    interpolate_truth,
     map_errors,
     pose_errors,
 )
@@ -300,7 +300,7 @@ def _reference_figures(
         sensor = np.array([[p.x(), p.y(), p.theta()] for p in poses])
         path = Path(chain.stamps_ns, chain.of_base(sensor))
         true_path = run.robots[robot].truth
-        true_poses, seen = interpolated(true_path, path.stamps_ns)
+        true_poses, seen = interpolate_truth(true_path, path.stamps_ns)
         paths[robot] = path
         if figures["noise"] == "profile" and has_biases(chain):
             turned, offset, scaled = optimum.atPoint3(bias_key(c)).tolist()

@@ -18,7 +18,7 @@ from sim.scenarios.scenario import Scenario, loads
 from sim.scenarios.source import streams_of
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, named
-from sim.world.streams import Detections, RobotStream, WorldStreams, with_observations
+from sim.world.streams import Detections, RobotStream, WorldStreams
 from team import translate
 from team.pairs import PAIRS
 from team.wire import channels as ch
@@ -124,7 +124,7 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
         seen.stamps_ns[1:], seen.offsets[:-1], seen.ids[:rows], seen.ranges[:rows],
         seen.bearings[:rows],
     )  # fmt: skip
-    return with_observations(stream, late)
+    return replace(stream, landmark_detections=late)
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:

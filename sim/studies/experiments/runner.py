@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from sim.datasets.tables import opened
+from sim.datasets.tables import open_data_set
 from sim.studies.experiments.cases import Cases, Done
 from sim.studies.experiments.catalogue import Entry
 from sim.studies.experiments.experiment import Dataset, Experiment, Options, Outcome, Results
@@ -102,7 +102,7 @@ def _write_failures(path: Path, failures: Sequence[Done]) -> None:
 
 def dataset(path: Path) -> Dataset:
     """A data set with its checksum; raises DatasetError where there is none."""
-    with opened(str(path), "Barcodes.dat"):
+    with open_data_set(str(path), "Barcodes.dat"):
         pass
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     digest = hashlib.sha256()

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.errors import Path, interpolated
+from central.desk.evaluation.errors import Path, interpolate_truth
 from central.desk.evaluation.evaluation import Evaluation
 from central.desk.verification.recorded import Recorded
 from central.tick_fold import TickFold
@@ -150,7 +150,7 @@ def _at_truth(
     for contribution, nodes, *_ in graph.submaps:
         path = paths[contribution.robot]
         stamps = np.array([contribution.end_ns, *contribution.local.node_stamps.tolist()])
-        poses, there = interpolated(path, stamps)
+        poses, there = interpolate_truth(path, stamps)
         for node, pose, is_known in zip(nodes[1:], poses, there, strict=False):
             if is_known:
                 place(int(node), pose)

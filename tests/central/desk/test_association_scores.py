@@ -7,7 +7,7 @@ import pytest
 
 from central.desk.evaluation.association import association_json, association_result
 from central.desk.evaluation.gps import distances
-from central.desk.evaluation.log import collected
+from central.desk.evaluation.log import collect_log
 from team.config import UNNAMED
 from team.wire import channels as ch
 from team.wire import messages as m
@@ -72,7 +72,7 @@ def final(table: dict[str, list[tuple[int, int, int]]]) -> Sample:
 
 
 def scores(samples: list[Sample]) -> dict[str, Any]:
-    result = association_result(collected(samples))
+    result = association_result(collect_log(samples))
     assert result is not None
     return association_json(result)
 
@@ -126,7 +126,7 @@ def test_a_merge_of_robots_is_judged_by_the_landmarks_that_they_share(
 
 
 def test_a_run_without_labels_has_no_scores() -> None:
-    assert association_result(collected([window("r1", 0, 0, [0])])) is None
+    assert association_result(collect_log([window("r1", 0, 0, [0])])) is None
 
 
 def test_a_path_fits_a_gps_of_another_frame_with_a_lever_and_some_fixes_that_are_wrong() -> None:

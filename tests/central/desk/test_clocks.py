@@ -13,7 +13,7 @@ from central.desk.evaluation.clocks import (
     separate_times_warning,
 )
 from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.evaluation.log import collected
+from central.desk.evaluation.log import collect_log
 from central.desk.report.tables import team_rows
 from sim.cli.launch import _time_warnings
 from sim.cli.main import app
@@ -41,7 +41,7 @@ def published(world: StressWorld, place: Path) -> list[Sample]:
 
 
 def timed_of(log: list[Sample], robot: str) -> Timed:
-    (found,) = (each for (name, _), each in collected(log).timed.items() if name == robot)
+    (found,) = (each for (name, _), each in collect_log(log).timed.items() if name == robot)
     return found
 
 

@@ -7,7 +7,7 @@ from central.desk.evaluation.association import AssociationResult, Pairs
 from central.desk.evaluation.errors import map_errors
 from central.desk.evaluation.evaluation import evaluate
 from central.desk.evaluation.events import EventDetector
-from central.desk.report.identities import decision_rows, score_note, score_rows
+from central.desk.report.identities import decision_sheet, score_sheet
 from central.desk.report.tables import in_words, team_rows
 from central.desk.view.landmark_sets import sets_of
 from team.wire import channels as ch
@@ -57,7 +57,7 @@ def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why() -
     (made,) = FUSED.decisions
     waits = msgspec.structs.replace(made, kind="waits", why="evidence 3 < 12", absent=9)
     undone = msgspec.structs.replace(made, kind="undone", why="share 0.41 < 0.5")
-    rows = decision_rows([made, undone, waits])
+    rows = decision_sheet([made, undone, waits]).rows
     assert [row[0].partition(":")[0] for row in rows] == ["undone", "merge", "waits"]
     assert [row[-1] for row in rows] == ["share 0.41 < 0.5", "", "evidence 3 < 12"]
     assert rows[2][1:6] == ("0.0", "12", "40", "9", "5")
@@ -81,11 +81,11 @@ def test_the_report_has_the_scores_inside_windows_and_over_all() -> None:
         left_out=0,
         clutter_in_map=0,
     )
-    assert score_rows(found) == [
+    assert score_sheet(found).rows == [
         ("inside windows", "0.75000", "1.0000", "0.8571", "2.000 %"),
         ("over all", "0.75000", "0.5000", "0.6000", "2.000 %"),
     ]
-    assert "4 rightly, 0 wrongly; 3 attempts wait" in score_note(found)
+    assert "4 rightly, 0 wrongly; 3 attempts wait" in score_sheet(found).note
     final = Sample(ch.FINAL_MAP.key(), encoded(msgspec.structs.replace(FUSED, final=True)), 0, 0, 0)
     run = evaluate([final])
     rows = dict(team_rows(replace(run, association=found, gps_median_m=0.817)))

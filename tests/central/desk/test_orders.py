@@ -11,9 +11,8 @@ from central.config import CentralConfig
 from central.desk import orders
 from central.desk.evaluation.evaluation import evaluate
 from central.desk.evaluation.verdicts import contradicting
-from central.desk.orders import WithdrawError, give_up, withdraw
+from central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
 from central.desk.report.tables import team_rows
-from central.desk.verdicts import judge, local_landmark
 from central.node import CentralNode
 from sim.cli.main import app
 from team.wire import channels as ch
@@ -171,7 +170,7 @@ def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgeme
 
     thread = threading.Thread(target=centre, daemon=True)
     thread.start()
-    monkeypatch.setattr("sim.cli.orders.connected", lambda *_: nullcontext(MemoryBus(network)))
+    monkeypatch.setattr("sim.cli.orders.connect_bus", lambda *_: nullcontext(MemoryBus(network)))
     try:
         return CliRunner().invoke(app, ["verdict", *words, "--team", "t"])
     finally:
@@ -200,10 +199,10 @@ def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(
     assert (alone.exit_code, alone.stderr) == (0, "")
     against = said(monkeypatch, "different", *names, rests_on=both)
     assert against.exit_code == 0
-    assert "were said to be same, too; different is what holds" in against.stderr
+    assert "have an earlier verdict, same; different is what holds" in against.stderr
     in_vain = said(monkeypatch, "same", *names, rests_on=both)
     assert in_vain.exit_code == 1
-    assert "were said to be different, too, which is what holds" in in_vain.stderr
+    assert "have an earlier verdict, different, which is what holds" in in_vain.stderr
 
 
 def test_verdicts_that_contradict_each_other_over_a_third_landmark_are_named(

@@ -13,16 +13,16 @@ def presence(*behind: tuple[float, float]) -> Presence:
     """A team's drivers, so many seconds behind the wall clock at two moments that are 2 s apart."""
     found = Presence()
     for node in ("central", "robot/r1", "robot/r2", "robot/r3"):
-        found._hear(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
+        found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
     for k, each in enumerate(behind, 1):
         node = f"source/r{k}"
-        found._hear(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
+        found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
         for wall_s, late_s in zip((NOW_S, NOW_S + 2), each, strict=True):
             stamp_ns = round((wall_s - late_s) * S)
             status = m.Status(
                 stamp_ns=stamp_ns, node=node, state="measuring", figures={}, warnings=()
             )
-            found._hear(status, wall_s * S)
+            found._take_message(status, wall_s * S)
     return found
 
 

@@ -14,7 +14,7 @@ from central.desk.evaluation.evaluation import evaluate
 from central.desk.export.take_home import (
     MAP_COLUMNS,
     measurement_counts,
-    taken_home,
+    take_home,
     write_map,
     write_paths,
 )
@@ -78,7 +78,7 @@ def test_without_the_measurements_the_ends_are_what_there_is(log: list[Sample]) 
 
 
 def test_the_tables_come_back_to_the_last_bit(log: list[Sample], tmp_path: Path) -> None:
-    home = taken_home(recorded_of(log))
+    home = take_home(recorded_of(log))
     fused = evaluate(log).map
     assert fused is not None
     write_map(fused, home.measurements, tmp_path)

@@ -14,14 +14,14 @@ from mcap_protobuf.decoder import DecoderFactory
 from central.desk.drawing import ellipses
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.names import in_order
-from central.desk.view.drawn import PATH_POINTS, Track, around, landmarks_of, placed
+from central.desk.view.drawn import PATH_POINTS, Track, centre_particles, landmarks_of, place_points
 from central.desk.view.export import export_views, with_views
 from central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from team import translate
-from team.recording.check import checked
+from team.recording.check import check_log
 from team.recording.reader import open_log
 from team.recording.recorder import Recorder
 from team.robot.node import RobotNode
@@ -80,7 +80,7 @@ def test_every_view_of_the_table_is_in_an_exported_log(read):
 
 def test_the_log_with_views_is_sound_and_has_the_teams_bytes_unchanged(exported, samples):
     log = open_log(exported)
-    assert checked(log) == []
+    assert check_log(log) == []
     kept = [s for s in log.samples() if ch.VIEW.owner(s.key) is None]
     assert [(s.key, s.payload) for s in kept] == [(s.key, s.payload) for s in samples]
 
@@ -352,10 +352,10 @@ def test_a_cloud_is_drawn_around_the_robot_wherever_its_own_frame_has_drifted():
         packed = (from_floats(of.ravel()), from_floats(weights))
         return m.ParticleCloud(stamp_ns=0, robot="r1", poses=packed[0], weights=packed[1])
 
-    seen = around(cloud(poses))
+    seen = centre_particles(cloud(poses))
     np.testing.assert_allclose(np.average(seen, axis=0, weights=weights), 0.0, atol=1e-12)
-    np.testing.assert_allclose(around(cloud(drifted)), seen, atol=1e-12)
+    np.testing.assert_allclose(centre_particles(cloud(drifted)), seen, atol=1e-12)
     heading = float(np.arctan2(*(np.average(f(poses[:, 2]), weights=weights)
                                  for f in (np.sin, np.cos))))  # fmt: skip
     mean = np.average(poses[:, :2], axis=0, weights=weights)
-    np.testing.assert_allclose(placed(seen, (*mean, heading)), poses[:, :2], atol=1e-12)
+    np.testing.assert_allclose(place_points(seen, (*mean, heading)), poses[:, :2], atol=1e-12)

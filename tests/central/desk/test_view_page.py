@@ -13,18 +13,15 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from foxglove.websocket import PlaybackStatus
 from mcap.reader import make_reader
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from central.desk.view.export import with_views
-from central.desk.view.foxglove_door import refusal
-from central.desk.view.foxglove_server import Player, Views
+from central.desk.view.foxglove_proxy import VIEWERS, refusal
 from central.desk.view.layout import layout
 from central.desk.view.page_frames import PageFrames
-from central.desk.view.server import Feed, ServerError, page_files, serving
-from central.desk.view.session import Shown, session
+from central.desk.view.server import Feed, ServerError, Shown, page_files, serving, session
 from team.recording.reader import LogError
 from team.recording.recorder import Recorder
 from team.recording.tail import Tail
@@ -56,7 +53,7 @@ def log(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) -> Path
 def told(path: Path) -> list[dict[str, object]]:
     feed = Feed(Tail(path))
     while not feed.ended:
-        feed.look(growing=False)
+        feed.read_more(growing=False)
     assert feed.error is None
     return [json.loads(frame) for frame in feed.frames]
 
@@ -271,8 +268,8 @@ def test_a_port_that_is_taken_is_told_with_a_remedy(log):
 def test_a_log_that_comes_later_is_shown_when_it_is_there(log, tmp_path):
     path = tmp_path / "later.mcap"
     feed = Feed(Tail(path))
-    with serving(feed, "127.0.0.1", 0, growing=True) as url:
-        with connect(url.replace("http", "ws") + "stream") as socket:
+    with serving(feed, "127.0.0.1", 0, growing=True) as shown:
+        with connect(shown.url.replace("http", "ws") + "stream") as socket:
             path.write_bytes(log.read_bytes())
             assert json.loads(socket.recv(timeout=60))[0]["k"] == "hello"
         wait_until(lambda: feed.ended, what="the log is read")
@@ -294,25 +291,17 @@ def offered(socket, count: int) -> list[dict[str, str]]:
     return channels
 
 
-def test_foxglove_is_offered_every_view_and_may_play_the_log(shown):
-    with foxglove(shown) as socket:
-        info = json.loads(socket.recv(timeout=60))
-        assert "playbackControl" in info["capabilities"]
-        assert info["dataEndTime"]["sec"] == SECONDS - 1
-        topics = {channel["topic"] for channel in offered(socket, 13)}
-    assert {"team/crowd/view/map", "team/crowd/view/pose/r3", "team/crowd/view/team"} <= topics
-
-
-def test_of_a_growing_log_foxglove_gets_the_newest_view_at_once(log, tmp_path):
+@pytest.mark.parametrize("growing", [False, True])
+def test_foxglove_is_offered_every_view_and_receives_the_newest_at_once(log, tmp_path, growing):
     path = tmp_path / "grown.mcap"
     path.write_bytes(log.read_bytes())
-    with session(path, "127.0.0.1", 0, 0, growing=True) as found:
+    with session(path, "127.0.0.1", 0, 0, growing=growing) as found:
         wait_until(lambda: found.feed.ended, what="the log is read")
         with foxglove(found) as socket:
-            assert "playbackControl" not in json.loads(socket.recv(timeout=60))["capabilities"]
-            number = next(
-                c["id"] for c in offered(socket, 13) if c["topic"] == "team/crowd/view/team"
-            )
+            socket.recv(timeout=60)
+            numbers = {c["topic"]: c["id"] for c in offered(socket, 13)}
+            assert {"team/crowd/view/map", "team/crowd/view/pose/r3"} <= set(numbers)
+            number = numbers["team/crowd/view/team"]
             wish = {"id": 1, "channelId": number}
             socket.send(json.dumps({"op": "subscribe", "subscriptions": [wish],
                                     "channels": [wish | {"id": number}]}))  # fmt: skip
@@ -326,7 +315,7 @@ def test_of_a_growing_log_foxglove_gets_the_newest_view_at_once(log, tmp_path):
 def test_foxglove_is_for_viewers_of_this_machine(shown):
     for origin in ("https://app.foxglove.dev", "http://localhost:8080", None):
         with connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"]) as socket:
-            assert "playbackControl" in json.loads(socket.recv(timeout=60))["capabilities"]
+            assert json.loads(socket.recv(timeout=60))["op"] == "serverInfo"
     for origin in ("http://elsewhere.example", "https://app.foxglove.dev.example", "null"):
         with pytest.raises(InvalidStatus, match="403"):
             connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"])
@@ -347,50 +336,13 @@ def test_foxglove_is_for_viewers_of_this_machine(shown):
         ("127.0.0.1", "localhost:1", ["http://localhost", "http://elsewhere.example"], False),
     ],
 )
-def test_foxgloves_door_looks_at_host_and_origin(at, host, origins, let_in):
-    assert (refusal(at, host, origins) is None) == let_in
-
-
-class Told(Views):
-    """Views that note what was said."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.name("crowd")
-        self.said: list[Sample] = []
-
-    def say(self, view: Sample) -> None:
-        self.said.append(view)
+def test_foxgloves_proxy_checks_host_and_origin(at, host, origins, let_in):
+    assert (refusal(at, host, origins, VIEWERS) is None) == let_in
 
 
 @pytest.fixture(scope="module")
 def kept(samples: list[Sample]) -> list[Sample]:
     return [s for s in with_views(samples) if ch.VIEW.owner(s.key) is not None]
-
-
-def test_a_jump_shows_every_topic_as_it_was(kept):
-    views = Told()
-    player = Player(views, kept)
-    views.said.clear()
-    player.ask(30_500_000_000, 1.0, play=False)
-    state = player.state()
-    assert (state.current_time, state.status) == (30_500_000_000, PlaybackStatus.Paused)
-    newest = {view.key: view for view in kept if view.stamp_ns <= 30_500_000_000}
-    assert {view.key: view for view in views.said} == newest
-    assert player.turn(1.0) is False
-
-
-def test_playing_says_each_view_once_at_its_time(kept):
-    views = Told()
-    player = Player(views, kept)
-    player.ask(0, 10.0, play=True)
-    views.said.clear()
-    assert player.turn(2.0)
-    assert views.said == [v for v in kept if 0 < v.stamp_ns <= 20_000_000_000]
-    while player.turn(1.0):
-        pass
-    assert views.said == [v for v in kept if v.stamp_ns > 0]
-    assert player.state().status == PlaybackStatus.Ended
 
 
 # The layout.

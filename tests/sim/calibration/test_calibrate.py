@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from central.desk.evaluation.errors import Path, on_circle
 from sim.calibration import join
-from sim.calibration.calibrate import Calibration, calibrated
+from sim.calibration.calibrate import Calibration, calibrate_models
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import (
     CalibrationError,
     Figure,
     groups_of,
-    jackknifed,
+    jackknife,
     with_figures,
 )
 from sim.calibration.join import joined_team
@@ -33,13 +33,11 @@ from sim.recorded.streams import recorded_streams
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.world.config import SimulatedWorld, UtiasWorld
 from sim.world.streams import (
-    ODOMETRY,
     Detections,
     Intervals,
     RobotStream,
     WorldStreams,
     grouped,
-    robot_stream,
 )
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
@@ -142,7 +140,7 @@ def bases() -> list[Reference]:
 def test_the_odometrys_figures_come_out_of_measurements_within_their_uncertainty(
     bases: list[Reference],
 ) -> None:
-    found = by_name(jackknifed(lambda part: fit_motion(part, None), bases, MOTION_UNITS))
+    found = by_name(jackknife(lambda part: fit_motion(part, None), bases, MOTION_UNITS))
     true = {"forward_scale": 1.05, "turn_drag": 0.1, "yaw_scale": 0.9, "veer": -0.03}
     for name, value in true.items():
         figure = found[name]
@@ -155,7 +153,7 @@ def test_the_odometrys_figures_come_out_of_measurements_within_their_uncertainty
 def test_the_scale_of_slow_speeds_is_learnt_where_robots_creep() -> None:
     creeping = [driven(seed, speeds=(0.0, 0.01, 0.08)) for seed in range(1, 6)]
     assert creep(creeping, 0.015)
-    found = by_name(jackknifed(lambda part: fit_motion(part, None, 0.015), creeping, MOTION_UNITS))
+    found = by_name(jackknife(lambda part: fit_motion(part, None, 0.015), creeping, MOTION_UNITS))
     for name, value in {"forward_scale": 1.05, "turn_drag": 0.1, "slow_scale": 2.4}.items():
         assert abs(found[name].value - value) < 4.0 * found[name].sigma + 1e-3, found[name]
     assert found["slow_scale"].sigma < 0.1
@@ -183,7 +181,7 @@ def test_a_turn_of_the_odometry_that_is_not_the_robots_own_is_found_out(
 
 def test_the_sensors_figures_come_out_of_measurements_within_their_uncertainty() -> None:
     data = [seeing(seed) for seed in range(1, 6)]
-    found = by_name(jackknifed(fit_sensor, data, SENSOR_UNITS))
+    found = by_name(jackknife(fit_sensor, data, SENSOR_UNITS))
     true = {"range_scale": 0.95, "range_offset": 0.1, "bearing_offset": 0.02}
     for name, value in true.items():
         assert abs(found[name].value - value) < 4.0 * found[name].sigma + 1e-4, found[name]
@@ -204,7 +202,7 @@ def test_white_errors_are_not_taken_for_a_correlation_that_is_gone_by_the_next_m
 
 def test_leaving_out_gives_the_standard_error_of_a_mean(bases: list[Reference]) -> None:
     marks = {each.name: float(i**2) for i, each in enumerate(bases)}
-    (figure,) = jackknifed(
+    (figure,) = jackknife(
         lambda part: {"mean": float(np.mean([marks[each.name] for each in part]))},
         bases,
         {"mean": "m"},
@@ -219,7 +217,7 @@ def test_what_hangs_on_one_group_is_no_figure(bases: list[Reference]) -> None:
         marker = {"marker": 2.0} if bases[0].name in [each.name for each in part] else {}
         return {"scale": float(len(part)), **marker}
 
-    assert [figure.name for figure in jackknifed(fit, bases, {"scale": "", "marker": "m"})] == [
+    assert [figure.name for figure in jackknife(fit, bases, {"scale": "", "marker": "m"})] == [
         "scale"
     ]
 
@@ -279,7 +277,7 @@ def spinning(seed: int, *, turns_first: bool) -> Reference:
 @pytest.mark.parametrize("turns_first", [True, False])
 def test_two_robots_that_turn_as_far_as_they_like_are_calibrated(turns_first: bool) -> None:
     data = [spinning(seed, turns_first=turns_first) for seed in (1, 2)]
-    found = by_name(jackknifed(lambda part: fit_motion(part, None), data, MOTION_UNITS))
+    found = by_name(jackknife(lambda part: fit_motion(part, None), data, MOTION_UNITS))
     assert found["forward_scale"].value == pytest.approx(1.05, abs=0.01)
     assert found["yaw_scale"].value == pytest.approx(0.95, abs=0.005)
     assert found["turn_drag"].value < 0.005
@@ -334,11 +332,10 @@ def test_the_joined_teams_paths_and_landmarks_lie_where_the_robots_were() -> Non
 def test_a_team_without_submaps_is_an_error_with_a_text() -> None:
     team = scenario(robots=2)
     world = streams(team)
-    standing = []
-    for stream in world.streams:
-        left = stream.kinds != ODOMETRY
-        kinds, stamps, rows = (each[left] for each in (stream.kinds, stream.stamps_ns, stream.rows))
-        standing.append(replace(stream, kinds=kinds, stamps_ns=stamps, rows=rows))
+    standing = [
+        replace(s, intervals=s.intervals.where(np.zeros(len(s.intervals.end_ns), np.bool_)))
+        for s in world.streams
+    ]
     with pytest.raises(CalibrationError, match="no robot has odometry and measurements"):
         joined_team(replace(world, streams=tuple(standing)), team)
 
@@ -355,15 +352,7 @@ def logged_often(world: WorldStreams, pieces: int) -> WorldStreams:
         often = Intervals(
             ends, durations, np.repeat(each.forward, pieces), np.repeat(each.yaw_rate, pieces)
         )
-        return robot_stream(
-            robot=stream.robot,
-            start_ns=int(ends[0] - step[0]),
-            start=stream.start,
-            intervals=often,
-            observations=stream.landmark_detections,
-            sightings=stream.teammate_detections,
-            teammates=stream.teammates,
-        )
+        return replace(stream, start_ns=int(ends[0] - step[0]), intervals=often)
 
     return replace(world, streams=tuple(of(each) for each in world.streams))
 
@@ -503,7 +492,7 @@ def test_odometry_that_does_not_fit_is_learnt_and_told_with_and_without_truth(
     team, world = slipping
     told: list[str] = []
     world = world if by_truth else replace(world, landmarks=None)
-    found = calibrated([("a log", world)], team, told.append)
+    found = calibrate_models([("a log", world)], team, told.append)
     assert found.by_truth == by_truth
     assert told
     motion = by_name(found.motion)
@@ -535,7 +524,7 @@ def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_
 def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path: File) -> None:
     team = scenario()
     with pytest.raises(CalibrationError, match="30 needed"):
-        calibrated([("a log", streams(team))], team, lambda text: None)
+        calibrate_models([("a log", streams(team))], team, lambda text: None)
     result = CliRunner().invoke(app, ["calibrate", "a.zip", "-o", str(tmp_path / "a.json")])
     assert result.exit_code == 2
     assert "ends in .toml" in result.output

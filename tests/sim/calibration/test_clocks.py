@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim.calibration import calibrate
-from sim.calibration.calibrate import Calibration, against_truth, calibrated
+from sim.calibration.calibrate import Calibration, against_truth, calibrate_models
 from sim.calibration.clocks import Clock, clocks_of, on_one_clock
 from sim.calibration.figures import Figure
 from sim.calibration.scenario import scenario_toml, within
@@ -57,7 +57,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
     right, late = (opened(place) for place in places)
     begun = msgspec.structs.replace(late.robots[1], clock_offset_s=0.1)
     scenario = msgspec.structs.replace(late, robots=(late.robots[0], begun))
-    found = calibrated([("late", streams_of(scenario))], scenario, lambda _: None)
+    found = calibrate_models([("late", streams_of(scenario))], scenario, lambda _: None)
     assert found.clocks["r1"].value == 0.0
     figure = found.clocks["r2"]
     assert abs(figure.value - OFFSET_S) < max(3.0 * figure.sigma, 0.01)

@@ -196,7 +196,7 @@ def test_what_is_hardly_meant_is_noted(tmp_path: Path) -> None:
     (tmp_path / "poles.csv").write_text("landmark,x_m,y_m\n1,2,3\n")
     degrees = SPEEDS.splitlines()[0] + "\n0,1,11\n1,1,11\n2,0,0\n"
     whirling = data_set(tmp_path / "w", odometry=degrees)
-    with pytest.raises(DatasetError, match="of degrees a map of columns makes radians"):
+    with pytest.raises(DatasetError, match="to convert from degrees, add a column map"):
         only(whirling)
     world = read(tmp_path, "r1", "r2")
     said = "\n".join([*world.notes, *world.streams[0].notes])
@@ -323,7 +323,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
         ),
         ("odometry", "0,1,0\n1,1,0\n", "line 1: '0' is a number, and the first line names the"),
         ("odometry", "t_s,,x_m\n0,1,0\n", "line 1: column 2 has no name"),
-        ("odometry", SPEEDS + "17e18,1,0\n", "of nanoseconds a map of columns makes seconds"),
+        ("odometry", SPEEDS + "17e18,1,0\n", "to convert from nanoseconds, add a column map"),
         (
             "odometry",
             SPEEDS.replace("t_s", "t_s,duration_s")

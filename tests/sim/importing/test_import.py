@@ -14,7 +14,7 @@ from sim.datasets.csv_table import CsvTable
 from sim.datasets.folder_writer import write_folder
 from sim.datasets.tables import DatasetError
 from sim.datasets.utias_writer import write_utias
-from sim.importing.columns import proposed
+from sim.importing.columns import propose_map
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import scenario_beside, streams_of
 from sim.world.streams import WorldStreams
@@ -267,7 +267,7 @@ def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_ex
 def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: str) -> None:
     names = header.split(",")
     columns = dict(zip(names, [[cell] for cell in row.split(",")], strict=True))
-    text, lacking = proposed({"log.csv": CsvTable("log.csv", columns, [2])})
+    text, lacking = propose_map({"log.csv": CsvTable("log.csv", columns, [2])})
     assert not lacking
     assert [each for each in expected.split("|") if each not in text] == []
 
@@ -277,10 +277,10 @@ def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: s
     [
         (
             "1763800000000",
-            "of milliseconds a map of columns makes seconds (scale = 1e-3)",
+            "to convert from milliseconds, add a column map (scale = 1e-3)",
         ),
-        ("1763800000000000", "of microseconds a map"),
-        ("1763800000000000000", "of nanoseconds a map"),
+        ("1763800000000000", "from microseconds, add a column map"),
+        ("1763800000000000000", "from nanoseconds, add a column map"),
     ],
 )
 def test_times_in_another_unit_are_refused_with_that_unit(

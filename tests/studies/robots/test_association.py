@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from central.desk.evaluation.association import AssociationResult, association_result
-from central.desk.evaluation.log import collected
+from central.desk.evaluation.log import collect_log
 from sim.in_memory.team import run_team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
@@ -37,7 +37,7 @@ def scores(estimator: str, error: float) -> AssociationResult:
         world=msgspec.structs.replace(scenario.world, steps=STEPS),
         robots=(msgspec.structs.replace(robot, sensor=sensor),),
     )
-    found = association_result(collected(run_team(scenario, streams_of(scenario))))
+    found = association_result(collect_log(run_team(scenario, streams_of(scenario))))
     assert found is not None
     return found
 

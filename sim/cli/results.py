@@ -1,0 +1,61 @@
+"""Steps of the commands that show a run's result: read it, print it, name its files."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.cli.steps import Steps
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from central.desk.evaluation.evaluation import Evaluation
+    from central.desk.report.run import Run
+    from team.recording.reader import Log
+
+
+def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":
+    """Read the contents of a report from a log; proves_ledger: prove its ledger, too."""
+    from central.desk.evaluation.history import history
+    from central.desk.export.take_home import take_home
+    from central.desk.ledger import ledger
+    from central.desk.report.run import Run
+    from central.desk.verification.recorded import RerunError, recorded
+
+    steps.begin("reading what the robots received")
+    messages = recorded(log)
+    found, why = None, Run.no_ledger
+    if proves_ledger:
+        steps.begin("proving the ledger (--no-ledger leaves it out)")
+        try:
+            found, why = ledger(messages, steps.robot), ""
+        except RerunError as error:
+            why = str(error)
+    steps.begin("smoothing the paths")
+    home = take_home(messages, steps.robot)
+    steps.begin("reading the run's history")
+    return Run(evaluation, history(log.samples()), log.metadata, found, why, home)
+
+
+def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
+    """Print the tables and the notes of a run."""
+    from central.desk.report.tables import summary_tables
+
+    for table in summary_tables(evaluation):
+        console.print(table)
+    for note in evaluation.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+
+
+def print_nis(run: "Run", console: "Console") -> None:
+    """Print the NIS per degree of freedom of every robot, where something was predicted."""
+    from central.desk.report.run import nis_line
+
+    if (line := nis_line(run.history)) is not None:
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def print_written(paths: Iterable[Path], console: "Console") -> None:
+    """Print the names of files that were written."""
+    for path in paths:
+        console.print(f"wrote {path}", highlight=False, soft_wrap=True)

@@ -1,0 +1,65 @@
+"""A robot's measurements row by row, as every data set's tables have them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64, UInt32
+
+from sim.world.streams import Detections, grouped
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Measurements of one robot in order of time; ids: landmarks, teammates by index, or subjects
+    of UTIAS (both).
+    """
+
+    stamps_ns: Int64[np.ndarray, " R"]
+    ids: UInt32[np.ndarray, " R"]
+    ranges: Float[np.ndarray, " R"]
+    bearings: Float[np.ndarray, " R"]
+    points: Float[np.ndarray, "R 2"] | None = None
+    covariances: Float[np.ndarray, "R 3"] | None = None
+
+    def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
+        """The chosen rows."""
+        return Scans(
+            self.stamps_ns[chosen],
+            self.ids[chosen],
+            self.ranges[chosen],
+            self.bearings[chosen],
+            None if self.points is None else self.points[chosen],
+            None if self.covariances is None else self.covariances[chosen],
+        )
+
+    def grouped(self) -> Detections:
+        """One message per stamp and form."""
+        return grouped(
+            self.stamps_ns, self.ids, self.ranges, self.bearings, self.points, self.covariances
+        )
+
+
+def first_of_each(
+    stamps_ns: Int64[np.ndarray, " R"],
+    ids: UInt32[np.ndarray, " R"],
+    usable: Bool[np.ndarray, " R"],
+) -> Bool[np.ndarray, " R"]:
+    """Among the usable measurements, the first of each (stamp, id)."""
+    rows = np.flatnonzero(usable)
+    order = rows[np.lexsort((ids[rows], stamps_ns[rows]))]
+    again = (np.diff(stamps_ns[order]) == 0) & (np.diff(ids[order].astype(np.int64)) == 0)
+    single = usable.copy()
+    single[order[1:][again]] = False
+    return single
+
+
+def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    """The angles in (−π, π]; those that are in it already keep their bits."""
+    turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    turned = np.where(turned == -np.pi, np.pi, turned)
+    return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
+
+
+def count_note(count: int, thing: str, what: str) -> str:
+    """A note such as "2 measurements dropped: unknown barcode"; empty for none."""
+    return f"{count} {thing}{'s' if count != 1 else ''} {what}" if count else ""
