@@ -186,7 +186,7 @@ class PageFrames:
             return
         frame = "" if self._frames.has(message.frame) else message.frame
         if stream.frame not in (None, frame):
-            self._say("frame", r=message.robot, t=self._t(message.stamp_ns))
+            self._add_frame("frame", r=message.robot, t=self._t(message.stamp_ns))
         stream.frame = frame
         x, y, heading = floats(message.pose, "pose").tolist()
         P = floats(message.covariance, "covariance").reshape(3, 3)
