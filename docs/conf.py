@@ -1,7 +1,8 @@
-"""The documentation site: `make docs` builds it without the network, and every warning is an error.
+"""Configuration of the documentation site, which `make docs` builds offline with warnings as
+errors.
 
-The pages are Markdown; the command reference comes from the commands themselves, the API reference
-from the docstrings, which are plain sentences with formulas and not reStructuredText.
+The pages are Markdown. The command reference is generated from the commands, the API reference from
+the docstrings, which are plain text with formulas and not reStructuredText.
 """
 
 import os
@@ -12,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, get_origin
 
-os.environ["NUMBA_DISABLE_JIT"] = "1"  # a kernel is then the function that is written there
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # kernels are then plain functions with docstrings
 HERE = Path(__file__).parent
 LEFT_OUT = ("sim/studies", "team/library.py")
-"""Of the API reference: programs that make the sources' tables; what has a page of its own."""
+"""Left out of the API reference: the studies, and the library, which has its own page."""
 GENERATED = HERE / "generated"
 sys.path.insert(0, str(HERE.parent))
 
@@ -63,7 +64,7 @@ python_maximum_signature_line_length = 88
 
 
 def _paragraphs(lines: list[str]) -> Iterator[list[str]]:
-    """The paragraphs of a docstring, without the empty lines between them."""
+    """Yield the paragraphs of a docstring."""
     paragraph: list[str] = []
     for line in [*lines, ""]:
         if line.strip():
@@ -74,7 +75,7 @@ def _paragraphs(lines: list[str]) -> Iterator[list[str]]:
 
 
 def _escaped(text: str) -> str:
-    """Plain text as reStructuredText: what stands in `backticks` is code, all else is itself."""
+    """Convert plain text to reStructuredText; `backticks` enclose code."""
     parts = re.split(r"`+([^`]+)`+", text)
     parts[::2] = [re.sub(r"([\\*|_`<>])", r"\\\1", part) for part in parts[::2]]
     parts[1::2] = [f"\\ ``{part}``\\ " for part in parts[1::2]]
@@ -87,7 +88,7 @@ _FIELD = re.compile(r"(?P<names>[a-zA-Z_]\w*(?:, [a-zA-Z_]\w*)*): +(?P<text>\S.*
 def _as_restructured_text(
     app: object, what: str, name: str, value: object, options: object, lines: list[str]
 ) -> None:
-    """A docstring's lines, in place: `field: meaning` becomes an entry of a list."""
+    """Convert the lines of a docstring in place; `field: meaning` becomes a list item."""
     written: list[str] = []
     for paragraph in _paragraphs(lines):
         for line in paragraph:
@@ -106,17 +107,17 @@ def _as_restructured_text(
 def _is_annotated(
     app: object, what: str, name: str, value: object, skip: bool, options: object
 ) -> bool | None:
-    """Whether a member is left out: a type with a constraint says no more than its definition."""
+    """Skip types with a constraint, whose documentation is their definition."""
     return True if get_origin(value) is Annotated else None
 
 
 def _inline(self: object, node: object) -> None:
-    """An equation within a line, as MathML."""
+    """Write an inline equation as MathML."""
     _write(self, node, "inline")
 
 
 def _block(self: object, node: object) -> None:
-    """An equation of its own, as MathML."""
+    """Write a displayed equation as MathML."""
     _write(self, node, "block")
 
 
@@ -129,7 +130,7 @@ def _write(writer: object, node: object, display: str) -> None:
 
 
 def _write_commands(app: object) -> None:
-    """The page of every command with its options, by Typer's own program for it."""
+    """Write the page of all commands with their options, by Typer."""
     GENERATED.mkdir(exist_ok=True)
     page = GENERATED / "commands.md"
     command = [sys.executable, "-m", "typer", "sim.cli.main", "utils", "docs", "--name", "teamslam"]
@@ -139,7 +140,7 @@ def _write_commands(app: object) -> None:
 
 
 def setup(app: object) -> None:
-    """Called by Sphinx."""
+    """Connect the functions of this module to Sphinx."""
     app.connect("builder-inited", _write_commands, priority=100)  # type: ignore[attr-defined]
     app.connect("autodoc-skip-member", _is_annotated)  # type: ignore[attr-defined]
     app.connect("autodoc-process-docstring", _as_restructured_text)  # type: ignore[attr-defined]
