@@ -64,7 +64,7 @@ def test_the_scenario_and_the_map_of_the_page_are_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    columns, further, own = blocks("your_data.md", "toml")
+    clock, columns, further, own = blocks("your_data.md", "toml")
     (tmp_path / "columns.toml").write_text(columns)
     assert set(load_map(tmp_path / "columns.toml")) == {"odometry", "observations"}
     (tmp_path / "further.toml").write_text(further)
@@ -74,6 +74,9 @@ def test_the_scenario_and_the_map_of_the_page_are_sound(
     scenario = load(scenario_beside("my_set"))
     assert [robot.id for robot in scenario.robots] == ["r1", "r2"]
     assert scenario.robots[0].sensor.bearing_sigma == 0.02
+    (tmp_path / "my_set" / "scenario.toml").write_text(f"{own}\n{clock}")
+    late = load(scenario_beside("my_set"))
+    assert [robot.clock_offset_s for robot in late.robots] == [0.0, 0.12]
 
 
 def test_the_bag_of_the_page_is_listed_and_imported(
