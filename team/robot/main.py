@@ -64,7 +64,7 @@ class RobotShell:
         """The shell of this process' node."""
         self.shell = shell
         shell.believed = self._believed
-        self._missing = MissingMeasurements(shell, lambda each: self.node.confirm(each))
+        self._missing = MissingMeasurements(shell, lambda each: self.node.inbox.confirm(each))
 
     def run(self) -> None:
         """Run until the final map is there."""
@@ -265,7 +265,7 @@ class RobotShell:
         if sample.key != ch.END.key():
             return False
         try:
-            last = self.node.end_in(decoded(sample.payload, m.End))
+            last = self.node.stream_end.announced_by(decoded(sample.payload, m.End))
         except WireError:
             return False
         if last not in self._doubted and len(self._doubted) >= MOST_DOUBTED:
@@ -297,7 +297,7 @@ class RobotShell:
                 self._doubted[incarnation, count] = sample
                 continue
             if count and numbers == {count - 1}:
-                self.node.confirm_end(incarnation, count)
+                self.node.stream_end.at_source = incarnation, count
             elif numbers or (count and self._source_is_there):
                 why = f"an end of {self.node.robot} at {count}, which is not its source's"
                 self.shell.boundary.refuse(sample, why)

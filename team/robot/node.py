@@ -21,6 +21,7 @@ from team.door import absurd
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.pairs import COMPARISON_ROBOT, PAIRS
 from team.registry import loaded
+from team.robot.account import StreamAccount
 from team.robot.ledger import Ledger, OnDisposition
 from team.robot.mapper import Mapper, Replaced
 from team.robot.poses import RunningPoses
@@ -81,18 +82,15 @@ class RobotNode:
         if announced is not None:
             self._announcement = msgspec.structs.replace(self._announcement, digest=announced)
         self.inbox = Inbox()
-        self._stream_end = EndOfStream(config.id, self.inbox)
+        self.stream_end = EndOfStream(config.id, self.inbox)
         digest = self._announcement.digest
         self.mapper = self.makes(
             config, exchange, digest, poses, replaced, on_window, on_disposition
         )
         self.out, self.warnings = self.mapper.out, self.mapper.warnings
-        self._incarnation = self.consumed = 0
-        self._steps_before = self._steps = 0
-        self._acknowledged = self._unreported = 0
+        self.account = StreamAccount(config.id)
         self._centre_alive: bool | None = None
         self.done = self._has_sent_done = False
-        self._dones: list[m.Done] = []
         self.finished = False
         self.final: m.FusedMap | None = None
         self.withheld = 0
@@ -126,7 +124,7 @@ class RobotNode:
 
     def request(self) -> m.MeasurementsRequest | None:
         """The measurements that are missing and must be asked for at their source."""
-        missing = self._stream_end.missing()
+        missing = self.stream_end.missing()
         if missing is None:
             return None
         incarnation, first, last = missing
@@ -144,10 +142,10 @@ class RobotNode:
         return status_of(
             self.mapper,
             "done" if self.done else "mapping" if measurements else "waiting",
-            self._steps_before + self._steps,
+            self.account.all_steps,
             measurements,
             self.withheld,
-            waits_for_driver=self._stream_end.waits_for_driver,
+            waits_for_driver=self.stream_end.waits_for_driver,
         )
 
     def begin(self) -> list[Outgoing]:
@@ -174,10 +172,9 @@ class RobotNode:
         `submaps` are those of the latest incarnation, without a gap from sequence 0.
         """
         self.mapper.resume(start, submaps)
-        self._note_incarnation(start.incarnation)
-        self.consumed = submaps[-1].last_measurement + 1
-        self._acknowledged = len(submaps)
-        self.inbox.resume(start.incarnation, self.consumed)
+        used = submaps[-1].last_measurement + 1
+        self.account.begin(start.incarnation, used, len(submaps))
+        self.inbox.resume(start.incarnation, used)
 
     def answer_submaps(self, request: bytes) -> list[bytes]:
         """The answer to `SubmapsRequest`: everything sent for fusion, also by an earlier
@@ -196,35 +193,17 @@ class RobotNode:
             case m.Measurement():
                 own = message.robot == self.robot
                 return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
-            case m.Progress() if message.incarnation == self._incarnation:
+            case m.Progress() if message.incarnation == self.account.incarnation:
                 if message.submaps > self.submaps + AHEAD:
                     return (
                         f"acknowledges {message.submaps} submaps of {self.submaps}: the centre's "
                         "set is of another run; start the centre again with a new --set FILE"
                     )
             case m.End() | m.StreamHead():
-                return self._stream_end.refusal(message)
+                return self.stream_end.refusal(message)
             case _:
                 pass
         return None
-
-    def confirm(self, measurement: m.Measurement) -> None:
-        """Note that a measurement comes in the source's own answer to a question."""
-        self.inbox.confirm(measurement)
-
-    def end_in(self, end: m.End) -> tuple[int, int]:
-        """Incarnation and measurements at which an announced end ends this robot's stream.
-
-        One that does not name the robot says that its stream has none.
-        """
-        ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self.robot]
-        return ends[0] if ends else (self.incarnation, 0)
-
-    def confirm_end(self, incarnation: int, measurements: int) -> None:
-        """Take the source's own answer that an incarnation ends so: what came behind it was not
-        the source's.
-        """
-        self._stream_end.at_source = incarnation, measurements
 
     # Receive.
 
@@ -244,20 +223,19 @@ class RobotNode:
             case m.FusedMap() if message.final:
                 self.finished, self.final = True, message
             case m.Progress():
-                if message.incarnation == self._incarnation:
-                    self._acknowledged = max(self._acknowledged, message.submaps)
+                self.account.acknowledge(message)
             case m.Rendezvous():
                 if self.robot in message.teammates:
                     self._release(())
             case m.Liveliness() if message.node == "central":
                 self._centre_alive = message.alive
             case m.Liveliness() | m.End() | m.TeamEnd():
-                self._stream_end.receive(message)
+                self.stream_end.receive(message)
             case m.StreamHead():
-                head = self._stream_end.take_head(message)
+                head = self.stream_end.take_head(message)
                 if head.state != "open":
                     self.out.append(Outgoing(ch.ROBOT_HEAD, self.robot, head))
-                if self.consumed:
+                if self.account.consumed:
                     self.report_progress()
             case _:
                 self.warnings.append(f"no use for a {type(message).__name__}")
@@ -288,28 +266,27 @@ class RobotNode:
         """Consume the measurements whose turn has come, while the centre gives credit."""
         while not self.is_held and (measurement := self.inbox.take_next()) is not None:
             self._consume(measurement)
-        if not self.done and self._stream_end.is_reached() and not self.is_held:
+        if not self.done and self.stream_end.is_reached() and not self.is_held:
             self._finish()
 
     @property
     def is_held(self) -> bool:
         """Whether the robot waits for the centre's credit; an absent one need not give any."""
-        ahead = self.mapper.submaps.sent - self._acknowledged
+        ahead = self.mapper.submaps.sent - self.account.acknowledged
         return ahead > CREDIT_SUBMAPS and bool(self._centre_alive)
 
     def _consume(self, measurement: m.Measurement) -> None:
         if isinstance(measurement, m.InitialPose):
             self._leave_incarnation()
             self.mapper.begin(measurement)
-            self._note_incarnation(measurement.incarnation)
-        self.consumed = measurement.number + 1
-        self._steps += isinstance(measurement, m.AnyOdometry)
+            self.account.begin(measurement.incarnation)
+        self.account.count(measurement)
         if self.mapper.take(measurement):
             self.report_progress()
         if isinstance(measurement, m.Sightings):
             self._release(measurement.teammates)
-        self._unreported += 1
-        if self._unreported >= PROGRESS_MEASUREMENTS:
+        self.account.unreported += 1
+        if self.account.unreported >= PROGRESS_MEASUREMENTS:
             self.report_progress()
 
     def _sound(self, out: list[Outgoing]) -> list[Outgoing]:
@@ -341,38 +318,26 @@ class RobotNode:
 
     def report_progress(self) -> None:
         """Publish how far the robot is."""
-        self._unreported = 0
+        self.account.unreported = 0
         self.out.append(Outgoing(ch.ROBOT_PROGRESS, self.robot, self.progress()))
 
     def progress(self) -> m.Progress:
         """How many measurements were consumed and submaps sent, and the time that has passed."""
-        since_ns = self.mapper.submaps.since_ns
-        return m.Progress(
-            stamp_ns=self.mapper.passed_ns if since_ns is None else since_ns,
-            node=ch.robot_node(self.robot),
-            robot=self.robot,
-            incarnation=self._incarnation,
-            measurements=self.consumed,
-            submaps=self.submaps,
-        )
+        return self.account.progress(self.mapper)
 
     # An incarnation begins and ends.
 
-    def _note_incarnation(self, incarnation: int) -> None:
-        self._incarnation, self.consumed, self._acknowledged = incarnation, 0, 0
-        self._steps_before, self._steps = self._steps_before + self._steps, 0
-
     def _leave_incarnation(self) -> None:
         """Close the current incarnation, if there is one, because a later one begins."""
-        if not self.consumed:
+        if not self.account.consumed:
             return
         if self.done:  # the driver had ended, and has come back: its last word is not the last
             self.done = self._has_sent_done = False
-            self._dones.append(self.statement())
+            self.account.ended.append(self.statement())
             return
         self._close_incarnation()
         self._release(())
-        self._dones.append(self.statement())
+        self.account.ended.append(self.statement())
         self.report_progress()
 
     def _close_incarnation(self) -> None:
@@ -389,23 +354,15 @@ class RobotNode:
 
     def _send_last_words(self) -> None:
         self._release(())
-        dones = [self.statement(), *self._dones]
+        statements = [self.statement(), *self.account.ended]
         self._has_sent_done = True
         self.report_progress()
-        self.out += (Outgoing(ch.ROBOT_DONE, self.robot, each) for each in dones)
+        self.out += (Outgoing(ch.ROBOT_DONE, self.robot, each) for each in statements)
 
     def statement(self) -> m.Done:
         """The account of the incarnation, without what was consumed behind its end."""
-        last = self._stream_end.last_of(self._incarnation)
-        return m.Done(
-            stamp_ns=self.mapper.now_ns,
-            robot=self.robot,
-            incarnation=self._incarnation,
-            measurements=self.consumed if last is None else min(self.consumed, last),
-            steps=self._steps,
-            submaps=self.submaps,
-            ledger=self.ledger.entries(),
-        )
+        last = self.stream_end.last_of(self.account.incarnation)
+        return self.account.statement(self.mapper, last)
 
 
 def robot_node(config: RobotConfig, exchange: Exchange = "continuous", **options: Any) -> RobotNode:

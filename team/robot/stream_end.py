@@ -55,6 +55,14 @@ class EndOfStream:
             robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
         )
 
+    def announced_by(self, end: m.End) -> tuple[int, int]:
+        """Incarnation and measurements at which an announced end ends this robot's stream.
+
+        One that does not name the robot says that its stream has none.
+        """
+        ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self._robot]
+        return ends[0] if ends else (self._inbox.incarnation, 0)
+
     def refusal(self, message: m.End | m.StreamHead) -> str | None:
         """Why an announced end can not be true of the stream, in words."""
         if isinstance(message, m.End):

@@ -29,7 +29,8 @@ class ExchangingRobot(RobotNode):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._centre_is_away = False
-        self._reported = 0
+        self._reported: tuple[int, int] = 0, 0
+        """An incarnation, and its number of measurements that were reported ahead of their use."""
 
     def receive(self, message: m.Message) -> None:
         """Take a message that is no measurement."""
@@ -71,27 +72,24 @@ class ExchangingRobot(RobotNode):
         measurements for its map, or the end.
         """
         super().consume()
-        received = self.inbox.received
         if not self.mapper.exchange.lockstep or not self.is_held:
             return
-        ahead = received - max(self._reported, self.consumed)
-        if ahead >= product.PROGRESS_MEASUREMENTS:
-            self._reported = received
+        received = self.inbox.received
+        if received - self.progress().measurements >= product.PROGRESS_MEASUREMENTS:
+            self._reported = self.account.incarnation, received
             self.report_progress()
 
     def progress(self) -> m.Progress:
         """How many measurements were consumed or reported ahead, and the time that has passed."""
         progress = super().progress()
-        count = max(progress.measurements, self._reported)
+        incarnation, reported = self._reported
+        ahead = reported if incarnation == progress.incarnation else 0
+        count = max(progress.measurements, ahead)
         return msgspec.structs.replace(progress, measurements=count)
 
     def statement(self) -> m.Done:
         """The account of the incarnation, with the sequence of its last map."""
         return msgspec.structs.replace(super().statement(), last_map=self.mapper.exchange.last)
-
-    def _note_incarnation(self, incarnation: int) -> None:
-        super()._note_incarnation(incarnation)
-        self._reported = 0
 
     def _close_incarnation(self) -> None:
         super()._close_incarnation()
