@@ -146,7 +146,7 @@ def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
     sources = sources_of("sim.studies.experiments.team_runs", ROOTS)
     wanted = {
         "team.estimation.hybrid_slam.fastslam_kernel",
-        "central.join_rule",
+        "central.submap_fold",
         "sim.studies.rules.svd_rule",  # found by the name that a table gives
         "sim.studies.batch_reference.graph",
         "sim",
