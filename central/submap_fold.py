@@ -123,8 +123,7 @@ class SubmapFold:
             s for s, chain in chains.items() if len(chain) > self._filed.get(s, 0)
         ):
             filed = self._filed.get(stream, 0)
-            start = translate.start_of(store.start(stream))
-            if not filed and start is not None:
+            if not filed and (start := translate.start_of(store.start(stream))) is not None:
                 ticks.add_start(start)
             for submap in chains[stream][filed:]:
                 sightings = store.sightings(submap)

@@ -121,6 +121,19 @@ def test_submaps_that_are_announced_but_not_here_hold_the_watermark():
     assert centre.maps[0].members == (m.VersionEntry(robot="r1", incarnation=1, sequence=2),)
 
 
+def test_a_set_that_is_handed_in_again_gives_the_same_final_map_and_closes_nothing_before():
+    members = [*STARTS.values(), *SUBMAPS.every(), done("r1"), done("r2")]
+    centre = joined()
+    centre.hears(progress("r1", 12, 4), progress("r2", 12, 4), *members, END)
+    first = centre.final
+    centre.node.restart()
+    assert not centre.node.finished
+    out = centre.hears(*STARTS.values(), SUBMAPS["r1"][0], SUBMAPS["r2"][0])
+    assert of(out, ch.FUSED_MAP) == [], "the progress of before covers submaps that are missing"
+    (final,) = of(centre.hears(*members), ch.FINAL_MAP)
+    assert encoded(final) == encoded(first)
+
+
 def test_a_submap_is_acknowledged_after_the_map_that_it_gave():
     centre = joined(robots=("r1",))
     centre.hears(alive("r2"), alive("r2", here=False), progress("r1", 3, 1))
