@@ -9,6 +9,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
+from tests import build
 from tests.support import fused_map
 
 S = 1_000_000_000
@@ -48,14 +49,7 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
             Outgoing(
                 ch.START,
                 name,
-                m.InitialPose(
-                    stamp_ns=0,
-                    robot=name,
-                    incarnation=1,
-                    number=0,
-                    pose=from_floats([0, 0, 0]),
-                    covariance=b"",
-                ),
+                build.initial_pose(robot=name, pose=from_floats([0, 0, 0])),
             )
         )
     phase = rng.uniform(0.0, 2.0 * np.pi, robots)
@@ -74,11 +68,9 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
             truth = m.Truth(
                 stamp_ns=at, robot=name, stamps=from_stamps([at]), poses=from_floats(true)
             )
-            pose = m.PoseEstimate(
+            pose = build.pose_estimate(
                 stamp_ns=at,
                 robot=name,
-                incarnation=1,
-                sequence=0,
                 map_digest=b"12345678",
                 pose=from_floats(said),
                 covariance=P,

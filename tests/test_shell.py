@@ -13,6 +13,7 @@ from team.shell import BACK_S, RECORDER, RECORDER_S, Shell, process
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from tests import build
 
 
 class Waiting:
@@ -28,13 +29,7 @@ class Waiting:
         return []
 
     def status(self) -> m.Status:
-        return m.Status(
-            stamp_ns=0,
-            node="world",
-            state=self.state,
-            figures={},
-            warnings=("waiting for robot/r2",),
-        )
+        return build.status(node="world", state=self.state, warnings=("waiting for robot/r2",))
 
 
 def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from team.store import SubmapStore
 from team.wire import messages as m
+from tests import build
 from tests.support import packed, spd, submap
 
 CHAIN = [submap(i) for i in range(6)]
@@ -84,7 +85,7 @@ def test_another_incarnation_is_another_stream():
 
 def sighting(i, stamp=1, teammate="bravo", measurements=(3,)):
     stamp_ns = i * 1_000_000 + stamp
-    return m.SightingFactor(
+    return build.sighting_factor(
         stamp_ns=stamp_ns,
         robot="alpha",
         incarnation=0,

@@ -12,10 +12,10 @@ from team.config import UNNAMED, RobotConfig
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from team.estimation.submap import LocalMap, Unnamed
-from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import decoded, encoded
 from team.wire.digest import NO_MAP, configured, digest_of
+from tests import build
 from tests.estimation.submap_world import correlated
 
 
@@ -105,14 +105,7 @@ def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
 def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
     spread = b"" if covariance is None else from_floats(covariance)
     start = translate.start_of(
-        m.InitialPose(
-            stamp_ns=0,
-            robot="r1",
-            incarnation=1,
-            number=0,
-            pose=from_floats([1.0, 2.0, 3.0]),
-            covariance=spread,
-        )
+        build.initial_pose(pose=from_floats([1.0, 2.0, 3.0]), covariance=spread)
     )
     np.testing.assert_array_equal(start.pose, [1.0, 2.0, 3.0])
     np.testing.assert_equal(start.covariance, covariance)
@@ -120,24 +113,14 @@ def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
 
 
 def test_an_unknown_start_is_none():
-    unknown = m.InitialPose(
-        stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b""
-    )
+    unknown = build.initial_pose()
     assert translate.start_of(unknown) is None
     assert translate.pose_of(unknown) == (None, None)
 
 
 def estimate(covariance, *, joint):
-    return m.MapEstimate(
-        stamp_ns=0,
-        robot="r1",
-        incarnation=1,
-        sequence=0,
-        exchange=0,
-        joint=joint,
-        ids=from_ids([3, 9]),
-        means=from_floats(np.arange(4.0)),
-        covariance=covariance,
+    return build.map_estimate(
+        joint=joint, ids=from_ids([3, 9]), means=from_floats(np.arange(4.0)), covariance=covariance
     )
 
 
@@ -207,10 +190,7 @@ def test_every_field_of_a_configuration_changes_its_digest():
 
 
 def test_a_scan_is_in_the_machines_byte_order_and_writable_by_nobody_elses_hand():
-    message = m.Observations(
-        stamp_ns=0,
-        robot="r1",
-        incarnation=1,
+    message = build.observations(
         number=1,
         ids=from_ids([4, 2]),
         ranges=from_floats([1.5, 2.5]),

@@ -17,6 +17,7 @@ from team.wire import messages as m
 from team.wire.arrays import floats, from_ids, ids
 from team.wire.bus import Outgoing
 from team.wire.newer import is_newer_map
+from tests import build
 from tests.teams import config, published, stream
 
 STEPS = 9
@@ -99,14 +100,7 @@ class Team:
                 self.take(self.robots[each.name].handle(self.credit(each.message), 0))
 
     def credit(self, submap: m.Submap) -> m.Progress:
-        return m.Progress(
-            stamp_ns=0,
-            node="central",
-            robot=submap.robot,
-            incarnation=1,
-            measurements=0,
-            submaps=submap.sequence + 1,
-        )
+        return build.progress(node="central", robot=submap.robot, submaps=submap.sequence + 1)
 
     def order_without(self, name: str) -> None:
         order = m.Withdrawal(stamp_ns=0, robot=name, by="operator", reason="a test")
@@ -291,17 +285,8 @@ def test_a_restarted_process_withdraws_what_the_one_before_it_has_claimed(restar
 
 
 def test_a_prior_that_withdraws_contains_no_estimate():
-    prior = m.Prior(
-        stamp_ns=0,
-        robot="alpha",
-        incarnation=1,
-        sequence=-1,
-        digest=bytes(8),
-        ids=b"",
-        mean=b"",
-        covariance=b"",
-        frame="alpha/1",
-        in_team_frame=False,
+    prior = build.prior(
+        robot="alpha", sequence=-1, ids=b"", mean=b"", frame="alpha/1", in_team_frame=False
     )
     prior.check()
     with pytest.raises(ValueError, match="contains an estimate"):

@@ -13,6 +13,7 @@ from team.driver.node import SourceNode
 from team.driver.order import Sorter
 from team.wire import messages as m
 from team.wire.codec import encoded
+from tests import build
 
 LATENCY_NS = 200_000_000
 
@@ -176,12 +177,8 @@ def test_nobody_has_consumed_more_than_the_driver_has_numbered(tmp_path):
     node = SourceNode(filled(tmp_path / "r1.stream"))
     node.listening = False
     here = node.journal.count(1)
-    whole = m.Progress(
-        stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=here, submaps=0
-    )
-    done = m.Done(
-        stamp_ns=0, robot="r1", incarnation=2, measurements=0, steps=0, submaps=0, ledger=()
-    )
+    whole = build.progress(measurements=here)
+    done = build.done(incarnation=2)
     assert node.refusal(whole) is None
     for far in (
         msgspec.structs.replace(whole, measurements=here + 1),

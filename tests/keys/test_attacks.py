@@ -26,6 +26,7 @@ from team.wire.codec import encoded
 from team.wire.zenoh import session
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.keys.certificates import TEAM, Folders
 from tests.support import examples, odometry, submap, wait_until
 
@@ -47,16 +48,12 @@ ATTACKS = {
     "says that another is done": (
         ch.ROBOT_DONE,
         "r1",
-        m.Done(
-            stamp_ns=0, robot="r1", incarnation=HUGE, measurements=0, steps=0, submaps=0, ledger=()
-        ),
+        build.done(incarnation=HUGE),
     ),
     "frees another's credit": (
         ch.ROBOT_PROGRESS,
         "r1",
-        m.Progress(
-            stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=HUGE, submaps=HUGE
-        ),
+        build.progress(measurements=HUGE, submaps=HUGE),
     ),
     "orders a withdrawal": (
         ch.ORDER,
@@ -79,9 +76,7 @@ ATTACKS = {
     "takes the recorder's place": (
         ch.RECORDER_PROGRESS,
         "r1",
-        m.Progress(
-            stamp_ns=0, node="recorder", robot="r1", incarnation=1, measurements=HUGE, submaps=HUGE
-        ),
+        build.progress(node="recorder", measurements=HUGE, submaps=HUGE),
     ),
     "gives the truth": (ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth))),
 }

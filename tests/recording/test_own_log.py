@@ -7,11 +7,11 @@ from team.recording.merge import merge
 from team.recording.own_log import own_log
 from team.recording.reader import open_log
 from team.wire import channels as c
-from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.support import odometry, received, submap
 
 
@@ -48,9 +48,7 @@ def test_what_a_robot_has_asked_for_is_in_its_own_log_and_what_a_death_cost_it_i
         thread.start()
         with ZenohBus("t", at) as robot:
             robot.tap = log
-            wanted = m.MeasurementsRequest(
-                stamp_ns=0, robot="alpha", incarnation=1, first=1, last=5
-            )
+            wanted = build.measurements_request(robot="alpha", first=1, last=5)
             for _ in range(2):
                 assert len(robot.ask(c.MEASUREMENTS, "alpha", wanted, 10.0)) == 3
         answering.set()

@@ -23,6 +23,7 @@ from team.wire.codec import decoded, encoded
 from team.wire.zenoh.attachment import Attachment, pack
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.support import Link, examples, odometry, received, submap, wait_until
 
 FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
@@ -121,7 +122,7 @@ def test_a_new_incarnation_counts_from_zero(path: Path) -> None:
     with Recorder(path, "t", {}) as recorder:
         loop = RecordLoop(bus, recorder, ())
         for incarnation, measurement in ((0, 0), (0, 1), (3, 0)):
-            message = m.Odometry(
+            message = build.odometry(
                 stamp_ns=7,
                 robot="alpha",
                 incarnation=incarnation,
@@ -134,12 +135,8 @@ def test_a_new_incarnation_counts_from_zero(path: Path) -> None:
         loop.take(bus.receive())
         loop.take([])
     assert messages_of(world.receive(), c.RECORDER_PROGRESS) == [
-        m.Progress(
-            stamp_ns=7, node="recorder", robot="alpha", incarnation=0, measurements=2, submaps=0
-        ),
-        m.Progress(
-            stamp_ns=7, node="recorder", robot="alpha", incarnation=3, measurements=1, submaps=0
-        ),
+        build.progress(stamp_ns=7, node="recorder", robot="alpha", incarnation=0, measurements=2),
+        build.progress(stamp_ns=7, node="recorder", robot="alpha", incarnation=3, measurements=1),
     ]
 
 

@@ -13,6 +13,7 @@ from team.estimation.plausible import prior_beyond
 from team.robot.team_map import CONDENSED, TeamMap
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
+from tests import build
 from tests.estimation.submap_world import team
 from tests.support import packed, spd
 
@@ -20,8 +21,7 @@ LOCALS = [each.local for each in team(1, robots=1, submaps=6).submaps]
 
 
 def prior(sequence: int) -> m.Prior:
-    return m.Prior(
-        stamp_ns=0,
+    return build.prior(
         robot="r0",
         incarnation=0,
         sequence=sequence,

@@ -18,6 +18,7 @@ from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import encoded
 from team.wire.digest import configured
+from tests import build
 from tests.support import fused_map
 
 STEPS = 20
@@ -96,15 +97,7 @@ def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoin
         Outgoing(
             channel,
             "r1",
-            m.PoseEstimate(
-                stamp_ns=t,
-                robot="r1",
-                incarnation=1,
-                sequence=0,
-                map_digest=bytes(8),
-                pose=from_floats(p),
-                covariance=unit,
-            ),
+            build.pose_estimate(stamp_ns=t, pose=from_floats(p), covariance=unit),
         )
         for t, p in zip(ends, poses, strict=True)
     ]

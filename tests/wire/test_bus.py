@@ -23,6 +23,7 @@ from team.wire.bus import (
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.support import odometry, received, submap, wait_until
 
 Joined = Callable[[], Bus]
@@ -125,9 +126,7 @@ def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined: Joine
             (
                 c.WORLD_CONFIG,
                 "",
-                m.Configuration(
-                    stamp_ns=i, node="world", incarnation=0, digest=b"configur", configuration="{}"
-                ),
+                build.configuration(stamp_ns=i, node="world", incarnation=0, digest=b"configur"),
             ),
         )
     late = joined()
@@ -150,9 +149,7 @@ def test_order_holds_across_keys_and_deliveries(joined: Joined) -> None:
         sink.subscribe(channel, "alpha")
     until_heard(source, sink)
     for i in range(300):
-        progress = m.Progress(
-            stamp_ns=i, node="robot/alpha", robot="alpha", incarnation=0, measurements=i, submaps=0
-        )
+        progress = build.progress(stamp_ns=i, robot="alpha", incarnation=0, measurements=i)
         send(
             source,
             (c.ODOMETRY, "alpha", odometry(i)),

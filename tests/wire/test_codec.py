@@ -19,6 +19,7 @@ from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.channels import OBSERVATIONS
 from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
 from team.wire.structure import MOST_VALUES, SMALL
+from tests import build
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 
 EXAMPLES = {m.tag_of(type(message)): message for message in examples()}
@@ -61,9 +62,7 @@ def test_appended_fields_are_ignored(tag: str) -> None:
 
 
 def test_a_last_word_from_before_the_last_map_has_none() -> None:
-    done = m.Done(
-        stamp_ns=0, robot="alpha", incarnation=1, measurements=2, steps=1, submaps=1, ledger=()
-    )
+    done = build.done(robot="alpha", measurements=2, steps=1, submaps=1)
     assert decoded(msgpack.packb(fields_of(done)[:-1])) == done
     assert done.last_map == -1
 
@@ -203,7 +202,7 @@ def test_odometry_comes_back_as_it_went(
     forward: float,
     rate: float,
 ) -> None:
-    message = m.Odometry(
+    message = build.odometry(
         stamp_ns=stamp,
         robot=robot,
         incarnation=incarnation,
@@ -225,7 +224,7 @@ def test_odometry_comes_back_as_it_went(
 )
 def test_observations_come_back_as_they_went(seen: list[tuple[int, float, float]]) -> None:
     ids, ranges, bearings = zip(*seen, strict=True) if seen else ((), (), ())
-    message = m.Observations(
+    message = build.observations(
         stamp_ns=5,
         robot="alpha",
         incarnation=0,
@@ -242,7 +241,7 @@ def test_observations_come_back_as_they_went(seen: list[tuple[int, float, float]
 def test_submaps_come_back_as_they_went(ids: set[int], seed: int) -> None:
     n = 3 + 2 * len(ids)
     root = np.random.default_rng(seed).normal(size=(n, n))
-    message = m.Submap(
+    message = build.submap(
         stamp_ns=20,
         robot="alpha",
         incarnation=0,
@@ -267,9 +266,7 @@ def test_submaps_come_back_as_they_went(ids: set[int], seed: int) -> None:
 def test_statuses_come_back_as_they_went(
     state: str, figures: dict[str, float], warnings: list[str]
 ) -> None:
-    message = m.Status(
-        stamp_ns=0, node="central", state=state, figures=figures, warnings=tuple(warnings)
-    )
+    message = build.status(node="central", state=state, figures=figures, warnings=tuple(warnings))
     assert decoded(encoded(message), m.Status) == message
 
 

@@ -11,6 +11,7 @@ from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, shown
 from team.wire.codec import encoded
 from team.wire.text import lines, one_line, readable
+from tests import build
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\r\n[  1.0 s] forged line"
 PRINTABLE = r"\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\x0d\x0a[  1.0 s] forged line"
@@ -53,8 +54,8 @@ def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
 
 
 def hostile_status() -> m.Status:
-    return m.Status(
-        stamp_ns=0, node="robot/r1", state=HOSTILE, figures={HOSTILE: 1.0}, warnings=(HOSTILE,) * 2
+    return build.status(
+        node="robot/r1", state=HOSTILE, figures={HOSTILE: 1.0}, warnings=(HOSTILE,) * 2
     )
 
 
@@ -74,9 +75,7 @@ def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message
     assert texts == [PRINTABLE] * 4
     assert readable(message) is message
     json = '{\n  "a": 1}'
-    configured = m.Configuration(
-        stamp_ns=0, node="robot/r1", incarnation=0, digest=bytes(8), configuration=json
-    )
+    configured = build.configuration(node="robot/r1", incarnation=0, configuration=json)
     key = ch.ROBOT_CONFIG.key("r1")
     assert shown(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, "is data, not words"
 

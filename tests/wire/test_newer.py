@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from team.wire import messages as m
 from team.wire.newer import further, is_newer_map, is_newer_prior, later_end
+from tests import build
 from tests.support import examples
 
 PRIOR = next(each for each in examples() if isinstance(each, m.Prior))
@@ -62,13 +63,8 @@ def test_a_later_life_of_the_stream_and_a_settled_map_of_the_same_set_are_newer(
 
 
 def progress(stamp_ns: int, incarnation: int, measurements: int, submaps: int) -> m.Progress:
-    return m.Progress(
-        stamp_ns=stamp_ns,
-        node="robot/r1",
-        robot="r1",
-        incarnation=incarnation,
-        measurements=measurements,
-        submaps=submaps,
+    return build.progress(
+        stamp_ns=stamp_ns, incarnation=incarnation, measurements=measurements, submaps=submaps
     )
 
 

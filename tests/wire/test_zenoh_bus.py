@@ -24,6 +24,7 @@ from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.recovery import Heartbeat, Recovery
 from team.wire.zenoh.router import router
 from team.wire.zenoh.session import client
+from tests import build
 from tests.support import (
     ROOT,
     Link,
@@ -66,9 +67,7 @@ def progress(i: int) -> Outgoing:
     return Outgoing(
         c.ROBOT_PROGRESS,
         "alpha",
-        m.Progress(
-            stamp_ns=i, node="robot/alpha", robot="alpha", incarnation=0, measurements=i, submaps=0
-        ),
+        build.progress(stamp_ns=i, robot="alpha", incarnation=0, measurements=i),
     )
 
 
@@ -172,15 +171,7 @@ def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None
             Outgoing(
                 c.ROBOT_DONE,
                 "alpha",
-                m.Done(
-                    stamp_ns=0,
-                    robot="alpha",
-                    incarnation=0,
-                    measurements=9,
-                    steps=9,
-                    submaps=1,
-                    ledger=(),
-                ),
+                build.done(robot="alpha", incarnation=0, measurements=9, steps=9, submaps=1),
             )
         )
         link.mend()
@@ -195,12 +186,10 @@ def test_a_killed_process_loses_its_token(endpoint: str) -> None:
     )
     with ZenohBus("t", endpoint) as watcher, python(program) as child:
         watcher.watch_alive()
-        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(
-            stamp_ns=0, node="robot/alpha", alive=True
-        )
+        assert opened(received(watcher, 1)[0])[2] == build.liveliness(node="robot/alpha")
         child.kill()
-        assert opened(received(watcher, 1)[0])[2] == m.Liveliness(
-            stamp_ns=0, node="robot/alpha", alive=False
+        assert opened(received(watcher, 1)[0])[2] == build.liveliness(
+            node="robot/alpha", alive=False
         )
 
 

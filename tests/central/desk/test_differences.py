@@ -5,17 +5,14 @@ import msgspec
 from central.desk.verification.differences import first_difference
 from team.wire import messages as m
 from team.wire.arrays import from_floats
+from tests import build
 from tests.support import packed, spd
 
 
 def prior(value: float) -> m.Prior:
     bias = m.BiasEstimate(robot="r1", incarnation=0, bias="bearing", value=value, sigma=0.1)
-    return m.Prior(
-        stamp_ns=0,
-        robot="r1",
+    return build.prior(
         incarnation=0,
-        sequence=0,
-        digest=bytes(8),
         ids=b"",
         mean=from_floats([0.0] * 3),
         covariance=packed(spd(3)),

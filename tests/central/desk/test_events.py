@@ -7,6 +7,7 @@ from central.desk.evaluation.history import history
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing
+from tests import build
 from tests.sim.logs import samples
 from tests.support import fused_map
 
@@ -29,9 +30,7 @@ def test_a_robot_joins_is_lost_and_comes_back() -> None:
 
 
 def test_a_robot_that_is_done_leaves() -> None:
-    done = m.Done(
-        stamp_ns=0, robot="r1", incarnation=1, measurements=1200, steps=5, submaps=4, ledger=()
-    )
+    done = build.done(measurements=1200, steps=5, submaps=4)
     assert told(alive(True), done, done, alive(False))[1:] == [
         ("done", "r1 has taken all its 1,200 measurements, 4 submaps"),
         ("left", "r1 left"),
@@ -111,12 +110,8 @@ def test_a_withdrawal_is_told_once_with_its_reason() -> None:
 
 
 def status(refused: int, *warnings: str) -> m.Status:
-    return m.Status(
-        stamp_ns=0,
-        node="central",
-        state="joining",
-        figures={"refused": float(refused)},
-        warnings=warnings,
+    return build.status(
+        node="central", state="joining", figures={"refused": float(refused)}, warnings=warnings
     )
 
 
@@ -140,9 +135,7 @@ def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
         m.InitialPose(stamp_ns=9, robot="r1", incarnation=n, number=0, pose=b"", covariance=b"")
         for n in (1, 2)
     )
-    configured = m.Configuration(
-        stamp_ns=0, node="robot/r1", incarnation=0, digest=bytes(8), configuration="{}"
-    )
+    configured = build.configuration(node="robot/r1", incarnation=0)
     assert told(first, first, again, again) == [
         ("restarted", "the stream of r1 begins anew, incarnation 2")
     ]

@@ -16,6 +16,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import Outgoing, Sample, opened
+from tests import build
 from tests.sim.logs import final_map, joined_log, samples, scenario, streams
 from tests.support import fused_map, submap
 
@@ -70,14 +71,8 @@ def measurement(k: int, wall_ms: int) -> Sample:
             Outgoing(
                 ch.ODOMETRY,
                 "r1",
-                m.Odometry(
-                    stamp_ns=k * MS,
-                    robot="r1",
-                    incarnation=0,
-                    number=k,
-                    duration_ns=MS,
-                    forward=0.5,
-                    yaw_rate=0.1,
+                build.odometry(
+                    stamp_ns=k * MS, incarnation=0, number=k, duration_ns=MS, forward=0.5
                 ),
             )
         ]
@@ -142,14 +137,8 @@ def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
             Outgoing(
                 ch.ODOMETRY,
                 "r1",
-                m.Odometry(
-                    stamp_ns=5,
-                    robot="r1",
-                    incarnation=0,
-                    number=2**60,
-                    duration_ns=MS,
-                    forward=0.5,
-                    yaw_rate=0.1,
+                build.odometry(
+                    stamp_ns=5, incarnation=0, number=2**60, duration_ns=MS, forward=0.5
                 ),
             )
         ]

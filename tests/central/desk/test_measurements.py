@@ -11,12 +11,12 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample
 from team.wire.codec import encoded
+from tests import build
 
 numbers = st.integers(0, 12)
 plain = st.builds(
-    lambda number, forward: m.Odometry(
+    lambda number, forward: build.odometry(
         stamp_ns=10 * number,
-        robot="r1",
         incarnation=0,
         number=number,
         duration_ns=10,
@@ -39,12 +39,11 @@ steering = st.builds(
     numbers,
 )
 scan = st.builds(
-    lambda number: m.Observations(
-        stamp_ns=10 * number, robot="r1", incarnation=0, number=number, ids=b"", ranges=b"",
-        bearings=b"",
+    lambda number: build.observations(
+        stamp_ns=10 * number, incarnation=0, number=number, ids=b"", ranges=b"", bearings=b""
     ),
     numbers,
-)  # fmt: skip
+)
 logs = st.lists(st.one_of(plain, plain, steering, scan), max_size=30)
 
 
@@ -79,9 +78,7 @@ def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, 
 
 
 def test_unsound_odometry_is_counted_and_another_robots_is_not_taken():
-    sound = m.Odometry(
-        stamp_ns=1, robot="r1", incarnation=0, number=1, duration_ns=1, forward=1.0, yaw_rate=0.0
-    )
+    sound = build.odometry(stamp_ns=1, incarnation=0, number=1, duration_ns=1, yaw_rate=0.0)
     other = msgspec.structs.replace(sound, robot="r2")
     found = Recorded()
     found.take_all(

@@ -16,6 +16,7 @@ from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.odometry import OdometryInterval
 from team.robot.own_map import InitialPose, OwnMap
 from team.wire import messages as m
+from tests import build
 from tests.teams import config, published, stream
 
 MEASUREMENTS = published(stream("r1", 12, off_ns=300_000_000))
@@ -93,7 +94,7 @@ def test_after_a_resume_the_following_windows_are_the_same_byte_for_byte(taken, 
 
 def test_a_window_does_not_depend_on_what_was_read_before_it():
     other = [
-        m.Odometry(
+        build.odometry(
             stamp_ns=r.stamp_ns,
             robot=r.robot,
             incarnation=r.incarnation,

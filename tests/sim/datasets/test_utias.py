@@ -24,6 +24,7 @@ from sim.world.config import UtiasWorld
 from sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
 from team.config import RobotConfig
 from team.wire import messages as m
+from tests import build
 
 REAL = Path(__file__).parents[4] / "shared" / "utias"
 
@@ -170,9 +171,7 @@ def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(fol
     node = WorldNode(
         utias(world, robots),
         frozenset(),
-        m.Configuration(
-            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
-        ),
+        build.configuration(node="world", incarnation=0),
     )
     sent = [o.message for o in node.publish(0.0) if isinstance(o.message, m.Odometry)]
     assert sent[0].stamp_ns == late.intervals.end_ns[0] - 400_000_000

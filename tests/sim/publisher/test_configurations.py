@@ -11,6 +11,7 @@ from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from team.wire import channels as ch
 from team.wire import messages as m
+from tests import build
 from tests.teams import stream, world_of
 
 SCENARIO = with_options(load("thesis"), robots=2)
@@ -22,9 +23,7 @@ def world() -> WorldNode:
     """A world that waits for two robots and a centre, which are all alive."""
     expected = expected_nodes(["r1", "r2"], recorder=False)
     configurations = Configurations(expected_configurations(SCENARIO))
-    announced = m.Configuration(
-        stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
-    )
+    announced = build.configuration(node="world", incarnation=0)
     node = WorldNode(STREAMS, expected, announced, configurations=configurations)
     for name in expected:
         node.handle(m.Liveliness(stamp_ns=0, node=name, alive=True), 0)
@@ -88,11 +87,7 @@ def test_who_speaks_in_the_name_of_a_node_that_was_right_is_named_and_stops_nobo
 
 def test_a_robot_that_is_not_in_the_scenario_is_named() -> None:
     configurations = Configurations(expected_configurations(SCENARIO))
-    configurations.take(
-        m.Configuration(
-            stamp_ns=0, node="robot/r9", incarnation=1, digest=bytes(8), configuration="{}"
-        )
-    )
+    configurations.take(build.configuration(node="robot/r9"))
     assert not configurations.forbid, "whoever that is, the team does not wait for it"
     (warning,) = configurations.mismatches
     assert warning.startswith("robot/r9 is not in the world's scenario, which has central, robot/r")

@@ -14,12 +14,11 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 from team.wire.codec import WireError, decoded, encoded
+from tests import build
 from tests.support import fused_map
 from tests.teams import of, stream, world_of
 
-SCENARIO = m.Configuration(
-    stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
-)
+SCENARIO = build.configuration(node="world", incarnation=0)
 STREAMS = world_of(stream("r1", 12), stream("r2", 9, off_ns=300_000_000, beyond=2))
 
 
@@ -43,9 +42,7 @@ def measurements(out):
 
 
 def progress(robot, count, incarnation=1, node="robot"):
-    return m.Progress(
-        stamp_ns=0, node=node, robot=robot, incarnation=incarnation, measurements=count, submaps=0
-    )
+    return build.progress(node=node, robot=robot, incarnation=incarnation, measurements=count)
 
 
 def test_it_waits_for_everyone_and_says_for_whom():
@@ -216,8 +213,8 @@ def wanted(node, robot="r1", incarnation=1, first=0, last=-1):
     return list(
         node.measurements(
             encoded(
-                m.MeasurementsRequest(
-                    stamp_ns=0, robot=robot, incarnation=incarnation, first=first, last=last
+                build.measurements_request(
+                    robot=robot, incarnation=incarnation, first=first, last=last
                 )
             )
         )
@@ -376,14 +373,7 @@ def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_eve
 def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot_is():
     node = world()
     node.handle(
-        m.Progress(
-            stamp_ns=5_000_000_000,
-            node="robot/r1",
-            robot="r1",
-            incarnation=3,
-            measurements=4,
-            submaps=0,
-        ),
+        build.progress(stamp_ns=5_000_000_000, incarnation=3, measurements=4),
         0,
     )
     out = [r for r in measurements(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]

@@ -11,6 +11,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
 from team.wire.codec import encoded
+from tests import build
 from tests.support import submap
 from tests.teams import stream
 
@@ -77,12 +78,6 @@ def _stamped(said: m.Submap, stamp_ns: int) -> m.Submap:
 
 
 def _pose(stamp_ns: int) -> m.PoseEstimate:
-    return m.PoseEstimate(
-        stamp_ns=stamp_ns,
-        robot="r1",
-        incarnation=1,
-        sequence=0,
-        map_digest=bytes(8),
-        pose=from_floats(np.zeros(3)),
-        covariance=from_floats(np.eye(3)),
+    return build.pose_estimate(
+        stamp_ns=stamp_ns, pose=from_floats(np.zeros(3)), covariance=from_floats(np.eye(3))
     )

@@ -15,6 +15,7 @@ from sim.world.streams import WorldStreams
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.codec import encoded
+from tests import build
 from tests.sim.datasets.test_folder import read
 
 SECOND = 10**9
@@ -102,9 +103,7 @@ def test_a_mixed_stream_comes_out_of_tables_as_it_was(
 
 
 def test_later_incarnations_are_left_out_and_counted() -> None:
-    begin = m.InitialPose(
-        stamp_ns=9 * SECOND, robot="r1", incarnation=2, number=0, pose=b"", covariance=b""
-    )
+    begin = build.initial_pose(stamp_ns=9 * SECOND, incarnation=2)
     later = [begin, seeing(9.5, m.Points, **AHEAD)]
     later[1] = msgspec.structs.replace(later[1], incarnation=2, number=1)
     world = recorded_streams([*MIXED, *later], "a log")

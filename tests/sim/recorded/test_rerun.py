@@ -28,6 +28,7 @@ from team.wire import messages as m
 from team.wire.arrays import floats, from_floats
 from team.wire.bus import Sample
 from team.wire.codec import encoded
+from tests import build
 from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
 from tests.teams import LOCALISERS, Team, config, stream, world_of
 
@@ -231,13 +232,7 @@ def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team
             team.resume(config("r1"))
             team.world.cache = cache
             first = team.robots["r1"].next_measurement
-            team.world.measurements(
-                encoded(
-                    m.MeasurementsRequest(
-                        stamp_ns=0, robot="r1", incarnation=0, first=first, last=-1
-                    )
-                )
-            )
+            team.world.measurements(encoded(build.measurements_request(incarnation=0, first=first)))
             team.world.cache = None
         team.run()
     return team

@@ -23,6 +23,7 @@ from team.pairs import PAIRS
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
 from team.wire.digest import configured
+from tests import build
 
 SMALL = """
 [world]
@@ -355,9 +356,7 @@ def test_a_logs_configurations_with_former_names_are_read_with_todays() -> None:
     text = msgspec.json.encode(today).decode()
     former = text.replace('"outlier_share":', '"garbage":')
     assert former != text
-    announced = m.Configuration(
-        stamp_ns=0, node="robot/r1", incarnation=1, digest=bytes(8), configuration=former
-    )
+    announced = build.configuration(node="robot/r1", configuration=former)
     recorded = Recorded(configured={announced.node: announced})
     assert recorded.robot_config("r1") == (today, announced.digest)
 
