@@ -10,7 +10,7 @@ import re
 import threading
 import time
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from types import TracebackType
@@ -67,7 +67,9 @@ class Driver:
     they are known beforehand. latency_s: what is seen may come so much later than newer odometry.
     patience_s: how long to wait for the router where the file is new; 0: not at all, it may come
     later. bounds: what is physically sensible; without them a yaw rate beyond LIKELY_RAD_S is
-    refused, too.
+    refused, too. on_message: called, in another thread, with each message of the team for this
+    robot: its poses in the team's frame (`PoseEstimate`), the team's maps (`FusedMap`), smoothed
+    paths (`Trajectory`) and its status; it returns at once.
 
     Times `t` are seconds of one clock for the whole team, as of Unix time. Raises DriverError where
     it can not begin; each call raises MeasurementError for what can not be a measurement.
@@ -87,6 +89,7 @@ class Driver:
         latency_s: float = 0.2,
         patience_s: float = 10.0,
         bounds: Bounds | None = None,
+        on_message: Callable[[m.Message], None] | None = None,
     ) -> None:
         if not re.fullmatch(measured.NAME, robot):
             raise DriverError(f"{robot!r} is no robot's name: {measured.NAMED}")
@@ -108,6 +111,7 @@ class Driver:
         self._incarnation = 0
         self._again: int | None = None if self._journal.calls else -1
         self._node = SourceNode(self._journal)
+        self._node.on_message = on_message
         self._link = Link(self._node, team=team, connect=connect, keys=keys, lock=self._lock)
         try:
             self._link.open(0.0 if self._journal.calls else patience_s)

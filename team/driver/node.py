@@ -3,6 +3,7 @@
 It is the source of one robot's stream, as a world is of all (`sim.publisher`). It reads no clock.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -58,6 +59,8 @@ class SourceNode:
         self._others: set[str] = set()
         self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
         """Figures and warnings of what feeds the driver, as a ROS 2 robot's topics."""
+        self.on_message: Callable[[m.Message], None] | None = None
+        """Called in the link's thread with each message of the team, for a program's own use."""
         self.listening = True
         """True until the team's earlier progress with this robot is known."""
 
@@ -75,6 +78,15 @@ class SourceNode:
     """Channels of this robot or of the team; besides, the heads of all drivers and the robot's
     set.
     """
+
+    results: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.FUSED_MAP,
+        ch.TEAM_MAP,
+        ch.TEAM_FINAL,
+        ch.TRAJECTORY,
+        ch.TEAM_TRAJECTORY,
+    )
+    """Channels of the team's results, for a program that has subscribed to them."""
 
     def begin(self) -> list[Outgoing]:
         """Publish the stream's initial pose again for receivers that missed it, and its head."""
@@ -163,6 +175,12 @@ class SourceNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take progress, liveliness, orders, the final map; the answer is mostly empty."""
+        if self.on_message is not None:
+            self.on_message(message)
+        self._update(message)
+        return []
+
+    def _update(self, message: m.Message) -> None:
         match message:
             case m.Progress() if message.robot != self._robot:
                 pass
@@ -191,7 +209,6 @@ class SourceNode:
                 self._compare(message)
             case _:
                 pass
-        return []
 
     def _hear_robot(self, message: m.PoseEstimate | m.Configuration) -> None:
         """Take what the robot's process says of itself."""
