@@ -8,7 +8,7 @@ ends the process.
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from typing import Protocol, runtime_checkable
 
@@ -18,8 +18,15 @@ from numpy.typing import ArrayLike
 from team.containment import place_of
 from team.driver.measured import MeasurementError
 from team.ros2.arrivals import MOST_WAITING, Backlog, Lost
-from team.ros2.decoding import READERS, DamagedError, Record, TransformsRecord, decode
-from team.ros2.frames import Frames, misplaced
+from team.ros2.decoding import (
+    READERS,
+    DamagedError,
+    OdometryRecord,
+    Record,
+    TransformsRecord,
+    decode,
+)
+from team.ros2.frames import Frames, heading, misplaced
 from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
 from team.ros2.owners import Owners
 from team.ros2.topics import RobotTopics
@@ -39,6 +46,10 @@ BEHIND_S = 1.0
 """A message that waits longer says that the driver is slower than its topics."""
 NANO = Decimal(10) ** -9
 _LOG = logging.getLogger("teamslam")
+
+
+OnOdometry = Callable[[int, tuple[float, float, float], str, str], None]
+"""Called with (stamp [ns], pose (x, y, θ), odometry frame, base frame)."""
 
 
 @runtime_checkable
@@ -71,6 +82,7 @@ class Ros2Driver:
 
     taken: messages by topic; dropped: by reason; lost: published, and never here. What waits is
     handed over in the order of its stamps, since topics come in no order among themselves.
+    on_odometry: called with each odometry pose and its frames.
     name, others: the robot's name, and the topics of the others in the file, which may be its own,
     too: a detection there belongs to the robot from whose base its frame hangs.
     """
@@ -83,8 +95,10 @@ class Ros2Driver:
         *,
         name: str = "",
         others: Mapping[str, RobotTopics] | None = None,
+        on_odometry: OnOdometry | None = None,
     ) -> None:
         self._robot = robot
+        self._on_odometry = on_odometry
         self._topics = topics
         self._domain = domain
         frames = Frames()
@@ -200,12 +214,28 @@ class Ros2Driver:
             if isinstance(record, TransformsRecord):
                 self._translator.take_static(record)
             return []
+        if self._on_odometry is not None and topic == self._topics.odometry:
+            self._report_odometry(_stamped(record))
         try:
             return self._translator.take(topic, _stamped(record))
         except Exception as error:  # a sound message that the translation does not know how to take
             place = place_of(error.__traceback__)
             self._note(f"{topic}: set aside", f"{type(error).__name__} at {place}: {error}")
             return []
+
+    def _report_odometry(self, record: Record) -> None:
+        """Pass the odometry's pose on, whether it is used as a pose or as speeds."""
+        assert self._on_odometry is not None
+        if isinstance(record, OdometryRecord):
+            x, y, _ = record.position
+            pose = x, y, heading(record.rotation)
+            self._on_odometry(record.stamp_ns, pose, record.frame, record.child)
+        elif isinstance(record, TransformsRecord):
+            frames = self._topics.odometry_frame, self._topics.base_frame
+            for t in record.transforms:
+                if (t.parent, t.child) == frames:
+                    x, y, _ = t.position
+                    self._on_odometry(t.stamp_ns, (x, y, heading(t.rotation)), *frames)
 
     def _hand_over(self, measured: Measured) -> None:
         t = measured.stamp_ns * NANO

@@ -3,6 +3,7 @@
 import logging
 import time
 import warnings
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,16 @@ if TYPE_CHECKING:
     from team.ros2_driver import Ros2Driver
 
 app = typer.Typer()
+
+
+class Back(StrEnum):
+    """What a driver publishes back to ROS 2."""
+
+    ALL = "all"
+    TOPICS = "topics"
+    NONE = "none"
+
+
 _LOG = logging.getLogger("teamslam")
 WAIT_S = 0.2
 LAST_S = 0.2
@@ -51,16 +62,26 @@ def driver(
         float,
         typer.Option(help="Seconds by which landmarks may arrive later than odometry.", min=0.0),
     ] = 0.2,
+    answers: Annotated[
+        Back,
+        typer.Option(
+            help="What is published back to ROS 2: everything, all but the transform map → odom "
+            "(another node publishes it), or nothing."
+        ),
+    ] = Back.ALL,
 ) -> None:
     """Drive a robot of a live team by its ROS 2 topics, with no ROS here; Ctrl-C ends its stream.
 
-    Topics come by rmw_zenoh or by zenoh-bridge-ros2dds.
+    Topics come by rmw_zenoh or by zenoh-bridge-ros2dds. Published back, in the namespace of its
+    odometry: team_pose, team_path, smoothed_path, team_landmarks, team_map, the transform map →
+    odom, and /diagnostics.
     """
     import numpy as np
 
     from team.driver.driver import Driver, DriverError
     from team.driver.measured import DriverWarning, MeasurementError
     from team.ros2.topics import TopicsError, load_topics
+    from team.ros2_answers import LiveAnswers, RosPublisher
     from team.ros2_driver import Ros2Driver
     from team.shell import process
     from team.wire.zenoh.foreign import ForeignKeys
@@ -74,6 +95,9 @@ def driver(
         fail(str(error), WRONG_USE)
     if robot not in topics.robots:
         fail(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}", WRONG_USE)
+    live = None
+    if answers is not Back.NONE:
+        live = LiveAnswers(robot, topics.robots[robot], has_tf=answers is Back.ALL)
     pose = () if start is None else parsed_start(start)[1]
     variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
     try:
@@ -88,11 +112,13 @@ def driver(
                 start=pose[:3] or None,
                 start_covariance=None if variances is None else np.diag(variances),
                 latency_s=latency,
+                on_message=None if live is None else live.add_message,
             ) as source,
         ):
             translated = Ros2Driver(
-                source, topics.robots[robot], topics.domain, name=robot, others=topics.robots
-            )
+                source, topics.robots[robot], topics.domain, name=robot, others=topics.robots,
+                on_odometry=None if live is None else live.add_odometry,
+            )  # fmt: skip
             with ForeignKeys(
                 ros2_connect or connect,
                 translated.keys,
@@ -100,10 +126,13 @@ def driver(
                 latched=translated.latched,
             ) as foreign:
                 _LOG.info("listening to %s", ", ".join((*translated.keys, *translated.latched)))
+                publisher = RosPublisher(foreign, f"teamslam_{robot}", topics.domain)
                 while not (stop.is_set() or source.team_has_ended):
                     for sample in foreign.receive(0.0 if translated.waiting else WAIT_S):
                         translated.put(sample)
                     translated.deliver(AT_ONCE)
+                    if live is not None:
+                        live.publish(publisher)
                     source.tell(translated.figures(), translated.warnings())
                     translated.report()
                     if translated.refusal:

@@ -47,6 +47,7 @@ class Format(StrEnum):
     PARQUET = "parquet"
     TUM = "tum"
     UTIAS = "utias"
+    ROSBAG2 = "rosbag2"
 
 
 @app.command()
@@ -173,7 +174,8 @@ def export(
         Format,
         typer.Option(
             "--format",
-            help="A table per channel (csv, parquet), the robots' paths (tum), a data set (utias).",
+            help="A table per channel (csv, parquet), the robots' paths (tum), a data set (utias), "
+            "a ROS 2 bag of poses, paths and maps (rosbag2).",
         ),
     ] = Format.CSV,
     channels: ChannelNames = None,
@@ -181,6 +183,7 @@ def export(
     """Write a log as tables, its paths for evo, or its measurements and truth as a UTIAS data
     set.
     """
+    from central.desk.export.rosbag2 import export_rosbag2
     from central.desk.export.tum import export_tum
     from sim.recorded.utias_set import export_utias
     from team.recording.reader import open_log
@@ -190,12 +193,16 @@ def export(
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         fail(f"{output} is there and not an empty folder: give a new one", WRONG_USE)
     warn_of_holes(opened)
-    if form in (Format.UTIAS, Format.TUM):
+    if form in (Format.UTIAS, Format.TUM, Format.ROSBAG2):
         if channels is not None:
             fail(f"--channels is for tables: {form} is of all that the format has", WRONG_USE)
         if form is Format.TUM:
             for path in export_tum(opened, output):
                 typer.echo(path)
+            return
+        if form is Format.ROSBAG2:
+            for topic, count in sorted(export_rosbag2(opened, output).items()):
+                typer.echo(f"{output}: {topic}: {counted(count, 'message')}")
             return
         for number, robot in enumerate(export_utias(opened, output), 1):
             typer.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")

@@ -10,7 +10,7 @@ import re
 import threading
 import time
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from types import TracebackType
@@ -65,7 +65,9 @@ class Driver:
     None: exactly known. landmarks: all landmark ids, if known. latency_s: longest delay of a
     detection behind the odometry of its time. patience_s: time to wait for the router with a new
     file; 0: connect later. bounds: physical limits of the robot; without them a yaw rate beyond
-    LIKELY_RAD_S is refused, too.
+    LIKELY_RAD_S is refused, too. on_message: called in another thread with each message of the team
+    for this robot: poses in the team's frame (`PoseEstimate`), maps (`FusedMap`), smoothed paths
+    (`Trajectory`) and the status of its process; it has to return at once.
 
     Times `t` are seconds on one clock for the whole team, such as Unix time. Raises DriverError if
     the driver can not start; each call raises MeasurementError for an impossible value.
@@ -85,6 +87,7 @@ class Driver:
         latency_s: float = 0.2,
         patience_s: float = 10.0,
         bounds: Bounds | None = None,
+        on_message: Callable[[m.Message], None] | None = None,
     ) -> None:
         if not re.fullmatch(measured.NAME, robot):
             raise DriverError(f"{robot!r} is no robot's name: {measured.NAMED}")
@@ -106,6 +109,7 @@ class Driver:
         self._incarnation = 0
         self._again: int | None = None if self._journal.calls else -1
         self._node = SourceNode(self._journal)
+        self._node.on_message = on_message
         self._link = Link(self._node, team=team, connect=connect, keys=keys, lock=self._lock)
         try:
             self._link.open(0.0 if self._journal.calls else patience_s)

@@ -142,6 +142,10 @@ class Link:
             self._node.alive.clear()
             for channel in self._node.listens:
                 bus.subscribe(channel, self._node.journal.robot)
+            if self._node.on_message is not None:
+                for channel in self._node.results:
+                    bus.subscribe(channel, self._node.journal.robot)
+                bus.subscribe(ch.STATUS, ch.robot_node(self._node.journal.robot))
             bus.subscribe(ch.HEAD)
             bus.subscribe(ch.SET_SUMMARY, ch.robot_node(self._node.journal.robot))
             bus.watch_alive()

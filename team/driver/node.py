@@ -3,6 +3,7 @@
 It is the source of one robot's stream, as the world is of all streams (`sim.publisher`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -58,6 +59,8 @@ class SourceNode:
         self._others: set[str] = set()
         self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
         """Figures and warnings of the driver's input, such as a ROS 2 robot's topics."""
+        self.on_message: Callable[[m.Message], None] | None = None
+        """Called in the link's thread with each message of the team, for a program's own use."""
         self.listening = True
         """True until the robot's earlier progress has been received."""
 
@@ -73,6 +76,15 @@ class SourceNode:
         ch.FINAL_MAP,
     )
     """Channels of this robot or the team; the link adds all heads and the robot's set summary."""
+
+    results: ClassVar[tuple[ch.Channel, ...]] = (
+        ch.FUSED_MAP,
+        ch.TEAM_MAP,
+        ch.TEAM_FINAL,
+        ch.TRAJECTORY,
+        ch.TEAM_TRAJECTORY,
+    )
+    """Channels of the team's results, for a program that has subscribed to them."""
 
     def begin(self) -> list[Outgoing]:
         """Publish the stream's initial pose and its head, for receivers that missed them."""
@@ -161,6 +173,12 @@ class SourceNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Update the state by progress, liveliness, orders and the final map."""
+        if self.on_message is not None:
+            self.on_message(message)
+        self._update(message)
+        return []
+
+    def _update(self, message: m.Message) -> None:
         match message:
             case m.Progress() if message.robot != self._robot:
                 pass
@@ -189,7 +207,6 @@ class SourceNode:
                 self._compare(message)
             case _:
                 pass
-        return []
 
     def _update_robot(self, message: m.PoseEstimate | m.Configuration) -> None:
         """Keep the robot's pose or its announced configuration."""

@@ -35,6 +35,11 @@ def number_of(attachment: bytes) -> tuple[bytes, int] | None:
     return None
 
 
+def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
+    """The attachment of our publication, in the second form; gid: 16 bytes."""
+    return struct.pack("<qqB16s", number, stamp_ns, len(gid), gid)
+
+
 @dataclass
 class Lost:
     """Number of lost messages by topic; numbered: number of messages with a known counter."""

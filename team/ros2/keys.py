@@ -6,10 +6,13 @@ bridge      <topic>, and a liveliness token @/<id>/@ros2_lv/MP/<topic>/<type>/<Q
 
 import re
 from collections.abc import Iterable
+from typing import NamedTuple
 
 RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
 BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
 SLASH = "§"
+ESCAPED = "%"
+"""What rmw_zenoh writes for / in its liveliness tokens."""
 STATIC = "tf_static"
 MOVING = "tf"
 
@@ -50,3 +53,54 @@ def moving_topics(odometry: str) -> set[str]:
 def _in_spaces(odometry: str, name: str) -> set[str]:
     spaces = odometry.strip("/").split("/")[:-1]
     return {"/" + "/".join([*spaces[:k], name]) for k in range(len(spaces) + 1)}
+
+
+class Publication(NamedTuple):
+    """The keys of one topic that we publish, and the liveliness tokens that announce it.
+
+    rmw, bridge: keys for subscribers by rmw_zenoh and behind zenoh-bridge-ros2dds.
+    """
+
+    rmw: str
+    bridge: str
+    tokens: tuple[str, ...]
+
+
+def publication(
+    topic: str,
+    kind: str,
+    type_hash: str,
+    *,
+    latched: bool,
+    domain: int,
+    node: str,
+    session: str,
+    entity: int,
+) -> Publication:
+    """The keys and tokens of a topic of the node `node` (without namespace) in a Zenoh session.
+
+    rmw_zenoh, docs/design.md: <domain>/<topic>/<type>/<hash>, and the tokens
+    @ros2_lv/<domain>/<session>/<node>/<entity>/{NN,MP}/<enclave>/<namespace>/<node>[/<topic>/<type>
+    /<hash>/<QoS>] with the QoS as reliability:durability:history,depth:deadline:lifespan:liveliness
+    (empty: default). zenoh-plugin-ros2dds: <topic>, and @/<session>/@ros2_lv/MP/<topic>/<type>/
+    <keyless>:<reliability>:<durability>:<history>,<depth>:<user data>. Every topic is reliable;
+    a latched one is transient local with a depth of 1, another one volatile with a depth of 10.
+    """
+    name = topic.strip("/")
+    package, _, short = kind.partition("/msg/")
+    dds = f"{package}::msg::dds_::{short}_"
+    depth = 1 if latched else 10
+    of_node = f"@ros2_lv/{domain}/{session}/0"
+    quality = f":{1 if latched else ''}:,{depth}:,:,:,,"
+    about = f"{ESCAPED}{name.replace('/', ESCAPED)}/{dds}/{type_hash}/{quality}"
+    bridged = f"{name.replace('/', SLASH)}/{kind.replace('/', SLASH)}"
+    return Publication(
+        f"{domain}/{name}/{dds}/{type_hash}",
+        name,
+        (
+            f"{of_node}/0/NN/{ESCAPED}/{ESCAPED}/{node}",
+            f"{of_node}/{entity}/MP/{ESCAPED}/{ESCAPED}/{node}/{about}",
+            f"@/{session}/@ros2_lv",
+            f"@/{session}/@ros2_lv/MP/{bridged}/:1:{int(latched)}:0,{depth}:typehash={type_hash};",
+        ),
+    )

@@ -1,4 +1,4 @@
-"""Reads keys that are not a team's, as those of ROS 2: the samples as they are published."""
+"""Reads and publishes keys that are not a team's, such as those of ROS 2, as raw samples."""
 
 import json
 import time
@@ -60,6 +60,7 @@ class ForeignKeys:
             "connect/timeout_ms": max(1, round(1e3 * patience_s)),
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
+            "timestamping/enabled": True,  # caches of latched keys need it
         }
         for name, value in settings.items():
             config.insert_json5(name, json.dumps(value))
@@ -67,6 +68,8 @@ class ForeignKeys:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BusError(f"nobody answers at {connect} ({patience_s:g} s): {error}") from None
+        self._announced: dict[str, Any] = {}
+        self._publishers: dict[str, Any] = {}
         self._first = [
             reply.ok
             for token in tokens
@@ -107,6 +110,36 @@ class ForeignKeys:
         trace: TracebackType | None,
     ) -> None:
         self._session.close()  # type: ignore[no-untyped-call] # zenoh leaves out `-> None`
+
+    @property
+    def identity(self) -> str:
+        """The session's Zenoh identity, as liveliness tokens name it."""
+        return str(self._session.info.zid())
+
+    def announce(self, token: str) -> None:
+        """Declare a liveliness token, which lasts until the session closes."""
+        if token not in self._announced:
+            self._announced[token] = self._session.liveliness().declare_token(token)
+
+    def publish(
+        self, key: str, payload: bytes, attachment: bytes | None = None, *, latched: bool = False
+    ) -> None:
+        """Publish on a key; a late subscriber receives the newest sample of a latched one.
+
+        A message that a slow network can not take is dropped: the next one replaces it.
+        """
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            drop = zenoh.CongestionControl.DROP
+            if latched:
+                publisher = ext.declare_advanced_publisher(
+                    self._session, key, congestion_control=drop, cache=ext.CacheConfig(1),
+                    publisher_detection=True,
+                )  # fmt: skip
+            else:
+                publisher = self._session.declare_publisher(key, congestion_control=drop)
+            self._publishers[key] = publisher
+        publisher.put(payload, attachment=attachment)
 
     def receive(self, timeout_s: float) -> list[ForeignSample]:
         """The samples received, at most AT_ONCE of each subscription; waits at most `timeout_s` for

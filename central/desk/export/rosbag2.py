@@ -1,0 +1,134 @@
+"""Export a run as a ROS 2 bag that RViz, Foxglove and evo open.
+
+For each robot: its odometry (dead reckoning from the logged intervals) with odom → base on the
+transform topic, and the messages of `team.ros2_answers`. Log times are team time.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from team import translate
+from team.config import RobotConfig
+from team.recording.reader import Log, LogError
+from team.ros2.definitions import types
+from team.ros2.encoding import Names, Pose, compose, encode, odometry, transform, transforms
+from team.ros2_answers import Answer, Answers
+from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.bus import opened
+from team.wire.codec import WireError
+
+TEAM_SPACE = "/teamslam"
+"""Namespace of the team's map and diagnostics."""
+BAG_VERSION: Final = 9
+"""Version of the bag's metadata, which ROS 2 Jazzy writes."""
+ODOMETRY_HZ = 50.0
+"""Highest rate of the exported odometry [Hz]."""
+
+
+class _Robot:
+    """Dead reckoning and answers of one robot."""
+
+    def __init__(self, name: str) -> None:
+        self.config: RobotConfig | None = None
+        frames = {"odometry_frame": f"{name}/odom", "base_frame": f"{name}/base_link"}
+        self.names = Names(f"/{name}", **frames)
+        self.answers = Answers(self.names)
+        self.pose: Pose = (0.0, 0.0, 0.0)
+        self.incarnation = 0
+        self._written_ns = -(2**62)
+
+    def drive(self, message: m.AnyOdometry) -> Iterator[Answer]:
+        """The odometry's pose after an interval, at most ODOMETRY_HZ."""
+        if self.config is None:
+            return
+        if message.incarnation != self.incarnation:
+            self.incarnation, self.pose = message.incarnation, (0.0, 0.0, 0.0)
+        interval = translate.interval_of(message, self.config)
+        step = interval.part(self.config.motion, interval.duration_ns, 0).mean.tolist()
+        self.pose = compose(self.pose, (step[0], step[1], step[2]))
+        stamp_ns, names = interval.end_ns, self.names
+        self.answers.add_odometry(stamp_ns, self.pose)
+        if stamp_ns - self._written_ns < 1e9 / ODOMETRY_HZ:
+            return
+        self._written_ns = stamp_ns
+        speeds = interval.forward, interval.yaw_rate
+        one = transform(stamp_ns, names.odometry_frame, names.base_frame, self.pose)
+        yield Answer(names.tf, "tf2_msgs/msg/TFMessage", stamp_ns, encode(transforms(one)))
+        data = encode(odometry(stamp_ns, names, self.pose, speeds))
+        yield Answer(names.topic("odometry"), "nav_msgs/msg/Odometry", stamp_ns, data)
+
+
+def answers_of(log: Log) -> Iterator[Answer]:
+    """The ROS 2 messages of a log, in the order of its messages."""
+    robots: dict[str, _Robot] = {}
+    team = Answers(Names(TEAM_SPACE))
+    final = False
+    for sample in log.samples():
+        if ch.channel_of(sample.key) is None:
+            continue
+        try:
+            channel, name, message = opened(sample)
+        except WireError:
+            continue
+        if channel is ch.ROBOT_CONFIG and isinstance(message, m.Configuration):
+            robot = robots.setdefault(name, _Robot(name))
+            robot.config = msgspec.json.decode(message.configuration, type=RobotConfig)
+        elif channel is ch.ODOMETRY and isinstance(message, m.AnyOdometry):
+            yield from robots.setdefault(name, _Robot(name)).drive(message)
+        elif channel in (ch.TEAM_POSE, ch.TRAJECTORY, ch.TEAM_TRAJECTORY):
+            yield from robots.setdefault(name, _Robot(name)).answers.convert(message)
+        elif channel in (ch.FUSED_MAP, ch.TEAM_MAP, ch.FINAL_MAP, ch.TEAM_FINAL, ch.STATUS):
+            is_final = channel in (ch.FINAL_MAP, ch.TEAM_FINAL)
+            if isinstance(message, m.FusedMap) and final and not is_final:
+                continue
+            final |= is_final
+            yield from team.convert(message)
+
+
+def export_rosbag2(
+    log: Log, folder: Path, progress: Callable[[int], None] = lambda _: None
+) -> dict[str, int]:
+    """Write a bag (MCAP) into a new folder; returns the number of messages by topic.
+
+    Raises LogError for a log without a robot's odometry or pose.
+    """
+    store, counts = types(), dict[str, int]()
+    connections = {}
+    with Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
+        for answer in answers_of(log):
+            if answer.topic not in connections:
+                connections[answer.topic] = bag.add_connection(
+                    answer.topic, answer.kind, typestore=store,
+                    offered_qos_profiles=[quality(answer.latched)],
+                )  # fmt: skip
+            bag.write(connections[answer.topic], max(answer.stamp_ns, 0), answer.data)
+            counts[answer.topic] = counts.get(answer.topic, 0) + 1
+            progress(sum(counts.values()))
+    if not counts:
+        raise LogError(log.path, "no odometry, pose or map in it", "`log info` lists what there is")
+    return counts
+
+
+def quality(latched: bool) -> Qos:
+    """Reliable; latched: transient local with a depth of 1, else volatile with a depth of 10."""
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    forever = QosTime(sec=9_223_372_036, nsec=854_775_807)
+    return Qos(
+        history=QosHistory.KEEP_LAST, depth=1 if latched else 10,
+        reliability=QosReliability.RELIABLE, durability=durability, deadline=forever,
+        lifespan=forever, liveliness=QosLiveliness.AUTOMATIC, liveliness_lease_duration=forever,
+        avoid_ros_namespace_conventions=False,
+    )  # fmt: skip

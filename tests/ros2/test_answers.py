@@ -1,0 +1,217 @@
+"""Results for ROS 2: the right numbers in the right frames, read by readers that are not ours."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from rosbags.highlevel import AnyReader
+
+from central.desk.export.rosbag2 import export_rosbag2
+from team.ros2.definitions import types
+from team.ros2.encoding import compose, ellipse, inverse, names_of
+from team.ros2.keys import of_rmw, of_token
+from team.ros2.topics import RobotTopics
+from team.ros2_answers import Answers, LiveAnswers, RosPublisher, landmark_blocks
+from team.wire import messages as m
+from team.wire.arrays import from_floats, from_ids
+from team.wire.zenoh.foreign import ForeignKeys
+from tests.ros2.test_live import free_port
+from tests.sim.reruns import team_samples, thesis, written
+from tests.support import examples, packed, spd, wait_until
+
+S = 10**9
+NAMES = names_of("r1", "/r1/odom", "odom", "base_link")
+
+
+def posed(stamp_ns: int, pose: tuple[float, float, float], *, inside: bool = True):
+    (example,) = (each for each in examples() if isinstance(each, m.PoseEstimate))
+    fields = {name: getattr(example, name) for name in example.__struct_fields__}
+    fields |= {"stamp_ns": stamp_ns, "robot": "r1", "pose": from_floats(pose)}
+    P = np.diag([0.04, 0.09, 0.01])
+    fields |= {"covariance": from_floats(P), "in_team_frame": inside}
+    return m.PoseEstimate(**fields)
+
+
+def decoded(answer):
+    return types().deserialize_cdr(answer.data, answer.kind)
+
+
+def by_topic(answers):
+    return {answer.topic: answer for answer in answers}
+
+
+def test_map_from_odom_takes_the_odometry_s_pose_to_the_pose_in_the_map() -> None:
+    answers = Answers(NAMES)
+    answers.add_odometry(1 * S, (1.0, 0.0, 0.0))
+    answers.add_odometry(2 * S, (2.0, 0.0, 0.2))
+    out = by_topic(answers.convert(posed(int(1.5 * S), (10.0, 5.0, math.pi / 2))))
+    (found,) = decoded(out["/r1/tf"]).transforms
+    assert (found.header.frame_id, found.child_frame_id) == ("map", "odom")
+    turn = 2.0 * math.atan2(found.transform.rotation.z, found.transform.rotation.w)
+    at = found.transform.translation.x, found.transform.translation.y, turn
+    half_way = compose(inverse((0.0, 0.0, 0.0)), (1.5, 0.0, 0.1))
+    np.testing.assert_allclose(compose(at, half_way), (10.0, 5.0, math.pi / 2), atol=1e-12)
+
+
+def test_a_pose_outside_of_the_team_s_frame_is_not_published_and_the_last_transform_stays() -> None:
+    answers = Answers(NAMES)
+    answers.add_odometry(1 * S, (1.0, 0.0, 0.0))
+    assert answers.transform(1 * S) == []
+    answers.convert(posed(1 * S, (3.0, 0.0, 0.0)))
+    assert answers.convert(posed(2 * S, (90.0, 90.0, 0.0), inside=False)) == []
+    (kept,) = answers.transform(2 * S)
+    assert decoded(kept).transforms[0].transform.translation.x == pytest.approx(2.0)
+
+
+def test_a_pose_without_odometry_at_its_time_has_no_transform() -> None:
+    answers = Answers(NAMES)
+    answers.add_odometry(5 * S, (0.0, 0.0, 0.0))
+    assert "/r1/tf" not in by_topic(answers.convert(posed(1 * S, (3.0, 0.0, 0.0))))
+
+
+def test_a_pose_has_its_covariance_in_six_dimensions() -> None:
+    out = by_topic(Answers(NAMES).convert(posed(3 * S + 7, (3.0, -2.0, 1.0))))
+    found = decoded(out["/r1/team_pose"])
+    assert (found.header.frame_id, found.header.stamp.sec, found.header.stamp.nanosec) == (
+        "map", 3, 7,
+    )  # fmt: skip
+    P = found.pose.covariance.reshape(6, 6)
+    assert P[0, 0] == 0.04
+    assert P[1, 1] == 0.09
+    assert P[5, 5] == 0.01
+    assert np.count_nonzero(P) == 3
+
+
+def test_landmarks_have_ellipses_of_two_sigma_and_their_ids() -> None:
+    (fused,) = (each for each in examples() if isinstance(each, m.FusedMap))
+    out = by_topic(Answers(NAMES).convert(fused))
+    markers = decoded(out["/r1/team_landmarks"]).markers
+    assert markers[0].action == 3, "the landmarks of the map before are deleted first"
+    drawn = [each for each in markers if each.ns == "landmarks" and each.action == 0]
+    major, minor, _ = ellipse(landmark_blocks(fused)[0])
+    assert (drawn[0].scale.x, drawn[0].scale.y) == (major, minor)
+    named = decoded(out["/r1/team_map"]).detections
+    assert [each.id for each in named] == ["4", "7"]
+    block = named[1].results[0].pose.covariance.reshape(6, 6)[:2, :2]
+    np.testing.assert_array_equal(block, landmark_blocks(fused)[1])
+    assert all(out[topic].latched for topic in ("/r1/team_landmarks", "/r1/team_map"))
+
+
+@pytest.mark.parametrize("joint", [True, False])
+def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint: bool) -> None:
+    (fused,) = (each for each in examples() if isinstance(each, m.FusedMap))
+    P, ids = spd(6), from_ids([1, 2, 3])
+    blocks = np.array([P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)])
+    data = packed(P) if joint else from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
+    fields = {name: getattr(fused, name) for name in fused.__struct_fields__}
+    changed = {"ids": ids, "means": from_floats(range(6)), "covariance": data, "joint": joint}
+    np.testing.assert_array_equal(landmark_blocks(m.FusedMap(**(fields | changed))), blocks)
+
+
+def test_an_ellipse_has_the_directions_of_its_covariance() -> None:
+    turn, axes = 0.7, np.array([3.0, 0.5])
+    R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    major, minor, direction = ellipse(R @ np.diag(axes**2) @ R.T)
+    assert (major, minor) == pytest.approx((12.0, 2.0))
+    assert math.tan(direction) == pytest.approx(math.tan(turn))
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame", "namespace", "tf"),
+    [
+        ("/odom", "odom", "/r1", "/tf"),
+        ("/alpha/odom", "alpha/odom", "/alpha", "/tf"),
+        ("/alpha/odom", "odom", "/alpha", "/alpha/tf"),
+    ],
+)
+def test_a_robot_s_topics_are_beside_its_odometry(topic, frame, namespace, tf) -> None:
+    names = names_of("r1", topic, frame, "base_link")
+    assert (names.namespace, names.tf) == (namespace, tf)
+
+
+def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types() -> None:
+    port = free_port()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    live = LiveAnswers("r1", RobotTopics(odometry="/r1/odom"))
+    with (
+        zenoh.open(config) as router,
+        ForeignKeys(f"tcp/127.0.0.1:{port}", [], []) as session,
+        router.declare_subscriber("0/**") as by_rmw,
+        router.declare_subscriber("r1/**") as by_bridge,
+    ):
+        publisher = RosPublisher(session, "teamslam_r1", 0)
+        live.add_odometry(1 * S, (1.0, 0.0, 0.0), "odom", "base_link")
+        live.add_message(posed(1 * S, (2.0, 0.0, 0.0)))
+        live.publish(publisher)
+        found: dict[str, zenoh.Sample] = {}
+
+        def complete() -> bool:
+            for subscriber in (by_rmw, by_bridge):
+                while (sample := subscriber.try_recv()) is not None:
+                    found[str(sample.key_expr)] = sample
+            return len(found) >= 6
+
+        wait_until(complete)
+        (key,) = (each for each in found if each.startswith("0/r1/team_pose/"))
+        assert of_rmw(key, 0) == ("/r1/team_pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+        assert key.rpartition("/")[2] == types().hash_rihs01(of_rmw(key, 0)[1])
+        assert found[key].payload.to_bytes() == found["r1/team_pose"].payload.to_bytes()
+        assert len(found[key].attachment.to_bytes()) == 33
+        tokens = {str(reply.ok.key_expr) for reply in router.liveliness().get("@/*/@ros2_lv/MP/**")}
+        assert ("/r1/team_pose", "geometry_msgs/msg/PoseWithCovarianceStamped") in {
+            of_token(each) for each in tokens
+        }
+        graph = {str(reply.ok.key_expr) for reply in router.liveliness().get("@ros2_lv/**")}
+        assert any("/MP/%/%/teamslam_r1/%r1%team_pose/" in each for each in graph)
+        assert any(each.endswith("/NN/%/%/teamslam_r1") for each in graph)
+
+
+def test_a_late_subscriber_receives_the_newest_path_and_map() -> None:
+    port = free_port()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config), ForeignKeys(f"tcp/127.0.0.1:{port}", [], []) as session:
+        publisher = RosPublisher(session, "teamslam_r1", 0)
+        for answer in Answers(NAMES).convert(posed(1 * S, (2.0, 0.0, 0.0))):
+            publisher.publish(answer)
+        topics = ["0/r1/team_path/*/*"]
+        with ForeignKeys(f"tcp/127.0.0.1:{port}", [], [], latched=topics) as late:
+            received: list[str] = []
+
+            def came() -> bool:
+                received.extend(each.key for each in late.receive(0.05))
+                return bool(received)
+
+            wait_until(came)
+    assert received[0].startswith("0/r1/team_path/nav_msgs::msg::dds_::Path_/RIHS01_")
+
+
+def test_a_log_becomes_a_bag_that_another_reader_opens(tmp_path: Path) -> None:
+    log = written(tmp_path / "log.mcap", team_samples(thesis(45)))
+    counts = export_rosbag2(log, tmp_path / "bag")
+    with AnyReader([tmp_path / "bag"]) as reader:
+        read = {each.topic: each for each in reader.connections}
+        assert {topic: each.msgcount for topic, each in read.items()} == counts
+        assert all(each.msgdef.data for each in read.values()), "definitions are embedded"
+        poses = [
+            reader.deserialize(data, each.msgtype)
+            for each, _, data in reader.messages([read["/r1/team_pose"]])
+        ]
+        assert {pose.header.frame_id for pose in poses} == {"map"}
+        frames = {
+            (t.header.frame_id, t.child_frame_id)
+            for each, _, data in reader.messages([read["/tf"]])
+            for t in reader.deserialize(data, each.msgtype).transforms
+        }
+    assert frames == {
+        (parent, child)
+        for robot in ("r1", "r2")
+        for parent, child in (("map", f"{robot}/odom"), (f"{robot}/odom", f"{robot}/base_link"))
+    }
