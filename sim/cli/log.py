@@ -202,7 +202,7 @@ def export(
             return
         if form is Format.ROSBAG2:
             for topic, count in sorted(export_rosbag2(opened, output).items()):
-                typer.echo(f"{output}: {topic}: {counted(count, 'message')}")
+                typer.echo(f"{output}: {topic}: {count_noun(count, 'message')}")
             return
         for number, robot in enumerate(export_utias(opened, output), 1):
             typer.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
