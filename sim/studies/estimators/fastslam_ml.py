@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sim.studies.estimators.nearest_neighbour import GATE
-from team.config import UNNAMED, Sensor
+from team.config import GATE, UNNAMED, Sensor
 from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from team.estimation.hybrid_slam.moments import mean_direction
