@@ -1,5 +1,4 @@
-"""Configuration of the documentation site, which `make docs` builds offline with warnings as
-errors.
+"""Configuration of the documentation site; `make docs` builds it offline, warnings are errors.
 
 The pages are Markdown. The command reference is generated from the commands, the API reference from
 the docstrings, which are plain text with formulas and not reStructuredText.

@@ -59,15 +59,11 @@ def view_table() -> str:
     return "\n".join(rows)
 
 
-def message_table() -> str:
+def message_list() -> str:
     """The fields of every message by position, and their types unless `usual_types` has them."""
-    rows = ["| message | fields |", "|---|---|"]
-    rows += [
-        f"| `{tag}` | {_fields(message)} |" if _fields(message) else f"| `{tag}` | |"
-        for tag, message in sorted(m.BY_TAG.items())
-    ]
-    rows += [f"| *{part.__name__}* | {_fields(part)} |" for part in _parts()]
-    return "\n".join(rows)
+    rows = [f"- `{tag}`: {_fields(message)}" for tag, message in sorted(m.BY_TAG.items())]
+    rows += [f"- *{part.__name__}*: {_fields(part)}" for part in _parts()]
+    return "\n".join(rows).replace(": \n", "\n")
 
 
 def fields_by_type() -> dict[str, str]:
@@ -146,7 +142,7 @@ def code_of(page: str, language: str) -> str:
     return page.partition(f"```{language}\n")[2].partition("```")[0]
 
 
-@pytest.mark.parametrize("table", [channel_table, query_table, view_table, message_table])
+@pytest.mark.parametrize("table", [channel_table, query_table, view_table, message_list])
 def test_the_page_has_the_tables_of_the_code(table: Callable[[], str]) -> None:
     assert table() in PAGE.read_text()
 
@@ -187,5 +183,5 @@ def test_the_pages_example_bytes_are_those_of_the_code() -> None:
 
 
 if __name__ == "__main__":
-    for table in (channel_table, query_table, message_table, view_table):
+    for table in (channel_table, query_table, message_list, view_table):
         sys.stdout.write(f"{table()}\n\n")
