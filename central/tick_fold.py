@@ -105,12 +105,14 @@ class TickFold:
         self.convicts = config.withdraw_above is not None
         self._ordered: frozenset[str] = frozenset()
         self._agreed: tuple[Fold, Agreement] | None = None
+        self._accused: Mapping[str, str] = {}
         self.undecided = ""
         self._restart(Conviction())
 
     def _restart(self, conviction: Conviction) -> None:
         """Forget every tick that was folded, under another conviction."""
         self._conviction = conviction
+        self._retried = 0.0
         self.checkpoints = Checkpoints()
 
     # Inputs.
@@ -342,11 +344,19 @@ class TickFold:
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
         """The robot that contradicts the rest in a provisional fold, with the reason in words; none
         where nothing is ahead of the watermark, since the ticks behind it are tested by themselves.
+
+        A trial folds the set again for each candidate, so its result holds until the set has grown
+        by GROWTH.
         """
         if provisional is self.fold or not self.convicts:
             return {}
-        found = self._try_robots(provisional, math.inf)
-        return {} if found is None or found.robot is None else {found.robot: found.reason}
+        if provisional.size >= self._retried:
+            found = self._try_robots(provisional, math.inf)
+            self._retried = 0.0 if found is None else GROWTH * provisional.size
+            self._accused = (
+                {} if found is None or found.robot is None else {found.robot: found.reason}
+            )
+        return {robot: why for robot, why in self._accused.items() if robot not in self._gone}
 
     def solve(self) -> Fold:
         """The full solution of all inputs, without the robots that it withdraws.

@@ -1,10 +1,10 @@
 """Finds the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
 A robot's disagreement is the larger of two figures, both near or below 1 where its covariances are
-right: its share of the joint cost per degree of freedom, where that is beyond chance, and the
-median over its submaps of χ²/dof, where it has enough of them. The first one finds a single
-contradiction that the map takes at full weight. A robust loss bounds it; there the second one finds
-a robot whose submaps disagree in the majority.
+right: its share of the joint cost per degree of freedom, and χ²/dof of its submaps, which most of
+them exceed; each where it is beyond chance. The first one finds a single contradiction that enters
+the map at full weight. A robust loss bounds it; there the second one finds a robot whose submaps
+disagree in the majority: over all of them if there are many, over the newest ones if there are few.
 
 One wrong robot distorts the map and makes others disagree, too; one that claims to be very sure,
 or that fixes the frame, makes only others disagree. So nobody is judged by its own disagreement.
@@ -15,15 +15,18 @@ them contradicts itself when alone.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""Least number of submaps of a robot for their median to be judged, and for it to be withdrawn
-before the final map; with fewer it is suspended."""
+"""Least number of submaps of a robot for all of them to be judged by their median, and for it to be
+withdrawn before the final map; with fewer it is suspended."""
+NEWEST, MOST_OF = 4, 3
+"""With fewer submaps than that a robot is judged by its newest ones: by the disagreement that
+MOST_OF of the NEWEST exceed."""
 AGREEING = 0.5
 """The rest agree if no disagreement is above this share of the limit."""
 TRIED = 3
@@ -98,19 +101,34 @@ def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, f
     chance: a share of the joint cost that a right robot exceeds with a probability above e^−chance
     is no disagreement.
     """
-    ratios: dict[str, list[float]] = {}
+    costs: dict[str, list[tuple[float, float]]] = {}
     for (robot, _), _, chi2, dof, _ in agreement.submaps:
         if dof >= 1.0:
-            ratios.setdefault(robot, []).append(chi2 / dof)
+            costs.setdefault(robot, []).append((chi2, dof))
     found = {}
-    for robot in sorted({*ratios, *agreement.robots}):
-        own = ratios.get(robot, [])
-        values = [median(own)] if len(own) >= LEAST_SUBMAPS else []
-        if (share := _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)) is not None:
-            values.append(share)
+    for robot in sorted({*costs, *agreement.robots}):
+        of_submaps = _most(costs.get(robot, []), chance)
+        share = _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)
+        values = [each for each in (of_submaps, share) if each is not None]
         if values:
             found[robot] = max(values)
     return found
+
+
+def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
+    """The χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it; None with
+    too few submaps.
+
+    costs: χ² and dof of each, oldest first. That MOST_OF of NEWEST submaps exceed χ² bounds of
+    probability e^−x each has a probability below 4 e^(−3x).
+    """
+    if len(costs) >= LEAST_SUBMAPS:
+        return median(chi2 / dof for chi2, dof in costs)
+    if len(costs) < NEWEST:
+        return None
+    beyond = (chance + math.log(math.comb(NEWEST, MOST_OF))) / MOST_OF
+    shares = (_share(chi2, dof, beyond) for chi2, dof in costs[-NEWEST:])
+    return sorted((1.0 if each is None else each for each in shares), reverse=True)[MOST_OF - 1]
 
 
 def _share(chi2: float, dof: float, chance: float) -> float | None:

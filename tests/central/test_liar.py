@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from central import tick_fold
 from central.map_publisher import MapPublisher
 from central.submap_fold import SubmapFold
-from central.withdrawal import convicted, disagreement
+from central.withdrawal import Trial, convicted, disagreement
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario
 from sim.world.simulator import simulated
@@ -93,7 +94,7 @@ class Liar(RobotNode):
 
 
 @cache
-def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
+def run_with(liar: str, kind: str, robust_c: float | None = None) -> tuple[Sample, ...]:
     """The small team in which one robot lies."""
 
     def robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
@@ -102,7 +103,7 @@ def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
             node.kind = kind
         return node
 
-    of: Scenario = scenario()
+    of: Scenario = scenario(robust_c=robust_c)
     talking = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
     of = msgspec.structs.replace(of, robots=talking)
     return tuple(run_team(of, simulated(of.world, of.robots, of.seed), robot))
@@ -160,6 +161,42 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
     assert (ticks.convicted, ticks.suspended) == (at_once.convicted, at_once.suspended)
     assert ticks.fold.main.state.tobytes() == at_once.fold.main.state.tobytes()
     assert list(ticks.convicted) == ["r1"]
+
+
+@pytest.mark.parametrize("kind", ["micrometre", "far", "swap"])
+def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind: str) -> None:
+    """Most of its newest submaps contradict the map, however little they weigh."""
+    samples = run_with("r1", kind, 1.0)
+    ticks = of_set(samples, central=scenario(robust_c=1.0).central)
+    ticks.fold_until(30e9)
+    assert list(ticks.suspended) == ["r1"]
+    ticks.fold_until(math.inf)
+    assert list(ticks.convicted) == ["r1"]
+    assert final_map(list(samples)).withdrawn == ("r1",)
+
+
+def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trials: list[float] = []
+
+    def undecided(agreement: Agreement, *_: object) -> Trial:
+        trials.append(agreement.dof)
+        return Trial(undecided="r1, r2 contradict each other")
+
+    samples = run_with("r1", "swap")
+    monkeypatch.setattr(tick_fold, "convicted", undecided)
+    early = tuple(each for each in samples if each.stamp_ns <= 30e9)
+    ticks = of_set(early)
+    first = ticks.fold_ahead()
+    for _ in range(2):
+        assert ticks.accuse(first) == {}
+        assert len(trials) == 1
+    for each in messages(samples, m.Submap):
+        if each.stamp_ns > 30e9:
+            ticks.add_submap(msgspec.structs.replace(each, sightings=0), bytes(8))
+    assert ticks.accuse(ticks.fold_ahead()) == {}
+    assert len(trials) == 2
 
 
 def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:

@@ -375,7 +375,16 @@ def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
     costs[:4] = [each._replace(chi2=500.0) for each in costs[:4]]
     assert disagreement(Agreement(0.0, 1.0, {}, tuple(costs)))["a"] < 2.0
     assert np.isclose(disagreement(agreement(a=3.0))["a"], 3.0 * 0.98)
-    assert disagreement(Agreement(0.0, 1.0, {}, agreement(a=9.0).submaps[:7])) == {}
+
+
+def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four() -> None:
+    bad, good = agreement(a=9.0).submaps[:7], agreement(a=1.0).submaps[:5]
+    of_last_four = [0.92, 0.96, 1.0, 1.04]
+    found = disagreement(Agreement(0.0, 1.0, {}, bad))["a"]
+    assert np.isclose(found, 9.0 * sorted(of_last_four)[1])
+    for few in ((*good, *bad[-2:]), (*bad[:3], *good[:4])):
+        assert disagreement(Agreement(0.0, 1.0, {}, few))["a"] <= 1.0
+    assert disagreement(Agreement(0.0, 1.0, {}, bad[:3])) == {}
 
 
 def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
