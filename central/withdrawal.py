@@ -80,23 +80,23 @@ class Conviction:
     tested_from: float = -math.inf
 
     def withdraw(self, robot: str, reason: str, at: float) -> "Conviction":
-        """The conviction with one more robot withdrawn."""
+        """Withdraw one more robot."""
         without = self.acquit(robot, at, -math.inf)
         return replace(without, withdrawn={**self.withdrawn, robot: reason})
 
     def suspend(self, robot: str, suspension: Suspension, at: float) -> "Conviction":
-        """The conviction with one more robot suspended."""
+        """Suspend one more robot."""
         suspended = {**self.suspended, robot: suspension}
         return Conviction(self.withdrawn, suspended, max(self.at, at))
 
     def acquit(self, robot: str, at: float, tested_from: float) -> "Conviction":
-        """The conviction under which a suspended robot is tested again."""
+        """Take a suspended robot in again, to be tested."""
         suspended = {each: why for each, why in self.suspended.items() if each != robot}
         return Conviction(self.withdrawn, suspended, max(self.at, at), tested_from)
 
 
 def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:
-    """The disagreement of each robot that can be judged.
+    """Return the disagreement of each robot that can be judged.
 
     chance: a share of the joint cost that a right robot exceeds with a probability above e^−chance
     is no disagreement.
@@ -116,8 +116,8 @@ def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, f
 
 
 def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
-    """The χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it; None with
-    too few submaps.
+    """Return the χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it;
+    None with too few submaps.
 
     costs: χ² and dof of each, oldest first. That MOST_OF of NEWEST submaps exceed χ² bounds of
     probability e^−x each has a probability below 4 e^(−3x).
@@ -132,8 +132,8 @@ def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
 
 
 def _share(chi2: float, dof: float, chance: float) -> float | None:
-    """The joint cost per degree of freedom, at most 1 where chance explains it; None where too few
-    degrees of freedom are left to judge it.
+    """Return the joint cost per degree of freedom, at most 1 where chance explains it; None where
+    too few degrees of freedom are left to judge it.
 
     A cost without degrees of freedom, or without end, has overflown: a disagreement like any other.
     """
@@ -149,21 +149,21 @@ def _bound(dof: float, chance: float) -> float:
     return dof + 2.0 * math.sqrt(dof * chance) + 2.0 * chance
 
 
-def suspects(agreement: Agreement, limit: float) -> list[str]:
-    """The robots whose disagreement is above the limit, the most suspect first."""
+def find_suspects(agreement: Agreement, limit: float) -> list[str]:
+    """List the robots whose disagreement is above the limit, the most suspect first."""
     found = disagreement(agreement)
     wrong = sorted((-value, robot) for robot, value in found.items() if value > limit)
     return [robot for _, robot in wrong]
 
 
-def convicted(agreement: Agreement, limit: float, without: Without) -> Trial:
-    """The robot that is wrong beyond chance, by leaving out one robot after the other.
+def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
+    """Find the robot that is wrong beyond chance by leaving out one robot after the other.
 
     It is the only one without which the rest agree, and two others at least agree on that; or it is
     the only one of those that contradicts itself when alone.
     """
     found = disagreement(agreement)
-    suspected = suspects(agreement, limit)
+    suspected = find_suspects(agreement, limit)
     if not suspected:
         return Trial()
     others = sorted({*found} - {*suspected}, key=lambda robot: (found[robot], robot))
@@ -192,7 +192,7 @@ def convicted(agreement: Agreement, limit: float, without: Without) -> Trial:
 
 
 def cost_share(chi2: float, dof: float, chance: float) -> float:
-    """The cost per degree of freedom, at most 1 where a probability above e^−chance explains it."""
+    """Return the cost per degree of freedom, at most 1 where e^−chance explains it."""
     share = _share(chi2, dof, chance)
     return 1.0 if share is None else share
 

@@ -12,7 +12,7 @@ import pytest
 from central import tick_fold
 from central.map_publisher import MapPublisher
 from central.submap_fold import SubmapFold
-from central.withdrawal import Trial, convicted, disagreement
+from central.withdrawal import Trial, disagreement, hold_trial
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario
 from sim.world.simulator import simulated
@@ -185,7 +185,7 @@ def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grow
         return Trial(undecided="r1, r2 contradict each other")
 
     samples = run_with("r1", "swap")
-    monkeypatch.setattr(tick_fold, "convicted", undecided)
+    monkeypatch.setattr(tick_fold, "hold_trial", undecided)
     early = tuple(each for each in samples if each.stamp_ns <= 30e9)
     ticks = of_set(early)
     first = ticks.fold_ahead()
@@ -245,7 +245,7 @@ def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:
         rest = {each: cost for each, cost in left.robots.items() if each not in robots}
         return Agreement(0.0, 1.0, rest, ())
 
-    found = convicted(loud, 4.0, without)
+    found = hold_trial(loud, 4.0, without)
     assert found.robot is None
     assert found.undecided.startswith("r1, r2 contradict each other: cost 200.0 per degree")
 
@@ -257,7 +257,7 @@ def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree() -> 
         costs["r3"] = (1e6 if liar_is_there else 50.0, 50.0)
         return Agreement(0.0, 1.0, {r: costs[r] for r in costs if r not in robots}, ())
 
-    assert convicted(without(()), 4.0, without).robot == "r1"
+    assert hold_trial(without(()), 4.0, without).robot == "r1"
 
 
 @pytest.mark.parametrize(("chi2", "dof"), [(np.inf, 40.0), (np.nan, 40.0), (1e9, -47.0)])

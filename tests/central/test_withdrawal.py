@@ -17,7 +17,7 @@ from central.map_publisher import MapPublisher
 from central.node import CentralNode
 from central.submap_fold import SubmapFold
 from central.tick_fold import TickFold
-from central.withdrawal import convicted, disagreement
+from central.withdrawal import disagreement, hold_trial
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, with_options
 from sim.world.config import OutlierKind, SimulatedWorld
@@ -347,7 +347,7 @@ def agreement(**ratios: float) -> Agreement:
 
 
 def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | None:
-    return convicted(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
+    return hold_trial(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
 
 
 def test_who_is_wrong_is_whose_absence_makes_the_rest_agree() -> None:
