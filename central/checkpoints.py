@@ -88,7 +88,7 @@ def _compacted(checkpoint: Checkpoint) -> Checkpoint:
 
 
 def thinned(kept: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
-    """The checkpoints to keep: the newest, then ever fewer.
+    """Return the checkpoints to keep: the newest, then ever fewer.
 
     Of those that are n to 2n ticks old two to four are kept: a late submap is folded from a
     checkpoint that is at most twice as old as it, and there are about twenty in all.

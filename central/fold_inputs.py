@@ -51,7 +51,7 @@ class FoldInputs:
         return min((tick for tick in ticks if tick is not None), default=math.inf)
 
     def _tick_judging(self, verdict: Verdict) -> int | None:
-        """The first tick by which both landmarks' submaps have arrived; None while one is
+        """Return the first tick by which both landmarks' submaps have arrived; None while one is
         missing.
         """
         ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
@@ -59,23 +59,23 @@ class FoldInputs:
         return max(known) if len(known) == len(ticks) else None
 
     def first_tick_of(self, robot: str) -> float:
-        """The first tick with a submap of a robot or an inter-robot measurement of it; infinity
-        if there is none.
+        """Return the first tick with a submap of a robot or an inter-robot measurement of it;
+        infinity if there is none.
         """
         ticks = self._members.behind(-math.inf)
         return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
 
     def ticks_after(self, last: float, without: Collection[str]) -> list[int]:
-        """The ticks after this one with a submap of any other robot, ascending."""
+        """List the ticks after this one with a submap of any other robot, ascending."""
         ticks = self._members.behind(last)
         return [tick for tick in ticks if self._members.has(tick, without)]
 
     def size(self, tick: int, without: Collection[str]) -> int:
-        """Number of submaps of a tick, those of some robots left out."""
+        """Count the submaps of a tick, those of some robots left out."""
         return len(self._members.keys(tick, without))
 
     def chains(self, robot: str) -> Mapping[Stream, Sequence[Contribution]]:
-        """The submaps of each of a robot's streams within the bounds, in order."""
+        """Return the submaps of each of a robot's streams within the bounds, in order."""
         found: dict[Stream, list[Contribution]] = {}
         for tick in self._members.behind(-math.inf):
             for key in self._members.keys(tick, ()):
@@ -86,11 +86,11 @@ class FoldInputs:
         return found
 
     def raised(self, without: Collection[str]) -> Mapping[str, int]:
-        """By robot, how many folded submaps have had their covariance raised to the least one."""
+        """Count, by robot, the folded submaps whose covariance was raised to the least one."""
         return self._members.raised(without)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
-        """The members of a tick, without some robots' submaps and the measurements of these robots.
+        """Return the members of a tick without some robots' submaps and measurements of these.
 
         Submaps beyond the bounds are named as such; inter-robot measurements and initial poses
         beyond them are set aside in words.
@@ -138,7 +138,7 @@ class FoldInputs:
     def digest(
         self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]
     ) -> bytes:
-        """The name of a fold's set: `more`, the robots left out, initial poses and verdicts, then
+        """Name a fold's set: `more`, the robots left out, initial poses and verdicts, then
         the submaps in canonical order. closed: the last tick whose digest is worth caching.
         """
         starts = [

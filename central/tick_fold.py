@@ -39,8 +39,8 @@ from central.withdrawal import (
     Conviction,
     Suspension,
     Trial,
-    convicted,
-    suspects,
+    find_suspects,
+    hold_trial,
 )
 from team.estimation.association.landmark_sets import Verdict
 from team.estimation.contribution import Stream
@@ -66,7 +66,7 @@ fold, since the ticks would take hours."""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
-    """The join's settings in a centre's configuration."""
+    """Return the join's settings of a centre's configuration."""
     return JoinSettings(
         iterations_per_tick=config.gauss_newton_per_tick,
         robust_c=config.robust_c,
@@ -105,12 +105,14 @@ class TickFold:
         self.convicts = config.withdraw_above is not None
         self._ordered: frozenset[str] = frozenset()
         self._agreed: tuple[Fold, Agreement] | None = None
+        self._accused: Mapping[str, str] = {}
         self.undecided = ""
         self._restart(Conviction())
 
     def _restart(self, conviction: Conviction) -> None:
         """Forget every tick that was folded, under another conviction."""
         self._conviction = conviction
+        self._retried = 0.0
         self.checkpoints = Checkpoints()
 
     # Inputs.
@@ -213,9 +215,7 @@ class TickFold:
         return folded
 
     def _open_ticks(self, watermark_ns: float = math.inf) -> list[int]:
-        """The ticks up to the watermark that are not folded yet and have a submap of a robot that
-        is not withdrawn.
-        """
+        """List the ticks up to the watermark that are not folded, withdrawn robots left out."""
         ticks = self._inputs.ticks_after(self.checkpoints.tick, self._gone)
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
@@ -251,13 +251,13 @@ class TickFold:
     # The robot that contradicts the rest.
 
     def agreement(self, fold: Fold) -> Agreement:
-        """The agreement of a fold; the last one's is cached, since a broadcast asks again."""
+        """Return the agreement of a fold, cached for the last one, since a broadcast asks again."""
         if self._agreed is None or self._agreed[0] is not fold:
             self._agreed = fold, marginals.joint_cost(fold)
         return self._agreed[1]
 
     def _due_for_retrial(self, tick: int) -> str | None:
-        """A suspended robot that is tested again at a tick; None if there is none."""
+        """Return a suspended robot that is tested again at a tick; None if there is none."""
         suspended = self._conviction.suspended
         if not suspended:
             return None
@@ -265,7 +265,7 @@ class TickFold:
         return next((r for r in sorted(suspended) if size >= suspended[r].retried), None)
 
     def _size_until(self, tick: float) -> int:
-        """Number of submaps up to a tick, those of suspended robots included."""
+        """Count the submaps up to a tick, those of suspended robots included."""
         gone = self._gone.difference(self._conviction.suspended)
         ticks = self._inputs.ticks_after(-math.inf, gone)
         return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
@@ -297,28 +297,26 @@ class TickFold:
         return True
 
     def _try_robots(self, fold: Fold, until_ns: float) -> Trial | None:
-        """The trial of a fold up to this time; None where nobody is suspect."""
+        """Hold a trial of a fold up to this time; return None where no robot is suspect."""
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
             return None
-        if not suspects(self.agreement(fold), limit):
+        if not find_suspects(self.agreement(fold), limit):
             return None
 
         def without(robots: Collection[str]) -> Agreement | None:
             rest = self.leave_out(robots, until_ns).fold
             return self._agreement_at_rest(rest) if rest.home else None
 
-        return convicted(self._agreement_at_rest(fold), limit, without)
+        return hold_trial(self._agreement_at_rest(fold), limit, without)
 
     def _agreement_at_rest(self, fold: Fold) -> Agreement:
-        """The agreement of a raw fold's full solution, of a condensed one as it is."""
+        """Return the agreement of a raw fold's full solution, of a condensed one as it is."""
         at_rest = fold if fold.condensed_count else converged(fold, self.settings)
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
-        """Another fold of the same inputs without some robots' up to a time; it withdraws no
-        further robot.
-        """
+        """Fold the same inputs up to a time without some robots; no further one is withdrawn."""
         return self._fold_others(robots, until_ns, self._limits)
 
     def _fold_others(
@@ -333,23 +331,32 @@ class TickFold:
     # Solutions beyond the closed ticks.
 
     def fold_ahead(self) -> Fold:
-        """The provisional fold over all inputs, those ahead of the watermark included."""
+        """Return the provisional fold: all inputs, those ahead of the watermark included."""
         fold = self.fold
         for tick in self._open_ticks():
             fold = self._fold_tick(fold, tick)
         return fold
 
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
-        """The robot that contradicts the rest in a provisional fold, with the reason in words; none
-        where nothing is ahead of the watermark, since the ticks behind it are tested by themselves.
+        """Find the robot that contradicts the rest in a provisional fold, with the reason in words.
+
+        There is none where nothing is ahead of the watermark: closed ticks are tested themselves.
+
+        A trial folds the set again for each candidate, so its result holds until the set has grown
+        by GROWTH.
         """
         if provisional is self.fold or not self.convicts:
             return {}
-        found = self._try_robots(provisional, math.inf)
-        return {} if found is None or found.robot is None else {found.robot: found.reason}
+        if provisional.size >= self._retried:
+            found = self._try_robots(provisional, math.inf)
+            self._retried = 0.0 if found is None else GROWTH * provisional.size
+            self._accused = (
+                {} if found is None or found.robot is None else {found.robot: found.reason}
+            )
+        return {robot: why for robot, why in self._accused.items() if robot not in self._gone}
 
     def solve(self) -> Fold:
-        """The full solution of all inputs, without the robots that it withdraws.
+        """Solve for all inputs in full, without the robots that are then withdrawn.
 
         Suspended robots are tested with all that they sent, one after the other.
         """
@@ -367,7 +374,7 @@ class TickFold:
                 return fold
 
     def _fold_raw(self) -> Fold:
-        """The fold over all ticks with nothing condensed."""
+        """Return the fold over all ticks with nothing condensed."""
         fold = self.fold
         if self._limits is None or fold.size <= self._limits.begin:
             return fold
@@ -378,8 +385,9 @@ class TickFold:
         return self._fold_others((), math.inf, None).fold
 
     def find_carried_off(self, fold: Fold) -> list[CarriedOff]:
-        """Where the robots that the fold has withdrawn were carried off, as far as their submaps
-        show it; fold: one without them.
+        """Find where the withdrawn robots were carried off, as far as their submaps show it.
+
+        fold: one without them.
         """
         limit = self._config.withdraw_above
         if limit is None:
@@ -399,11 +407,11 @@ class TickFold:
     # The names of a fold.
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
-        """The name of the fold's set: starts and submaps in canonical order, and `more`."""
+        """Name the fold's set: starts and submaps in canonical order, and `more`."""
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
-        """The version vector: the last sequence of each stream that was folded or refused."""
+        """Return the version vector: the last sequence of each stream, folded or refused."""
         last = {stream: fold.next_sequence(stream) - 1 for stream in fold.home}
         for _, robot, incarnation, sequence in fold.refused:
             last[robot, incarnation] = max(last.get((robot, incarnation), -1), sequence)

@@ -1,10 +1,10 @@
 """Finds the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
 A robot's disagreement is the larger of two figures, both near or below 1 where its covariances are
-right: its share of the joint cost per degree of freedom, where that is beyond chance, and the
-median over its submaps of χ²/dof, where it has enough of them. The first one finds a single
-contradiction that the map takes at full weight. A robust loss bounds it; there the second one finds
-a robot whose submaps disagree in the majority.
+right: its share of the joint cost per degree of freedom, and χ²/dof of its submaps, which most of
+them exceed; each where it is beyond chance. The first one finds a single contradiction that enters
+the map at full weight. A robust loss bounds it; there the second one finds a robot whose submaps
+disagree in the majority: over all of them if there are many, over the newest ones if there are few.
 
 One wrong robot distorts the map and makes others disagree, too; one that claims to be very sure,
 or that fixes the frame, makes only others disagree. So nobody is judged by its own disagreement.
@@ -15,15 +15,18 @@ them contradicts itself when alone.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""Least number of submaps of a robot for their median to be judged, and for it to be withdrawn
-before the final map; with fewer it is suspended."""
+"""Least number of submaps of a robot for all of them to be judged by their median, and for it to be
+withdrawn before the final map; with fewer it is suspended."""
+NEWEST, MOST_OF = 4, 3
+"""With fewer submaps than that a robot is judged by its newest ones: by the disagreement that
+MOST_OF of the NEWEST exceed."""
 AGREEING = 0.5
 """The rest agree if no disagreement is above this share of the limit."""
 TRIED = 3
@@ -77,45 +80,60 @@ class Conviction:
     tested_from: float = -math.inf
 
     def withdraw(self, robot: str, reason: str, at: float) -> "Conviction":
-        """The conviction with one more robot withdrawn."""
+        """Withdraw one more robot."""
         without = self.acquit(robot, at, -math.inf)
         return replace(without, withdrawn={**self.withdrawn, robot: reason})
 
     def suspend(self, robot: str, suspension: Suspension, at: float) -> "Conviction":
-        """The conviction with one more robot suspended."""
+        """Suspend one more robot."""
         suspended = {**self.suspended, robot: suspension}
         return Conviction(self.withdrawn, suspended, max(self.at, at))
 
     def acquit(self, robot: str, at: float, tested_from: float) -> "Conviction":
-        """The conviction under which a suspended robot is tested again."""
+        """Take a suspended robot in again, to be tested."""
         suspended = {each: why for each, why in self.suspended.items() if each != robot}
         return Conviction(self.withdrawn, suspended, max(self.at, at), tested_from)
 
 
 def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:
-    """The disagreement of each robot that can be judged.
+    """Return the disagreement of each robot that can be judged.
 
     chance: a share of the joint cost that a right robot exceeds with a probability above e^−chance
     is no disagreement.
     """
-    ratios: dict[str, list[float]] = {}
+    costs: dict[str, list[tuple[float, float]]] = {}
     for (robot, _), _, chi2, dof, _ in agreement.submaps:
         if dof >= 1.0:
-            ratios.setdefault(robot, []).append(chi2 / dof)
+            costs.setdefault(robot, []).append((chi2, dof))
     found = {}
-    for robot in sorted({*ratios, *agreement.robots}):
-        own = ratios.get(robot, [])
-        values = [median(own)] if len(own) >= LEAST_SUBMAPS else []
-        if (share := _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)) is not None:
-            values.append(share)
+    for robot in sorted({*costs, *agreement.robots}):
+        of_submaps = _most(costs.get(robot, []), chance)
+        share = _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)
+        values = [each for each in (of_submaps, share) if each is not None]
         if values:
             found[robot] = max(values)
     return found
 
 
+def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
+    """Return the χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it;
+    None with too few submaps.
+
+    costs: χ² and dof of each, oldest first. That MOST_OF of NEWEST submaps exceed χ² bounds of
+    probability e^−x each has a probability below 4 e^(−3x).
+    """
+    if len(costs) >= LEAST_SUBMAPS:
+        return median(chi2 / dof for chi2, dof in costs)
+    if len(costs) < NEWEST:
+        return None
+    beyond = (chance + math.log(math.comb(NEWEST, MOST_OF))) / MOST_OF
+    shares = (_share(chi2, dof, beyond) for chi2, dof in costs[-NEWEST:])
+    return sorted((1.0 if each is None else each for each in shares), reverse=True)[MOST_OF - 1]
+
+
 def _share(chi2: float, dof: float, chance: float) -> float | None:
-    """The joint cost per degree of freedom, at most 1 where chance explains it; None where too few
-    degrees of freedom are left to judge it.
+    """Return the joint cost per degree of freedom, at most 1 where chance explains it; None where
+    too few degrees of freedom are left to judge it.
 
     A cost without degrees of freedom, or without end, has overflown: a disagreement like any other.
     """
@@ -131,21 +149,21 @@ def _bound(dof: float, chance: float) -> float:
     return dof + 2.0 * math.sqrt(dof * chance) + 2.0 * chance
 
 
-def suspects(agreement: Agreement, limit: float) -> list[str]:
-    """The robots whose disagreement is above the limit, the most suspect first."""
+def find_suspects(agreement: Agreement, limit: float) -> list[str]:
+    """List the robots whose disagreement is above the limit, the most suspect first."""
     found = disagreement(agreement)
     wrong = sorted((-value, robot) for robot, value in found.items() if value > limit)
     return [robot for _, robot in wrong]
 
 
-def convicted(agreement: Agreement, limit: float, without: Without) -> Trial:
-    """The robot that is wrong beyond chance, by leaving out one robot after the other.
+def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
+    """Find the robot that is wrong beyond chance by leaving out one robot after the other.
 
     It is the only one without which the rest agree, and two others at least agree on that; or it is
     the only one of those that contradicts itself when alone.
     """
     found = disagreement(agreement)
-    suspected = suspects(agreement, limit)
+    suspected = find_suspects(agreement, limit)
     if not suspected:
         return Trial()
     others = sorted({*found} - {*suspected}, key=lambda robot: (found[robot], robot))
@@ -174,7 +192,7 @@ def convicted(agreement: Agreement, limit: float, without: Without) -> Trial:
 
 
 def cost_share(chi2: float, dof: float, chance: float) -> float:
-    """The cost per degree of freedom, at most 1 where a probability above e^−chance explains it."""
+    """Return the cost per degree of freedom, at most 1 where e^−chance explains it."""
     share = _share(chi2, dof, chance)
     return 1.0 if share is None else share
 

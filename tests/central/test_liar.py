@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from central import tick_fold
 from central.map_publisher import MapPublisher
 from central.submap_fold import SubmapFold
-from central.withdrawal import convicted, disagreement
+from central.withdrawal import Trial, disagreement, hold_trial
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario
 from sim.world.simulator import simulated
@@ -93,7 +94,7 @@ class Liar(RobotNode):
 
 
 @cache
-def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
+def run_with(liar: str, kind: str, robust_c: float | None = None) -> tuple[Sample, ...]:
     """The small team in which one robot lies."""
 
     def robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
@@ -102,7 +103,7 @@ def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
             node.kind = kind
         return node
 
-    of: Scenario = scenario()
+    of: Scenario = scenario(robust_c=robust_c)
     talking = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
     of = msgspec.structs.replace(of, robots=talking)
     return tuple(run_team(of, simulated(of.world, of.robots, of.seed), robot))
@@ -162,6 +163,42 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
     assert list(ticks.convicted) == ["r1"]
 
 
+@pytest.mark.parametrize("kind", ["micrometre", "far", "swap"])
+def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind: str) -> None:
+    """Most of its newest submaps contradict the map, however little they weigh."""
+    samples = run_with("r1", kind, 1.0)
+    ticks = of_set(samples, central=scenario(robust_c=1.0).central)
+    ticks.fold_until(30e9)
+    assert list(ticks.suspended) == ["r1"]
+    ticks.fold_until(math.inf)
+    assert list(ticks.convicted) == ["r1"]
+    assert final_map(list(samples)).withdrawn == ("r1",)
+
+
+def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trials: list[float] = []
+
+    def undecided(agreement: Agreement, *_: object) -> Trial:
+        trials.append(agreement.dof)
+        return Trial(undecided="r1, r2 contradict each other")
+
+    samples = run_with("r1", "swap")
+    monkeypatch.setattr(tick_fold, "hold_trial", undecided)
+    early = tuple(each for each in samples if each.stamp_ns <= 30e9)
+    ticks = of_set(early)
+    first = ticks.fold_ahead()
+    for _ in range(2):
+        assert ticks.accuse(first) == {}
+        assert len(trials) == 1
+    for each in messages(samples, m.Submap):
+        if each.stamp_ns > 30e9:
+            ticks.add_submap(msgspec.structs.replace(each, sightings=0), bytes(8))
+    assert ticks.accuse(ticks.fold_ahead()) == {}
+    assert len(trials) == 2
+
+
 def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:
     """One of its first submaps is wrong by 0.8 m; its true ones outvote it later."""
     samples = team_run()
@@ -208,7 +245,7 @@ def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:
         rest = {each: cost for each, cost in left.robots.items() if each not in robots}
         return Agreement(0.0, 1.0, rest, ())
 
-    found = convicted(loud, 4.0, without)
+    found = hold_trial(loud, 4.0, without)
     assert found.robot is None
     assert found.undecided.startswith("r1, r2 contradict each other: cost 200.0 per degree")
 
@@ -220,7 +257,7 @@ def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree() -> 
         costs["r3"] = (1e6 if liar_is_there else 50.0, 50.0)
         return Agreement(0.0, 1.0, {r: costs[r] for r in costs if r not in robots}, ())
 
-    assert convicted(without(()), 4.0, without).robot == "r1"
+    assert hold_trial(without(()), 4.0, without).robot == "r1"
 
 
 @pytest.mark.parametrize(("chi2", "dof"), [(np.inf, 40.0), (np.nan, 40.0), (1e9, -47.0)])

@@ -17,7 +17,7 @@ from central.map_publisher import MapPublisher
 from central.node import CentralNode
 from central.submap_fold import SubmapFold
 from central.tick_fold import TickFold
-from central.withdrawal import convicted, disagreement
+from central.withdrawal import disagreement, hold_trial
 from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import Scenario, with_options
 from sim.world.config import OutlierKind, SimulatedWorld
@@ -347,7 +347,7 @@ def agreement(**ratios: float) -> Agreement:
 
 
 def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | None:
-    return convicted(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
+    return hold_trial(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
 
 
 def test_who_is_wrong_is_whose_absence_makes_the_rest_agree() -> None:
@@ -375,7 +375,16 @@ def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
     costs[:4] = [each._replace(chi2=500.0) for each in costs[:4]]
     assert disagreement(Agreement(0.0, 1.0, {}, tuple(costs)))["a"] < 2.0
     assert np.isclose(disagreement(agreement(a=3.0))["a"], 3.0 * 0.98)
-    assert disagreement(Agreement(0.0, 1.0, {}, agreement(a=9.0).submaps[:7])) == {}
+
+
+def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four() -> None:
+    bad, good = agreement(a=9.0).submaps[:7], agreement(a=1.0).submaps[:5]
+    of_last_four = [0.92, 0.96, 1.0, 1.04]
+    found = disagreement(Agreement(0.0, 1.0, {}, bad))["a"]
+    assert np.isclose(found, 9.0 * sorted(of_last_four)[1])
+    for few in ((*good, *bad[-2:]), (*bad[:3], *good[:4])):
+        assert disagreement(Agreement(0.0, 1.0, {}, few))["a"] <= 1.0
+    assert disagreement(Agreement(0.0, 1.0, {}, bad[:3])) == {}
 
 
 def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:

@@ -232,7 +232,7 @@ def _normal_equations(
 def _iterated(
     state: Values, offset: Indices, factors: SubmapFactors, damping: float
 ) -> tuple[Values, float, float]:
-    """One step of `least_squares.iterated`: the next state, the damping for the step after it and
+    """One step of `gauss_newton.take_step`: the next state, the damping for the step after it and
     the largest change of the full step; NaN where an unknown is not determined.
     """
     H, gradient = _normal_equations(state, offset, factors)

@@ -15,6 +15,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -26,9 +27,16 @@ from team.estimation.dense_kernel import add_product
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining import inter_robot_kernel as sightings
 from team.estimation.map_joining import joining_kernel as kernel
-from team.estimation.map_joining import least_squares
 from team.estimation.map_joining.condensing_kernel import add_blocks
-from team.estimation.map_joining.least_squares import STUCK, Values, robust_scale
+from team.estimation.map_joining.least_squares import (
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    ROUNDING,
+    SHARES,
+    STUCK,
+    Values,
+    robust_scale,
+)
 from team.estimation.map_joining.priors_kernel import add_priors, prior_terms
 from team.estimation.map_joining.resting_kernel import own_blocks, symmetric_of
 from team.estimation.map_joining.submap_graph import CommonBias, Graph
@@ -100,7 +108,7 @@ UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, eq=False)
-class Island(least_squares.Iterate):
+class Island:
     """One frame: its graph, the state (poses and landmarks by node) and the ages of the factors.
 
     age, sighting_age: number of iterations since each submap and each inter-robot measurement was
@@ -246,8 +254,10 @@ class Island(least_squares.Iterate):
         return np.where(of_bias, weight, 1.0)
 
     def cost_of(self, other: "Island") -> float:
-        """The cost of another state with the weights of this one: the quantity that an iteration
-        lowers.
+        """The cost Σ w χ² of another state with the weights and the noise of this one: the quantity
+        that an iteration lowers.
+
+        Where it falls the robust cost falls too, since each loss lies below its parabola.
         """
         settings = self.settings
         if other is self or (settings.robust_c is None and not settings.joined_ranges):
@@ -341,10 +351,10 @@ class Island(least_squares.Iterate):
         add_priors(values, gradient, graph.prior_factors, slopes, self.prior_weight, at)
         return values, gradient
 
-    @property
-    def diagonal(self) -> Int64[np.ndarray, " n"]:
-        """Indices of the information matrix' diagonal among its values."""
-        return self.graph.pattern.diagonal
+    @cached_property
+    def step(self) -> Values:
+        """The full step, −A⁻¹g."""
+        return -sparse.solved(self.posterior, self.normal_equations[1][:, None])[:, 0]
 
     @cached_property
     def posterior(self) -> sparse.Cholesky:
@@ -468,10 +478,50 @@ def _stands_still(island: Island) -> bool:
     return squared <= STILL * len(island.graph.submaps)
 
 
-def _iteration(island: Island, damping: float) -> tuple[Island, least_squares.Iteration]:
+class Iteration(NamedTuple):
+    """The outcome of one step: the damping for the next one (or STUCK), the full step's largest
+    change.
+    """
+
+    damping: float
+    change: float
+
+
+def _iteration(island: Island, damping: float) -> tuple[Island, Iteration]:
     """One iteration; the island is one iteration older even where no step lowers the cost."""
-    after, outcome = least_squares.iterated(island, _eased(damping))
+    after, outcome = take_step(island, _eased(damping))
     return aged(island, 1) if after is island else after, outcome
+
+
+def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
+    """Take one step: return the next island and the outcome of the step.
+
+    The step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, if undamped, a share
+    of it; else a more damped one. Where no damping helps the island is returned unchanged, with the
+    change of the first step.
+    """
+    values, gradient = island.normal_equations
+    before = island.cost_of(island)
+    refused = None
+    while damping < MOST_DAMPING:
+        if damping:
+            damped = values.copy()
+            damped[island.graph.pattern.diagonal] *= 1.0 + damping
+            step = -sparse.solved(island.factorised(damped), gradient[:, None])[:, 0]
+        else:
+            step = island.step
+        for share in (1.0,) if damping else SHARES:
+            moved = island.moved(share * step)
+            if island.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:
+                eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+                return moved, Iteration(eased, _largest(step))
+        refused = _largest(step) if refused is None else refused
+        damping = max(10.0 * damping, LEAST_DAMPING)
+    return island, Iteration(STUCK, math.inf if refused is None else refused)
+
+
+def _largest(step: Values) -> float:
+    return float(np.abs(step).max(initial=0.0))
 
 
 def _eased(damping: float) -> float:

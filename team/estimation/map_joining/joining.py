@@ -190,13 +190,12 @@ class Fold:
     @property
     def condensed_count(self) -> int:
         """Number of condensed submaps (`condensing`), which are not among `contributions`."""
-        factors = (island.graph.condensed for island in self.islands.values())
-        return sum(each.submaps for each in factors if each is not None)
+        return self.size - len(self.contributions)
 
     @property
     def size(self) -> int:
         """Number of submaps in the fold, condensed ones included."""
-        return self.condensed_count + len(self.contributions)
+        return sum(island.graph.size for island in self.islands.values())
 
     @property
     def main_key(self) -> Stream | None:

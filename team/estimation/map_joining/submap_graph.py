@@ -8,6 +8,7 @@ values. The value of an added node is composed from the nodes that are in the gr
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
@@ -454,35 +455,45 @@ def without_nodes(
     streams, gone = {}, dict(graph.gone)
     for stream, nodes in graph.streams.items():
         first = int(eliminated[list(nodes)].sum())
-        streams[stream] = tuple(node_of[list(nodes[first:])].tolist())
+        streams[stream] = nodes[first:]
         gone[stream] = gone.get(stream, 0) + first
-    left = Graph(
+    left = replace(
+        graph,
         streams=streams,
-        landmarks={id_: int(node_of[n]) for id_, n in graph.landmarks.items() if not eliminated[n]},
-        poses={at: int(node_of[n]) for at, n in graph.poses.items() if not eliminated[n]},
-        biases={at: int(node_of[node]) for at, node in graph.biases.items()},
-        offset=_starts(np.diff(graph.offset)[~eliminated].tolist()),
-        fixed=graph.fixed[~eliminated],
-        submaps=tuple(
-            each._replace(nodes=node_of[each.nodes])
-            for each, stays in zip(graph.submaps, submaps.tolist(), strict=True)
-            if stays
-        ),
-        sightings=tuple(
-            Encounter(each.sighting, int(node_of[each.observer]), int(node_of[each.teammate]))
-            for each, stays in zip(graph.sightings, sightings.tolist(), strict=True)
-            if stays
-        ),
-        priors=tuple(
-            each._replace(node=int(node_of[each.node]))
-            for each, stays in zip(graph.priors, priors.tolist(), strict=True)
-            if stays
-        ),
-        common={bias: int(node_of[node]) for bias, node in graph.common.items()},
+        landmarks={id_: node for id_, node in graph.landmarks.items() if not eliminated[node]},
+        poses={at: node for at, node in graph.poses.items() if not eliminated[node]},
+        submaps=tuple(compress(graph.submaps, submaps)),
+        sightings=tuple(compress(graph.sightings, sightings)),
+        priors=tuple(compress(graph.priors, priors)),
+        condensed=None,
         gone=gone,
+    )
+    return _renumbered(left, node_of, ~eliminated), node_of
+
+
+def _renumbered(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
+    """The graph with other numbers of its nodes, some of which it no longer has or become one.
+
+    node_of: the new number of each node. stays: the nodes that the new ones stem from, ascending.
+    Condensed factors keep their numbers.
+    """
+    return replace(
+        graph,
+        streams={s: tuple(node_of[list(nodes)].tolist()) for s, nodes in graph.streams.items()},
+        landmarks={number: int(node_of[node]) for number, node in graph.landmarks.items()},
+        poses={key: int(node_of[node]) for key, node in graph.poses.items()},
+        biases={key: int(node_of[node]) for key, node in graph.biases.items()},
+        common={bias: int(node_of[node]) for bias, node in graph.common.items()},
+        offset=_starts(np.diff(graph.offset)[stays].tolist()),
+        fixed=graph.fixed[stays],
+        submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
+        sightings=tuple(
+            Encounter(seen, int(node_of[observer]), int(node_of[teammate]))
+            for seen, observer, teammate in graph.sightings
+        ),
+        priors=tuple(each._replace(node=int(node_of[each.node])) for each in graph.priors),
         memory=graph.memory.renumbered(node_of),
     )
-    return left, node_of
 
 
 def with_landmarks(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
@@ -548,36 +559,22 @@ def merged(
         node_of[node] = len(main.fixed) + len(values)
         value = other_state[other.offset[node] : other.offset[node + 1]]
         values.append(_moved(main_from_other, value))
-    streams = {
-        stream: tuple(node_of[list(nodes)].tolist()) for stream, nodes in other.streams.items()
-    }
-    landmarks = {id_: int(node_of[node]) for id_, node in other.landmarks.items()}
-    poses = {key: int(node_of[node]) for key, node in other.poses.items()}
-    sightings = (
-        Encounter(each, int(node_of[observer]), int(node_of[teammate]))
-        for each, observer, teammate in other.sightings
-    )
-    biases = {key: int(node_of[node]) for key, node in other.biases.items()}
-    of_team = {bias: int(node_of[node]) for bias, node in other.common.items()}
-    priors = (
-        prior._replace(node=int(node_of[prior.node]))
+    moved = _renumbered(other, node_of, np.ones(len(other.fixed), np.bool_))
+    kept = [
+        len(prior.mean) == 1 and prior.node not in common  # of a bias, not of an initial pose
         for prior in other.priors
-        if len(prior.mean) == 1 and prior.node not in common
-    )
+    ]
     graph = Graph(
-        streams={**main.streams, **streams},
-        landmarks={**landmarks, **main.landmarks},
-        poses={**main.poses, **poses},
-        biases={**main.biases, **biases},
+        streams={**main.streams, **moved.streams},
+        landmarks={**moved.landmarks, **main.landmarks},
+        poses={**main.poses, **moved.poses},
+        biases={**main.biases, **moved.biases},
         offset=_continued(main.offset, [len(value) for value in values]),
         fixed=np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
-        submaps=(
-            *main.submaps,
-            *(each._replace(nodes=node_of[each.nodes]) for each in other.submaps),
-        ),
-        sightings=(*main.sightings, *sightings),
-        priors=(*main.priors, *priors),
-        common={**of_team, **main.common},
+        submaps=(*main.submaps, *moved.submaps),
+        sightings=(*main.sightings, *moved.sightings),
+        priors=(*main.priors, *compress(moved.priors, kept)),
+        common={**moved.common, **main.common},
         condensed=main.condensed,
         gone={**main.gone, **other.gone},
         memory=main.memory,
@@ -599,28 +596,13 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
         stands_for[node] = first.setdefault(number, node)
         remaining[node] = stands_for[node] == node
     node_of = (np.cumsum(remaining) - 1)[stands_for]
-    sizes = np.diff(graph.offset)
+    sizes, old = np.diff(graph.offset), graph.condensed
     renamed = replace(
         graph,
-        streams={s: tuple(node_of[list(nodes)].tolist()) for s, nodes in graph.streams.items()},
-        landmarks={number: int(node_of[node]) for number, node in first.items()},
-        poses={key: int(node_of[node]) for key, node in graph.poses.items()},
-        biases={key: int(node_of[node]) for key, node in graph.biases.items()},
-        common={bias: int(node_of[node]) for bias, node in graph.common.items()},
-        offset=_starts(sizes[remaining].tolist()),
-        fixed=graph.fixed[remaining],
-        submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
-        sightings=tuple(
-            Encounter(seen, int(node_of[observer]), int(node_of[teammate]))
-            for seen, observer, teammate in graph.sightings
-        ),
-        priors=tuple(each._replace(node=int(node_of[each.node])) for each in graph.priors),
-        condensed=None
-        if graph.condensed is None
-        else tied_nodes(graph.condensed, sizes, node_of, becomes),
-        memory=graph.memory.renumbered(node_of),
+        landmarks=first,
+        condensed=None if old is None else tied_nodes(old, sizes, node_of, becomes),
     )
-    return renamed, state[np.repeat(remaining, sizes)]
+    return _renumbered(renamed, node_of, remaining), state[np.repeat(remaining, sizes)]
 
 
 def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:

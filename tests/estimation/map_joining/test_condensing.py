@@ -1,7 +1,6 @@
 """The bounded fold: close to the full one, consistent, and a pure function of its ticks."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,12 +8,11 @@ import pytest
 from team.estimation.map_joining import (
     condensing,
     gauss_newton,
-    least_squares,
     marginals,
     path_elimination,
 )
 from team.estimation.map_joining.condensing import Limits, condense_submaps
-from team.estimation.map_joining.gauss_newton import aged, final_cost
+from team.estimation.map_joining.gauss_newton import aged, final_cost, take_step
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
 from team.estimation.map_joining.minima import degrees_of_freedom
 from team.estimation.map_joining.path_elimination import quadratic
@@ -132,9 +130,9 @@ def test_an_iteration_that_would_hardly_move_a_condensed_fold_is_left_out(
 
     def counted(point, damping):
         taken.append(point)
-        return least_squares.iterated(point, damping)
+        return take_step(point, damping)
 
-    monkeypatch.setattr(gauss_newton, "least_squares", SimpleNamespace(iterated=counted))
+    monkeypatch.setattr(gauss_newton, "take_step", counted)
     full, bounded = both(world, settings)
     once = [point for point in taken if point.graph.condensed is not None]
     assert len(taken) - len(once) == 2 * 20 + 2 * (LAG + 1)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.least_squares import LEAST_DAMPING, iterated
+from team.estimation.map_joining.gauss_newton import JoinSettings, take_step
+from team.estimation.map_joining.least_squares import LEAST_DAMPING
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 
@@ -33,7 +33,7 @@ def test_a_damped_step_solves_the_equations_with_so_much_more_of_their_diagonal(
     hessian = dense(island.graph.pattern, values)
     damped = hessian + damping * np.diag(np.diag(hessian))
     expected = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
-    moved, (eased, largest) = iterated(island, damping)
+    moved, (eased, largest) = take_step(island, damping)
     np.testing.assert_allclose((moved.state - island.state)[free], expected, rtol=1e-6, atol=1e-10)
     np.testing.assert_array_equal(moved.state[~free], island.state[~free])
     assert largest == pytest.approx(np.abs(expected).max())
