@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.options import FAILED, WRONG_USE, fail, set_aside
+from sim.cli.options import FAILED, WRONG_USE, JsonFile, fail, set_aside, write_json
 
 app = typer.Typer()
 
@@ -25,15 +25,12 @@ def calibrate(
     scenario: Annotated[
         str | None, typer.Option(help="The scenario to begin with; default: the source's own.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures as JSON, too.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Learn odometry and sensor models from measurements; every figure with its uncertainty.
 
     With a ground truth also clock_offset_s, by which detections are stamped late.
     """
-    import json
     from dataclasses import asdict, replace
 
     from rich.console import Console
@@ -83,8 +80,7 @@ def calibrate(
     Console().print(table)
     for note in found.notes:
         typer.echo(note)
-    if json_file is not None:
-        json_file.write_text(json.dumps(asdict(found), indent=2) + "\n")
+    write_json(json_file, asdict(found))
     if output is not None:
         names = [name for name, _, _ in read]
         text = within(own, found, names, output) if own else scenario_toml(found, start, names)

@@ -1,13 +1,12 @@
 """`teamslam compare`: runs side by side."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from central.desk.pictures.style import Form
-from sim.cli.options import WRONG_USE, fail, warn_of_holes
+from sim.cli.options import WRONG_USE, JsonFile, fail, warn_of_holes, write_json
 
 app = typer.Typer()
 FEWEST = 2
@@ -19,7 +18,7 @@ def compare(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write the picture here (png, svg, pdf).")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Compare runs side by side: a column for each in a table, and a picture with -o."""
     from rich import box
@@ -52,8 +51,7 @@ def compare(
     Console().print(table)
     if output is not None and compare_picture(evaluated, output):
         typer.echo(f"wrote {output}")
-    if json_file is not None:
-        json_file.write_text(json.dumps(compare_figures(evaluated), indent=2) + "\n")
+    write_json(json_file, compare_figures(evaluated))
 
 
 def _check_picture(path: Path) -> None:

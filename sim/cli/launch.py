@@ -21,6 +21,7 @@ from sim.cli.options import (
     EstimatorOption,
     FusionOption,
     IdentitiesOption,
+    JsonFile,
     Keys,
     Peers,
     Pieces,
@@ -75,9 +76,7 @@ def launch(
     record: Annotated[
         Path | None, typer.Option(help="The log to write; default: log.mcap in the run's folder.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the result as JSON, too.")
-    ] = None,
+    json_file: JsonFile = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="The run's folder; default: a new one below runs/."),

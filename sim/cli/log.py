@@ -11,12 +11,14 @@ import typer
 from sim.cli.options import (
     FAILED,
     WRONG_USE,
+    JsonFile,
     LogArgument,
     count_noun,
     fail,
     refuse_existing,
     tell_holes,
     warn_of_holes,
+    write_json,
 )
 from sim.cli.recorded import repair
 from team.extras import install_command
@@ -54,12 +56,9 @@ class Format(StrEnum):
 def info(
     log: LogArgument,
     keys: Annotated[bool, typer.Option("--keys", help="A row per key, not per channel.")] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures of every key, too.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Show the contents of a log: channels, messages, bytes, rates, span in team time, metadata."""
-    import json
     from dataclasses import asdict
 
     from rich.console import Console
@@ -88,18 +87,17 @@ def info(
     for name, value in opened.metadata.items():
         console.print(Text(one_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
     tell_holes(log, lacks)
-    if json_file is not None:
-        figures = {
-            "log": str(log),
-            "team": opened.team,
-            "complete": opened.complete,
-            "lacks": [str(each) for each in lacks],
-            "span_ns": span,
-            "keys": [{**asdict(each), "rate_hz": each.rate_hz} for each in summary.keys],
-            "metadata": opened.metadata,
-            "damaged": summary.damaged,
-        }
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+    figures = {
+        "log": str(log),
+        "team": opened.team,
+        "complete": opened.complete,
+        "lacks": [str(each) for each in lacks],
+        "span_ns": span,
+        "keys": [{**asdict(each), "rate_hz": each.rate_hz} for each in summary.keys],
+        "metadata": opened.metadata,
+        "damaged": summary.damaged,
+    }
+    write_json(json_file, figures)
 
 
 @app.command()

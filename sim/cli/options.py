@@ -1,5 +1,6 @@
 """The options that commands share, their parsing, and errors with their exit status."""
 
+import json
 import logging
 import math
 import re
@@ -42,6 +43,7 @@ ScenarioArgument = Annotated[
 LogArgument = Annotated[
     Path, typer.Argument(help="An MCAP log of a team, or the folder of its run.")
 ]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
 Connect = Annotated[
     str, typer.Option(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
 ]
@@ -174,6 +176,12 @@ def fail(message: str, status: int) -> NoReturn:
     """Print an error and end with its status."""
     typer.secho(f"error: {lines(message)}", fg="red", err=True)
     raise typer.Exit(status)
+
+
+def write_json(path: Path | None, figures: object) -> None:
+    """Write the figures of a command to its --json file, if one is given."""
+    if path is not None:
+        path.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
 
 
 def refuse_existing(path: Path) -> None:

@@ -1,6 +1,5 @@
 """Commands on a recorded run: replay, report, repair."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +11,7 @@ from sim.cli.options import (
     FAILED,
     LOOPBACK,
     WRONG_USE,
+    JsonFile,
     Keys,
     LogArgument,
     SpeedText,
@@ -22,6 +22,7 @@ from sim.cli.options import (
     refuse_existing,
     refuse_open_door,
     warn_of_holes,
+    write_json,
 )
 from sim.cli.results import print_evaluation, print_nis, print_written, read_run
 from sim.cli.steps import Steps
@@ -84,7 +85,7 @@ def replay(
 def report(
     log: LogArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")],
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures.")] = None,
+    json_file: JsonFile = None,
     ledger: Annotated[
         bool,
         typer.Option(help="Prove the ledger: the robots consume the recorded measurements again."),
@@ -145,8 +146,7 @@ def report(
         print_written(write_report(run, output, figures), console)
     except OSError as error:
         fail(f"-o {output}: can not write: {error.strerror}; give another folder", FAILED)
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    write_json(json_file, figures)
     _hint_if_cut(opened)
 
 

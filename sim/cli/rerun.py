@@ -1,6 +1,5 @@
 """Commands that compute a log again: rerun and verify-ledger."""
 
-import json
 import math
 import time
 from dataclasses import asdict
@@ -14,9 +13,11 @@ from sim.cli.options import (
     WRONG_USE,
     EstimatorOption,
     FusionOption,
+    JsonFile,
     LogArgument,
     fail,
     warn_of_holes,
+    write_json,
 )
 from sim.recorded.changes import Changes
 
@@ -31,8 +32,6 @@ app = typer.Typer()
 
 OFFENDERS = 20
 """Most violations that are printed; the JSON file has all."""
-
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
 
 
 @app.command()
@@ -207,15 +206,14 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     verdict = "the same bytes" if same else f"another one{moved}"
     if not plain:
         console.print(f"final map: {verdict}", highlight=False)
-    if json_file is not None:
-        figures = {
-            "changes": asdict(changes),
-            "same_final_map": same,
-            "largest_move_m": move_m,
-            "recorded": to_json(recorded),
-            "recomputed": to_json(changed),
-        }
-        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    figures = {
+        "changes": asdict(changes),
+        "same_final_map": same,
+        "largest_move_m": move_m,
+        "recorded": to_json(recorded),
+        "recomputed": to_json(changed),
+    }
+    write_json(json_file, figures)
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         picture = output / "maps.png"
@@ -253,9 +251,8 @@ def _verify(path: Path, json_file: Path | None) -> None:
         fail(f"{path}: {error}", FAILED)
     elapsed_s = time.monotonic() - began
     _print_verification(result, elapsed_s)
-    if json_file is not None:
-        figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
-        json_file.write_text(json.dumps(figures, indent=2) + "\n")
+    figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
+    write_json(json_file, figures)
     if not log.complete:
         typer.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
     if not result.messages:
@@ -329,8 +326,7 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
     if not opened.complete:
         typer.echo(f"{log} is cut: what came after the cut counts as lost", err=True)
-    if json_file is not None:
-        json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+    write_json(json_file, found.to_json())
     for offender in found.offenders[:OFFENDERS]:
         typer.secho(offender, fg="red", err=True)
     if found.offenders:

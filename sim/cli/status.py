@@ -1,7 +1,5 @@
 """`teamslam status`: the nodes of a running team."""
 
-import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -11,11 +9,13 @@ from sim.cli.options import (
     FAILED,
     LOOPBACK,
     Connect,
+    JsonFile,
     Keys,
     TeamOption,
     check_names,
     connect_bus,
     fail,
+    write_json,
 )
 
 app = typer.Typer()
@@ -29,7 +29,7 @@ def status(
     seconds: Annotated[
         float, typer.Option(help="Seconds for which the team is observed.", min=0.5)
     ] = 3.0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write it as JSON, too.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
     from rich.console import Console
@@ -54,8 +54,7 @@ def status(
     advice = presence.advice()
     for line in advice:
         console.print(f"- {line}", markup=False, highlight=False, soft_wrap=True)
-    if json_file is not None:
-        json_file.write_text(json.dumps({"nodes": rows, "advice": advice}, indent=2) + "\n")
+    write_json(json_file, {"nodes": rows, "advice": advice})
 
 
 def _rows(presence: Any) -> list[dict[str, Any]]:

@@ -37,7 +37,7 @@ IN_TIME, YEARS = (0.0, 0.0), (5e8, 5e8)
             (IN_TIME, IN_TIME, (-7.0, -7.0)),
             "stamps 7.0 s ahead of the others: set its machine's clock",
         ),
-        ((IN_TIME, IN_TIME, (9.0, 7.0)), "it lags and catches up: its program hands over what"),
+        ((IN_TIME, IN_TIME, (9.0, 7.0)), "it lags and catches up: its program delivers old"),
         ((IN_TIME, IN_TIME, (6.0, 7.0)), "it lags and falls further behind"),
         ((YEARS, YEARS, (5e8 + 20, 5e8 + 20)), "began later or go slower: the map waits for them"),
         ((IN_TIME, IN_TIME, YEARS), "recorded data, which began later or go slower: the map"),

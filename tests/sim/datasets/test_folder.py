@@ -506,4 +506,4 @@ def test_a_cell_of_another_kind_is_named_with_the_kind_that_is_needed(
 def test_ranges_that_are_hardly_metres_are_noted(tmp_path: Path) -> None:
     far = SEEN.replace("2.5", "2500").replace("1.5,", "1500,").replace("2.4", "2400")
     notes = only(data_set(tmp_path, odometry=SPEEDS, observations=far)).notes
-    assert any("2,400 m away most of the time" in note for note in notes)
+    assert any("the median range is 2,400 m" in note for note in notes)

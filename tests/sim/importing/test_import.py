@@ -372,7 +372,7 @@ def test_folders_of_csv_files_with_other_names_are_robots(tmp_path: Path) -> Non
     named = run(logs, "-o", tmp_path / "x", "--columns", columns, "--robot", "cat")
     assert "has a folder for each robot, ann, bob, which names it" in str(named.exception)
     columns.write_text((MAP + further).replace("offset = -1.5", "offset = 90"))
-    assert "bearings are in radians" in str(run(logs, "-o", tmp_path / "x", *mapped).exception)
+    assert "bearings must be in radians" in str(run(logs, "-o", tmp_path / "x", *mapped).exception)
     assert not (tmp_path / "x").exists()  # the next attempt may have the folder
     columns.write_text(MAP + further)
     one_by_one = run(logs / "ann", logs / "bob", "-o", tmp_path / "again", "--columns", columns)
