@@ -3,14 +3,26 @@
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys.store import Typestore
 
 from team.ros2.definitions import types
 
 SUFFIXES = (".mcap", ".db3")
+VERSION: Final = 9
+"""Version of a new bag's metadata, that of ROS 2 Jazzy."""
 
 
 class BagError(ValueError):
@@ -98,3 +110,38 @@ def opened_bag(path: Path) -> Iterator[Bag]:
         raise BagError(f"{path}: {error}") from None
     finally:
         reader.close()
+
+
+class NewBag:
+    """A bag that is being written; every topic is reliable."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._connections: dict[str, Connection] = {}
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes, latched: bool) -> None:
+        """Write a message at a time [ns], which is both its log time and its receive time."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=types(), offered_qos_profiles=[_quality(latched)]
+            )
+        self._writer.write(self._connections[topic], max(stamp_ns, 0), data)
+
+
+@contextmanager
+def new_bag(folder: Path) -> Iterator[NewBag]:
+    """Write a bag (MCAP) into a folder that does not exist."""
+    with Writer(folder, version=VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
+        yield NewBag(writer)
+
+
+def _quality(latched: bool) -> Qos:
+    """Latched: transient local with a depth of 1, else volatile with a depth of 10."""
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    forever = QosTime(sec=9_223_372_036, nsec=854_775_807)
+    return Qos(
+        history=QosHistory.KEEP_LAST, depth=1 if latched else 10,
+        reliability=QosReliability.RELIABLE, durability=durability, deadline=forever,
+        lifespan=forever, liveliness=QosLiveliness.AUTOMATIC, liveliness_lease_duration=forever,
+        avoid_ros_namespace_conventions=False,
+    )  # fmt: skip

@@ -6,23 +6,13 @@ transform topic, and the messages of `team.ros2_answers`. Log times are team tim
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
 
 import msgspec
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
 
 from team import translate
 from team.config import RobotConfig
 from team.recording.reader import Log, LogError
-from team.ros2.definitions import types
+from team.ros2.bags import new_bag
 from team.ros2.encoding import Names, Pose, compose, encode, odometry, transform, transforms
 from team.ros2_answers import Answer, Answers
 from team.wire import channels as ch
@@ -32,8 +22,6 @@ from team.wire.codec import WireError
 
 TEAM_SPACE = "/teamslam"
 """Namespace of the team's map and diagnostics."""
-BAG_VERSION: Final = 9
-"""Version of the bag's metadata, which ROS 2 Jazzy writes."""
 ODOMETRY_HZ = 50.0
 """Highest rate of the exported odometry [Hz]."""
 
@@ -105,30 +93,12 @@ def export_rosbag2(
 
     Raises LogError for a log without a robot's odometry or pose.
     """
-    store, counts = types(), dict[str, int]()
-    connections = {}
-    with Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
+    counts = dict[str, int]()
+    with new_bag(folder) as bag:
         for answer in answers_of(log):
-            if answer.topic not in connections:
-                connections[answer.topic] = bag.add_connection(
-                    answer.topic, answer.kind, typestore=store,
-                    offered_qos_profiles=[quality(answer.latched)],
-                )  # fmt: skip
-            bag.write(connections[answer.topic], max(answer.stamp_ns, 0), answer.data)
+            bag.write(answer.topic, answer.kind, answer.stamp_ns, answer.data, answer.latched)
             counts[answer.topic] = counts.get(answer.topic, 0) + 1
             progress(sum(counts.values()))
     if not counts:
         raise LogError(log.path, "no odometry, pose or map in it", "`log info` lists what there is")
     return counts
-
-
-def quality(latched: bool) -> Qos:
-    """Reliable; latched: transient local with a depth of 1, else volatile with a depth of 10."""
-    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-    forever = QosTime(sec=9_223_372_036, nsec=854_775_807)
-    return Qos(
-        history=QosHistory.KEEP_LAST, depth=1 if latched else 10,
-        reliability=QosReliability.RELIABLE, durability=durability, deadline=forever,
-        lifespan=forever, liveliness=QosLiveliness.AUTOMATIC, liveliness_lease_duration=forever,
-        avoid_ros_namespace_conventions=False,
-    )  # fmt: skip
