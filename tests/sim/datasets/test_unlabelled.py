@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from sim.calibration.data import scan_of
 from sim.calibration.source import measurements_of
-from sim.cli.launch import _paces
+from sim.cli.launch import _time_warnings
 from sim.cli.main import app
 from sim.datasets.kinds import kind_of
 from sim.datasets.tables import DatasetError
@@ -186,7 +186,7 @@ def test_half_of_a_log_of_one_robot_is_told_what_is_missing(steps, car):
 def test_times_in_milliseconds_are_warned_of_before_the_launch(car):
     rows = [f"{100 * i},1.0,0.1" for i in range(1, 41)]
     (car / "odometry.csv").write_text("t_s,rear_wheel_speed_m_s,steering_rad\n" + "\n".join(rows))
-    (warning,) = _paces(streams(car))
+    (warning,) = _time_warnings(streams(car))
     assert warning.startswith(
         "r1: most rows of its odometry are 100 s apart: times are taken for s"
     )
