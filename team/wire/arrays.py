@@ -1,6 +1,6 @@
 """Arrays on the wire: little-endian `bin` fields, and the checks of their contents.
 
-NumPy is imported at the first array: a router and a recorder see none, and it takes 14 MB.
+NumPy (14 MB) is imported at the first array; router and recorder receive none.
 """
 
 import math
@@ -35,13 +35,13 @@ Stamps = bytes
 EPSILON = sys.float_info.epsilon
 _SIZES = {"<f8": 8, "<u4": 4, "<i8": 8, "u1": 1}
 FEW = 16
-"""So many numbers are looked at one by one sooner than as an array."""
+"""Largest number of floats that are checked one by one, faster than as an array."""
 _NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
 _POSE = _NUMBERS[9]
 _SMALL = 128
-"""Up to so many rows the places of a packed triangle are kept."""
+"""Largest number of rows for which the indices of a packed triangle are cached."""
 LARGEST_JOINT = 4096
-"""Number of rows of the largest covariance that is accepted."""
+"""Largest number of rows of a covariance."""
 
 
 def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
@@ -92,15 +92,13 @@ def from_stamps(values: Any) -> Stamps:
 
 
 def _few(data: Floats) -> tuple[float, ...] | None:
-    """The numbers, where they are few: as plain floats they are looked at in a fifth of the time of
-    an array.
-    """
+    """Return at most FEW numbers as plain floats, else None; their check is five times as fast."""
     count, rest = divmod(len(data), 8)
     return None if rest or count > FEW else _NUMBERS[count].unpack(data)
 
 
 def check_finite(data: Floats, what: str, count: int | None = None) -> None:
-    """Raise ValueError unless `count` floats are there and all are finite."""
+    """Raise ValueError unless there are `count` floats, all finite."""
     few = _few(data)
     values = floats(data, what) if few is None else few
     if count is not None and len(values) != count:
@@ -110,7 +108,7 @@ def check_finite(data: Floats, what: str, count: int | None = None) -> None:
 
 
 def check_angles(data: Floats, what: str, count: int) -> None:
-    """Raise ValueError unless `count` angles in [−π, π] are there."""
+    """Raise ValueError unless there are `count` angles in [−π, π]."""
     check_finite(data, what, count)
     few = _few(data)
     values = np.abs(floats(data, what)).tolist() if few is None else map(abs, few)
@@ -119,7 +117,7 @@ def check_angles(data: Floats, what: str, count: int) -> None:
 
 
 def check_ranges(data: Floats, what: str, count: int | None = None) -> None:
-    """Raise ValueError unless `count` finite floats are there and none is negative."""
+    """Raise ValueError unless there are `count` finite floats, none negative."""
     check_finite(data, what, count)
     few = _few(data)
     if min(floats(data, what).tolist() if few is None else few, default=0.0) < 0.0:
@@ -127,9 +125,9 @@ def check_ranges(data: Floats, what: str, count: int | None = None) -> None:
 
 
 def check_named(data: Ids, what: str) -> None:
-    """Raise ValueError where an id is one of a landmark without identity: 2³¹ or larger.
+    """Raise ValueError if an id is that of a landmark without identity, 2³¹ or larger.
 
-    A window numbers such landmarks itself, so that the two would collide.
+    A window assigns these numbers itself, so they would collide.
     """
     if ids(data, what).max(initial=0) >= UNNAMED:
         raise ValueError(f"out of bounds: {what} from 2³¹ on are of landmarks without identities")
@@ -146,8 +144,8 @@ def check_pose_covariance(data: Floats, what: str) -> None:
     """Raise ValueError unless nine floats form a symmetric positive definite 3 × 3 matrix.
 
     Symmetry is judged by the standard deviations, |Pᵢⱼ − Pⱼᵢ| ≤ 1e-9 σᵢ σⱼ; a pivot by the rounding
-    error of a matrix with a unit diagonal. Every pose on the wire passes here, so these are plain
-    floats: arrays of nine numbers take ten times as long.
+    error of a matrix with a unit diagonal. Plain floats take a tenth of the time of arrays of nine
+    numbers.
     """
     if len(data) != _POSE.size:
         check_finite(data, what, 9)
@@ -176,7 +174,7 @@ def _clipped(value: float) -> float:
 def check_semidefinite(data: Floats, n: int, what: str) -> None:
     """Raise ValueError unless n × n floats are symmetric and positive semi-definite, of any rank.
 
-    A variance of zero is a number that its source takes as exact; its row is then zero.
+    A variance of zero belongs to an exact number; its row is then zero.
     """
     check_finite(data, what, n * n)
     matrix = floats(data, what).reshape(n, n)
@@ -193,7 +191,7 @@ def check_semidefinite(data: Floats, n: int, what: str) -> None:
 
 
 def check_packed_covariance(data: Floats, n: int, what: str) -> None:
-    """Raise ValueError unless the packed upper triangle is of a positive definite n × n matrix."""
+    """Raise ValueError unless a packed upper triangle is a positive definite n × n matrix."""
     if n > LARGEST_JOINT:
         raise ValueError(f"too large: {what} has {n} rows, {LARGEST_JOINT} at most")
     check_finite(data, what, n * (n + 1) // 2)
@@ -202,7 +200,7 @@ def check_packed_covariance(data: Floats, n: int, what: str) -> None:
 
 
 def check_blocks(data: Floats, count: int, what: str) -> None:
-    """Raise ValueError unless `count` packed 2 × 2 covariances (3 floats each) are there."""
+    """Raise ValueError unless there are `count` packed 2 × 2 covariances (3 floats each)."""
     check_finite(data, what, 3 * count)
     a, b, c = floats(data, what).reshape(count, 3).T
     root = np.sqrt(np.maximum(a, 0.0)) * np.sqrt(np.maximum(c, 0.0))  # a·c could overflow
@@ -213,11 +211,12 @@ def check_blocks(data: Floats, count: int, what: str) -> None:
 def _unit_diagonal(
     packed: "np.typing.NDArray[np.float64]", n: int, what: str
 ) -> "np.typing.NDArray[np.float64]":
-    """The lower triangle of D⁻¹ P D⁻¹ with D = √diag P, so that units and scale do not influence
-    the conditioning; zeros above it.
+    """Return the lower triangle of D⁻¹ P D⁻¹, D = √diag P, with zeros above it.
+
+    Units and scale then do not influence the conditioning.
     """
     rows, columns, places, diagonal = _triangle(n) if n <= _SMALL else _triangle.__wrapped__(n)
-    with np.errstate(over="ignore", invalid="ignore"):  # √ of what is negative is judged below
+    with np.errstate(over="ignore", invalid="ignore"):  # negative variances are refused below
         sigmas = np.sqrt(packed[diagonal])
         if not (sigmas > 0.0).all():
             raise ValueError(f"not positive definite: {what}")
@@ -229,17 +228,17 @@ def _unit_diagonal(
 
 @lru_cache(maxsize=16)
 def _triangle(n: int) -> "tuple[np.typing.NDArray[np.intp], ...]":
-    """Row and column of each number of a packed upper triangle, its place in the transposed matrix
-    row by row, and the places of the diagonal in the triangle.
+    """Return the indices of a packed upper triangle of n rows.
+
+    They are the row and the column of each number, its index in the transposed matrix, row by row,
+    and the indices of the diagonal in the triangle.
     """
     rows, columns = np.triu_indices(n)
     return rows, columns, columns * n + rows, np.flatnonzero(rows == columns)
 
 
 def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
-    """Raises ValueError unless each pivot of a matrix with a unit diagonal exceeds its rounding
-    error n ε.
-    """
+    """Raise ValueError unless each pivot of a matrix with a unit diagonal exceeds n ε."""
     try:
         factor = np.linalg.cholesky(scaled)  # reads the lower triangle
     except np.linalg.LinAlgError:

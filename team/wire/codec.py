@@ -1,8 +1,8 @@
-"""Encodes messages and decodes them with all checks, so that only sound messages reach a node.
+"""Encode messages, and decode them with all checks, so that only valid ones reach a node.
 
-A payload is decoded straight into the class that its tag names, field by field, so that one of
-another shape is refused at its first wrong byte. Nothing is unpacked before its type is known: a
-list of empty lists would take 75 times its size.
+A payload is decoded into the class of its tag, field by field, and refused at the first byte that
+does not fit. Values are never unpacked without a type: a list of empty lists takes 75 times its
+size.
 """
 
 from functools import cache
@@ -16,11 +16,11 @@ from team.wire.structure import SMALL, StructureError, check_structure, read_tag
 M = TypeVar("M", bound=Message)
 
 LARGEST_PAYLOAD = 64 * 2**20
-"""Largest payload in bytes: that of a joint covariance of 4096 rows."""
+"""Largest payload [bytes]: a joint covariance of 4096 rows."""
 
 
 class WireError(ValueError):
-    """Bytes that are no sound message; `reason` is one of the words below, `detail` a sentence.
+    """An invalid payload; `reason` is one of the texts below, `detail` a sentence.
 
     Reasons: "wrong tag", "wrong version", "truncated", "trailing bytes", "wrong length", "not
         finite", "not symmetric", "not positive definite", "not ascending", "out of bounds", "too
@@ -34,12 +34,12 @@ class WireError(ValueError):
 
 
 def encoded(message: Message) -> bytes:
-    """The message's payload bytes: a MessagePack array [tag, field, …]."""
+    """Encode a message as a MessagePack array [tag, field, …]."""
     return _ENCODER.encode(message)
 
 
 def _plain(value: object) -> float:
-    """A number of NumPy that is a `float`, as the float that it is."""
+    """Convert a NumPy number that is a `float` to a plain float."""
     if isinstance(value, float):
         return float(value)
     raise TypeError(f"no field of a message takes a {type(value).__name__}")
@@ -49,10 +49,9 @@ _ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def decoded(payload: bytes, *expected: type[M]) -> M:
-    """The message in `payload`, checked field by field; raises `WireError`.
+    """Decode and check a payload field by field; raises `WireError`.
 
-    `expected` are the classes that the channel carries; without any, every known message is
-    accepted.
+    expected: the accepted classes, as those of a channel; without any, all.
     """
     if len(payload) > LARGEST_PAYLOAD:
         raise WireError("too large", f"{len(payload)} bytes, {LARGEST_PAYLOAD} at most")
@@ -67,7 +66,7 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
 
 
 def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exception) -> NoReturn:
-    """Raise the `WireError` for a payload that could not be decoded: its tag is judged first."""
+    """Raise the `WireError` of a payload that could not be decoded; a wrong tag comes first."""
     try:
         tag = read_tag(payload)
     except StructureError as why:
@@ -91,9 +90,9 @@ def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exceptio
 
 
 def unsound(message: Message) -> WireError | None:
-    """Why every receiver would refuse this message; None for a sound one.
+    """Return the error with which every receiver refuses this message; None for a valid one.
 
-    A sender checks its own messages with it before publishing; the checks are those of `decoded`.
+    A sender applies it before publishing; the checks are those of `decoded`.
     """
     payload = _ENCODER.encode(message)
     kind = type(message)
@@ -111,7 +110,7 @@ def unsound(message: Message) -> WireError | None:
 
 
 def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
-    """Why a payload is refused."""
+    """Return the error with which a payload is refused."""
     try:
         decoded(payload, kind)
     except WireError as error:
@@ -121,7 +120,7 @@ def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
 
 @cache
 def _decoder(kinds: tuple[type[Message], ...]) -> msgspec.msgpack.Decoder[Any]:
-    """A decoder of the message of one of these classes; of every class where there are none."""
+    """Return a decoder of the messages of these classes; without any, of all."""
     return msgspec.msgpack.Decoder(Union[kinds or tuple(BY_TAG.values())])  # noqa: UP007
 
 
@@ -134,7 +133,7 @@ def _check(message: Message) -> None:
 
 
 def tag_in(payload: bytes) -> str:
-    """The tag at the beginning of a payload, if it can be read; empty where there is none."""
+    """Return the tag at the beginning of a payload; empty if it has none."""
     try:
         return read_tag(payload)
     except StructureError:
@@ -142,7 +141,7 @@ def tag_in(payload: bytes) -> str:
 
 
 def _kind(tag: str, expected: tuple[type[Message], ...]) -> type[Message]:
-    """The class of a tag; raises `WireError` for one that does not belong here."""
+    """Return the class of a tag; raises `WireError` if it is not expected."""
     kind = BY_TAG.get(tag)
     if kind is not None and (not expected or kind in expected):
         return kind
