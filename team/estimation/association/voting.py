@@ -193,39 +193,28 @@ def _refine(
 
     Motions that no two points confirm are left out.
     """
-    most = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
-    return [
-        vote
-        for k in range(0, len(motions), most)
-        for vote in _refine_batch(a, b, centre, motions[k : k + most], tolerance)
-    ]
-
-
-def _refine_batch(
-    a: PointSet,
-    b: PointSet,
-    centre: Float[np.ndarray, "2"],
-    motions: Float[np.ndarray, "B 3"],
-    tolerance: float,
-) -> list[Vote]:
-    """Refine as `_refine` does, with all distances in memory at once."""
     local = a.mean - centre
-    for step in range(REFINEMENTS):
-        reach = tolerance * (1.5 if step < 2 else 1.0)
-        to, agree = _find_neighbours(motions, local, b.mean, reach)
-        lasting = agree.sum(axis=1) >= 2
-        motions, to, agree = motions[lasting], to[lasting], agree[lasting]
-        if step < REFINEMENTS - 1 and len(motions):
-            weights = agree / (
-                elementary.squared(a.sd)
-                + elementary.squared(b.sd[to])
-                + elementary.squared(tolerance)
-            )
-            motions = _fit_motions(local, b.mean[to], weights)
-    return [
-        Vote(motion, np.flatnonzero(own), of[own])
-        for motion, of, own in zip(motions, to, agree, strict=True)
-    ]
+    size = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
+    votes = []
+    for k in range(0, len(motions), size):
+        batch = motions[k : k + size]
+        for step in range(REFINEMENTS):
+            reach = tolerance * (1.5 if step < 2 else 1.0)
+            to, agree = _find_neighbours(batch, local, b.mean, reach)
+            lasting = agree.sum(axis=1) >= 2
+            batch, to, agree = batch[lasting], to[lasting], agree[lasting]
+            if step < REFINEMENTS - 1 and len(batch):
+                weights = agree / (
+                    elementary.squared(a.sd)
+                    + elementary.squared(b.sd[to])
+                    + elementary.squared(tolerance)
+                )
+                batch = _fit_motions(local, b.mean[to], weights)
+        votes += [
+            Vote(motion, np.flatnonzero(own), of[own])
+            for motion, of, own in zip(batch, to, agree, strict=True)
+        ]
+    return votes
 
 
 def _find_neighbours(
