@@ -15,8 +15,9 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Thresholds for merging landmarks without identities; lengths in metres.
 
     LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
-    empirical (docs/decisions/29-association-in-the-fold.md). `tight`, `same` and `slack` are
-    reduced where a map's landmarks stand closer (`team.estimation.association.density`).
+    empirical, chosen with DLR and Victoria Park in view (docs/notes/association-with-undo.md).
+    `tight`, `same` and `slack` are reduced where a map's landmarks stand closer
+    (`team.estimation.association.density`).
     """
 
     gate: Positive = GATE
