@@ -23,9 +23,8 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
 
-
 _SUBMAP = msgspec.msgpack.Decoder(m.Submap)
-"""Decodes without the checks of `decoded`: only messages that passed them are stored."""
+"""Decodes without the checks of `decoded`: the payloads are this robot's own."""
 
 
 @dataclass
