@@ -20,7 +20,7 @@ it.
 
 
 class Ledger:
-    """Counts the measurements of an incarnation by their disposition.
+    """The number of an incarnation's measurements by their disposition.
 
     used: the disposition of a measurement that the estimator takes. A measurement is counted as
         used when it arrives; the window that closes lists those that it did not use after all, so
@@ -41,7 +41,7 @@ class Ledger:
     def count(
         self, measurement: m.Measurement, rejected: Rejection | None, used: str | None = None
     ) -> None:
-        """Counts one more measurement: rejected for this reason, or used."""
+        """Count one more measurement: rejected for this reason, or used."""
         number, stamp_ns = measurement.number, measurement.stamp_ns
         taken = self.used if used is None else used
         if rejected is None:
@@ -61,7 +61,7 @@ class Ledger:
             self._on_disposition(number, disposition)
 
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
-        """Recounts measurements that were counted as used and were not, for this reason."""
+        """Recount measurements that were counted as used and were not, for this reason."""
         for number in numbers:
             self.counts[used] -= 1
             self.counts[reason.disposition] += 1
@@ -70,21 +70,21 @@ class Ledger:
             self._scans.pop(number, None)
             self._detections.pop(number, None)
 
-    def _behind(self, count: int) -> list[int]:
+    def _last_scans(self, count: int) -> list[int]:
         """The last scans by their stamps."""
         by_stamp = sorted(self._scans, key=lambda number: (self._scans[number], number))
         return by_stamp[len(by_stamp) - count :]
 
     def cover(self, until_ns: int) -> None:
-        """An estimator without windows has used every scan up to this time."""
+        """Settle every scan up to this time as used, by an estimator without windows."""
         self._scans = {n: at_ns for n, at_ns in self._scans.items() if at_ns > until_ns}
         self._detections.clear()
 
     def close(self, closed: ClosedWindow) -> None:
-        """A window has become a submap, which lists what it could not use."""
+        """Recount the measurements that a closed window could not use."""
         self.leave_out(set().union(*(each.measurements for each in closed.sightings)))
         if closed.late:
-            self._reject(self._behind(closed.late), Rejection.LATE, self.used)
+            self._reject(self._last_scans(closed.late), Rejection.LATE, self.used)
         behind = {n: at_ns for n, at_ns in self._scans.items() if at_ns > closed.end_ns}
         if closed.unsolved:
             self._reject(sorted(self._scans.keys() - behind), Rejection.UNSOLVED, self.used)
@@ -97,13 +97,13 @@ class Ledger:
         self._detections.clear()
 
     def leave_out(self, used: set[int]) -> None:
-        """The window ends: inter-robot measurements beyond those used reached no pose node."""
+        """Recount the inter-robot measurements of the window that reached no pose node."""
         self._reject(sorted(self._sighted - used), Rejection.NO_NODE, IN_SIGHTING)
         self._sighted.clear()
 
     def uncover(self, count: int) -> None:
-        """The stream ends: its last scans are behind all odometry."""
-        self._reject(self._behind(count), Rejection.NOT_COVERED, self.used)
+        """Recount the last scans of a stream, which are behind all odometry."""
+        self._reject(self._last_scans(count), Rejection.NOT_COVERED, self.used)
 
     def entries(self) -> tuple[m.Disposition, ...]:
         """The dispositions as the robot's `Done` reports them."""

@@ -26,7 +26,7 @@ from team.estimation.scans import Scan, sensible
 from team.estimation.submap import LocalMap
 from team.rejection import UNMEASURED, Rejection
 from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
-from team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thinned
+from team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from team.robot.poses import RunningPoses
 from team.robot.statements import MessageWriter
 from team.robot.submaps import Submaps
@@ -182,7 +182,7 @@ class Mapper:
         self.account(measurement, rejected)
         keyframe_ns = self._slam.last_keyframe_ns
         if keyframe_ns != before_ns and keyframe_ns is not None:
-            self.out += self.poses.at(keyframe_ns, self)
+            self.out += self.poses.publish(keyframe_ns, self)
         return False
 
     def judge_interval(
@@ -199,7 +199,7 @@ class Mapper:
         return interval if rejected in UNMEASURED else None, rejected
 
     def _observe(self, measurement: m.Measurement, is_near: bool) -> Rejection | None:
-        """Take what is no odometry; returns the reason if it is rejected."""
+        """Take a scan or an initial pose; returns the reason if it is rejected."""
         match measurement:
             case m.Observations() | m.Points() | m.Detections():
                 return self._observe_landmarks(measurement, is_near)
@@ -270,12 +270,12 @@ class Mapper:
         shown = self.is_map_due(closed.start_ns, end_ns)
         if shown and closed.window is not None:
             self.out.append(
-                writer.cloud(end_ns, thinned(closed.window.particles, self.own_map.origin))
+                writer.cloud(end_ns, thin_out(closed.window.particles, self.own_map.origin))
             )
         self.out.append(writer.innovation(end_ns, closed.sequence, closed.innovation))
         if closed.became is not None:
             self.out.append(writer.association(closed.sequence, end_ns, closed.became))
-        self.out += self.poses.at(end_ns, self)
+        self.out += self.poses.publish(end_ns, self)
         if shown:
             self.publish_map(end_ns)
 

@@ -219,7 +219,7 @@ class RobotNode:
         """Take a message that is no measurement."""
         match message:
             case m.Prior():
-                self.out += self.mapper.poses.follow(message)
+                self.out += self.mapper.poses.take_prior(message)
             case m.FusedMap() if message.final:
                 self.finished, self.final = True, message
             case m.Progress():

@@ -45,7 +45,7 @@ class Cloud(NamedTuple):
     weights: Float[np.ndarray, " P"]
 
 
-def thinned(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
+def thin_out(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
     """Thin out the particles evenly; origin: the pose of their frame in the own map's frame."""
     every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
     logs = particles.log_weights[::every]

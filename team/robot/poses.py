@@ -1,4 +1,4 @@
-"""Publishes a robot's running poses: by its own measurements, and given the team's map.
+"""A robot's running poses: by its own measurements, and given the team's map.
 
 A pose on team/pose is in the team's frame as long as the newest prior is in the frame that the pose
 names. When a newer prior is in another frame, or withdraws the robot's, the own pose goes out on
@@ -65,7 +65,7 @@ class RunningPoses:
         self.team_map = TeamMap()
         self.sigma_m = 0.0
 
-    def follow(self, prior: m.Prior) -> list[Outgoing]:
+    def take_prior(self, prior: m.Prior) -> list[Outgoing]:
         """Take a prior from the team's map; the newest one is used.
 
         Returns the message that withdraws the last pose, if that was in another frame.
@@ -73,7 +73,7 @@ class RunningPoses:
         if not is_newer_prior(prior, self._prior):
             return []
         if prior.in_team_frame:
-            whole = self.team_map.decoded(prior).whole
+            whole = self.team_map.decode(prior).whole
             why = prior_beyond(whole.mean, whole.covariance, self._bounds)
             if why is not None:
                 self._warnings.append(f"the team's map is refused: {why}")
@@ -107,17 +107,17 @@ class RunningPoses:
         return prior if prior is not None and prior.incarnation == incarnation else None
 
     def begin_incarnation(self, incarnation: int) -> None:
-        """Begin an incarnation: a prior of an earlier one is of no further use."""
+        """Begin an incarnation: forget the prior of an earlier one."""
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 
-    def at(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
-        """A new pose: the messages to publish, if they are due."""
+    def publish(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
+        """The messages of a new pose, if they are due; they take effect as published."""
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
         prior = self.prior_of(estimator.writer.incarnation)
-        out = self.posed(stamp_ns, prior, estimator)
+        out = self.estimate(stamp_ns, prior, estimator)
         self._own = out[0]
         if len(out) == 1:
             return [*out, *self._withdrawn_pose()]
@@ -125,7 +125,7 @@ class RunningPoses:
         self._claimed, self._is_first = prior.frame, False
         return out
 
-    def posed(
+    def estimate(
         self, stamp_ns: int, prior: m.Prior | None, estimator: PoseEstimator
     ) -> list[Outgoing]:
         """The message of the own pose and, given a prior, of the pose in the team's map."""
@@ -134,7 +134,7 @@ class RunningPoses:
         if prior is None:
             return out
         try:
-            with np.errstate(all="ignore"):  # what is no number is withheld
+            with np.errstate(all="ignore"):  # a pose that is not finite is withheld
                 posed = self.team_map.pose(prior, estimator.submaps, window).pose
         except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self._warnings.append(f"no team pose from the fused map: {error}")

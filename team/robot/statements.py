@@ -1,4 +1,4 @@
-"""Turns what a robot's estimator has found into messages on their channels."""
+"""Writes a robot's estimates as messages."""
 
 from dataclasses import dataclass
 from typing import Literal

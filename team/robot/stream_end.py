@@ -1,4 +1,4 @@
-"""Where a robot's stream ends, as its world, its driver or an operator says."""
+"""The end of a robot's stream, as its world, its driver or an operator announces it."""
 
 from team.stream.inbox import Inbox
 from team.wire import channels as ch

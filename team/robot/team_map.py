@@ -53,7 +53,7 @@ class TeamMap:
         A robot whose heading is badly known lies on an arc; its pose gets the covariance of that
         arc.
         """
-        given = self.given(prior, submaps)
+        given = self.join(prior, submaps)
         open_window = None if window is None else self._shared.taken(window.named)
         posed = pose_now(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
@@ -61,7 +61,7 @@ class TeamMap:
         self.doubt = self._warning(given)
         return Posed(curved(posed.pose), posed.known, posed.refused)
 
-    def decoded(self, prior: m.Prior) -> RobotPrior:
+    def decode(self, prior: m.Prior) -> RobotPrior:
         """The estimate in a prior; that of the last one asked for is kept."""
         if self._decoded is None or self._decoded[0] is not prior:
             self._decoded = prior, translate.prior_of(prior)
@@ -80,7 +80,7 @@ class TeamMap:
             )
         return ""
 
-    def given(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
+    def join(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
         """Join the prior with those of the incarnation's submaps that it does not contain.
 
         Landmarks without identities are left out: the robot can not compare them before the team's
@@ -90,7 +90,7 @@ class TeamMap:
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             if prior is not self._prior or len(submaps) < self._submaps:
                 self._prior, self._submaps, self._pending = prior, 0, []
-                decoded = self.decoded(prior)
+                decoded = self.decode(prior)
                 self._whole, self._shared = decoded.whole, decoded.shared
             later = submaps[max(self._submaps, prior.sequence + 1) :]
             self._pending += [self._shared.taken(each.named) for each in later]

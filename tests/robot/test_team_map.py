@@ -35,8 +35,8 @@ def prior(sequence: int) -> m.Prior:
 def test_the_map_that_is_kept_is_the_one_that_is_made_anew() -> None:
     kept, told = TeamMap(), prior(1)
     for known in range(2, 7):
-        again = TeamMap().given(told, LOCALS[:known])
-        assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
+        again = TeamMap().join(told, LOCALS[:known])
+        assert kept.join(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
 
 
 def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,9 +57,9 @@ def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch: pytest.M
     monkeypatch.setattr("team.robot.team_map.followed", counted)
     often, seldom = TeamMap(), TeamMap()
     for known in range(1, len(submaps) + 1):
-        last = often.given(told, submaps[:known]).whole
+        last = often.join(told, submaps[:known]).whole
         if known in (3, 50, len(submaps)):
-            assert seldom.given(told, submaps[:known]).whole.mean.tobytes() == last.mean.tobytes()
+            assert seldom.join(told, submaps[:known]).whole.mean.tobytes() == last.mean.tobytes()
     assert max(solved_at_once) < 2 * CONDENSED
     off, covariance = last.mean - whole.mean, whole.covariance
     assert off @ np.linalg.solve(covariance, off) / len(off) < 1e-3
@@ -80,9 +80,9 @@ def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() 
     kept, told = TeamMap(), prior(4)
     alone = translate.prior_of(told).whole
     for known in (3, 4, 5):
-        assert kept.given(told, LOCALS[:known]).whole.mean.tobytes() == alone.mean.tobytes()
+        assert kept.join(told, LOCALS[:known]).whole.mean.tobytes() == alone.mean.tobytes()
     expected = followed(alone, LOCALS[5:]).whole
-    assert kept.given(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()
+    assert kept.join(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()
 
 
 def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(

@@ -37,13 +37,13 @@ class RecordedPoses(RunningPoses):
         self._recorded = recorded
         self._withdrawn = withdrawn
 
-    def at(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
+    def publish(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
         """The poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
         incarnation = estimator.writer.incarnation
         for prior in self._recorded.get((incarnation, stamp_ns), ()):
             here = prior if prior is not None and prior.incarnation == incarnation else None
-            out += self.posed(stamp_ns, here, estimator)
+            out += self.estimate(stamp_ns, here, estimator)
         if out and (incarnation, stamp_ns) in self._withdrawn:
             out.append(outside_team_frame(out[0]))
         return out

@@ -160,7 +160,7 @@ class StreamMapper(ExchangingMapper):
         """Publish the results of an interval, or of the stream's end."""
         writer, sequence = self.writer, self.sequence
         if estimates.pose_ns is not None:
-            self.out += self.poses.at(estimates.pose_ns, self)
+            self.out += self.poses.publish(estimates.pose_ns, self)
         if estimates.judged is not None:
             judged, stamp_ns = estimates.judged
             self.out.append(writer.innovation(stamp_ns, sequence, judged))

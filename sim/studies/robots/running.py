@@ -29,7 +29,7 @@ from team.estimation.scans import Scan, unclaimed
 from team.estimation.submap import Became
 from team.pairs import FEEDBACK
 from team.rejection import Rejection
-from team.robot.own_map import Cloud, InitialPose, thinned
+from team.robot.own_map import Cloud, InitialPose, thin_out
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 """Added to a running pose's covariance [m², m², rad²], which may be singular: an exactly known
@@ -131,7 +131,7 @@ class RunningEstimator:
         """Returns the particles, where there are any and a map is published."""
         if map_ns is None or self._filter.particles is None:
             return None
-        return partial(thinned, self._filter.particles(self._state), np.zeros(3))
+        return partial(thin_out, self._filter.particles(self._state), np.zeros(3))
 
     def _take(self, keyframe: Keyframe) -> None:
         """Takes a keyframe: its scans without identities one by one, then all observations with

@@ -1,6 +1,4 @@
-"""Turns a stream of odometry intervals and observations into the keyframes that an estimator
-takes.
-"""
+"""Keyframes from a stream of odometry intervals and scans."""
 
 from bisect import insort
 
@@ -30,7 +28,7 @@ large as the motion itself."""
 
 
 class Keyframe(msgspec.Struct, frozen=True, gc=False):
-    """The motion since the last keyframe and what was seen at its end (accepted and calibrated).
+    """The motion since the last keyframe and the measurements at its end (accepted and calibrated).
 
     own: the noises that the measurements claim (`team.estimation.scans`); without rows: none do.
     Poses and motions are those of the sensor, wherever on the base it is mounted.
@@ -109,7 +107,7 @@ class Segmenter:
         """Begin a stream or a window at this team time."""
         self.now_ns = stamp_ns
         self._keyframe_start_ns = stamp_ns
-        self._last = STANDING  # what a window says depends on its own measurements alone
+        self._last = STANDING  # a submap depends on its window's measurements alone
         if self._grid is not None:
             self._grid.begin(stamp_ns)
 
@@ -276,11 +274,11 @@ class Segmenter:
         if not self._run.is_pending:
             return
         if self._since_look is not None:
-            self._since_look = self._run.behind(self._since_look)
+            self._since_look = self._run.append_to(self._since_look)
         if self._grid is not None:
-            self._grid.carry(self._run.behind)
+            self._grid.carry(self._run.append_to)
         node = Increment.identity() if self._grid is None else self._grid.since_node
-        after, poses = self._run.driven(self._increment, node, self._forward, self._scan_motion)
+        after, poses = self._run.compose(self._increment, node, self._forward, self._scan_motion)
         self._scan_poses += list(poses)
         self._increment = Increment(after.motion, after.covariance)
         if self._motion.calibrated_speed is not None:

@@ -122,33 +122,33 @@ class OdometryRun:
         self.is_pending = False
 
     def add(self, over: OdometryInterval, duration_ns: int) -> None:
-        """Adds the next part of an interval."""
+        """Add the next part of an interval."""
         self._durations.append(duration_ns)
         self._forward.append(over.forward)
         self._yaw_rates.append(over.yaw_rate)
         self.is_pending = True
 
     def mark(self) -> None:
-        """Marks this place: `driven` returns the pose here."""
+        """Mark this place: `compose` returns the pose here."""
         self._marks.append(len(self._durations))
 
-    def behind(self, motion: Increment) -> Increment:
-        """A motion followed by all stored parts, which remain stored."""
+    def append_to(self, motion: Increment) -> Increment:
+        """Append all stored parts to a motion; they remain stored."""
         none = np.zeros(3)
         still = none, np.zeros((3, 3))
         since = Since(motion.mean, motion.covariance, none, *still, none)
         after, _ = gone_on(since, self._model, *self._whole(), NO_MARKS)
         return Increment(after.motion, after.covariance)
 
-    def driven(
+    def compose(
         self,
         increment: Increment,
         since_node: Increment,
         shift: Float[np.ndarray, "3"],
         of_scan: Pose,
     ) -> tuple[Since, Float[np.ndarray, "m 3"]]:
-        """The motions up to now with all stored parts, which are removed, and the poses since the
-        first scan at the marks.
+        """Append all stored parts to the motions up to now and remove them; returns the motions and
+        the poses since the first scan at the marks.
         """
         whole = self._whole()
         marks = np.array(self._marks, np.int64) if self._marks else NO_MARKS

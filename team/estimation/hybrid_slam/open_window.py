@@ -94,8 +94,8 @@ class OpenWindow:
             self._motions.append(rest)
             self._try(self._go, rest, forward)
 
-    def solved(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
-        """The Gaussian that `step` makes of the window; None where it has none."""
+    def solve(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
+        """Make the Gaussian of the window by `step`; None where the window has none."""
         if not self._solvable:
             return None
         try:
@@ -112,7 +112,7 @@ class OpenWindow:
         most = self._config.bounds.submap_landmarks
         bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
         self._keyframes.append(bounded)
-        self._take(self._gate.admitted(bounded) if self._gate.judges else bounded)
+        self._take(self._gate.admit(bounded) if self._gate.judges else bounded)
 
     def _take(self, keyframe: Keyframe) -> None:
         self.particles = windows.advanced(
@@ -131,7 +131,7 @@ class OpenWindow:
             self.particles = windows.marked(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
-        keyframes = self._gate.settled() if self._gate.judges else tuple(self._keyframes)
+        keyframes = self._gate.confirm() if self._gate.judges else tuple(self._keyframes)
         has_unnamed = bool([each for each in self._keyframes if each.looks])
         if has_unnamed:
             config = self._config

@@ -34,8 +34,8 @@ class OutlierGate:
         self._keyframes = []
         self.gated = 0
 
-    def admitted(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe with those of its measurements that agree with the ones up to it."""
+    def admit(self, keyframe: Keyframe) -> Keyframe:
+        """Reduce the keyframe to its measurements that agree with those up to it."""
         if not self.judges:
             return keyframe
         self._keyframes.append(keyframe)
@@ -44,10 +44,8 @@ class OutlierGate:
         taken = agreeing(*self._all(), self._sensor, self._outlier_share)
         return keyframe.only(taken[-len(keyframe.ids) :])
 
-    def settled(self) -> Sequence[Keyframe]:
-        """All keyframes of the window with their confirmed measurements; counts the rejected
-        ones.
-        """
+    def confirm(self) -> Sequence[Keyframe]:
+        """Reduce all keyframes of the window to their confirmed measurements; count the others."""
         taken = confirmed(*self._all(), self._sensor, self._outlier_share)
         self.gated = int(np.count_nonzero(~taken))
         bounds = np.cumsum([0, *(len(keyframe.ids) for keyframe in self._keyframes)])

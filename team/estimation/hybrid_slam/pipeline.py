@@ -128,7 +128,7 @@ class HybridSlam:
             self._open.advance(keyframe)
         self._open.confirm()
         self._open.move(rest, self._segmenter.rest_forward)
-        submap = self._open.solved(_submap)
+        submap = self._open.solve(_submap)
         is_sensible = self._open.is_sensible(submap)
         scans, self._scans = self._scans - self._segmenter.uncovered, self._segmenter.uncovered
         closed = ClosedWindow(
@@ -180,7 +180,7 @@ class HybridSlam:
         """
         if self.last_keyframe_ns is None:
             return None
-        found = self._open.solved(_running)
+        found = self._open.solve(_running)
         return self._moved_alone() if found is None else found
 
     def _moved_alone(self) -> LocalMap:

@@ -8,7 +8,7 @@ linearised again, so the map is overconfident after many joins.
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -28,7 +28,6 @@ Maps = tuple[
     Float[np.ndarray, "q q"],
 ]
 """Ids, mean and covariance of a map, then those of a local map."""
-A = TypeVar("A", bound=np.ndarray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +78,13 @@ def end_pose(
 
 def _parts(whole: WholeMap, local: LocalMap) -> Maps:
     """Both maps as the kernels take them: one layout, since each would be a form of its own."""
-    return (
-        _alone(whole.ids),
-        _alone(whole.mean),
-        _alone(whole.covariance),
-        _alone(local.ids),
-        _alone(local.mean),
-        _alone(local.covariance),
-    )
-
-
-def _alone(values: A) -> A:
-    return values if values.flags.carray else values.copy()
+    parts = (
+        whole.ids, whole.mean, whole.covariance, local.ids, local.mean, local.covariance
+    )  # fmt: skip
+    for values in parts:
+        if not values.flags.carray:
+            return cast(Maps, tuple(each.copy() for each in parts))
+    return parts
 
 
 def _refuse(fault: int) -> None:

@@ -63,7 +63,7 @@ def window_of(keyframes: list[Keyframe], seed: int) -> OpenWindow:
 
 
 def submap_of(keyframes: list[Keyframe], seed: int) -> LocalMap:
-    local = window_of(keyframes, seed).solved(gaussian)
+    local = window_of(keyframes, seed).solve(gaussian)
     assert local is not None
     assert len(local.ids) > 15
     return local
