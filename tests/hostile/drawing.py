@@ -89,7 +89,7 @@ def packed(P: np.ndarray) -> bytes:
 
 def initial_pose(robot: str) -> m.InitialPose:
     """An unknown initial pose."""
-    return m.InitialPose(stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b"")
+    return build.initial_pose(robot=robot)
 
 
 class Team:
@@ -237,7 +237,7 @@ def centre_session(
     centre = CentralNode(config or CentralConfig(), list(ROBOTS))
     out = centre.begin()
     for robot in ROBOTS:
-        out += centre.handle(m.Liveliness(stamp_ns=0, node=f"robot/{robot}", alive=True), 0)
+        out += centre.handle(build.liveliness(node=f"robot/{robot}"), 0)
     for message in messages:
         out += centre.handle(message, 0)
     for each in [*out, Outgoing(out[0].channel, "central", centre.status())]:
@@ -257,11 +257,11 @@ def _interval(
         case 0:
             spread = b"" if rng.random() < 0.5 else from_floats(covariance(rng, 3))
             motion = from_floats([speed, float(numbers(rng, 1)[0]), np.clip(turn, -3.1, 3.1)])
-            return m.Increment(**name, increment=motion, covariance=spread)
+            return build.increment(**name, increment=motion, covariance=spread)
         case 1:
             return m.Steering(**name, wheel_speed=speed, steering=float(np.clip(turn, -1.5, 1.5)))
         case _:
-            return m.Odometry(**name, forward=speed, yaw_rate=turn)
+            return build.odometry(**name, forward=speed, yaw_rate=turn)
 
 
 def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m.Measurement:
@@ -278,12 +278,12 @@ def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m
     match rng.integers(6):
         case 0:
             places = from_floats(numbers(rng, 2 * n))
-            return m.Points(**name, ids=ids, positions=places, covariances=spread)
+            return build.points(**name, ids=ids, positions=places, covariances=spread)
         case 1:
             alike = b"" if rng.random() < 0.5 else from_floats(numbers(rng, n))
-            return m.Detections(**name, **polar, covariances=spread, signatures=alike)
+            return build.detections(**name, **polar, covariances=spread, signatures=alike)
         case _:
-            return m.Observations(**name, ids=ids, **polar, covariances=spread)
+            return build.observations(**name, ids=ids, **polar, covariances=spread)
 
 
 def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator[m.Message]:
@@ -304,10 +304,9 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
             message = _scan(rng, robot, counter + 1, stamp_ns)
         else:
             names = tuple(str(x) for x in rng.choice(ROBOTS, int(rng.integers(0, 3))))
-            message = m.Sightings(
+            message = build.sightings(
                 stamp_ns=stamp_ns,
                 robot=robot,
-                incarnation=1,
                 number=counter + 1,
                 teammates=names,
                 ranges=from_floats(np.abs(numbers(rng, len(names)))),

@@ -27,6 +27,7 @@ from team.wire import logs
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import encoded
+from tests import build
 from tests.sim.reruns import messages, team_samples, thesis, written
 from tests.support import submap
 from tests.teams import config, published, stream
@@ -216,7 +217,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
 def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew() -> None:
     network = MemoryNetwork()
     centre, viewer = MemoryBus(network), MemoryBus(network)
-    start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
+    start = build.initial_pose()
     centre.answer(ch.SUBMAPS, "", lambda _: [encoded(start)])
     centre.answer(ch.MEASUREMENTS, "r1", lambda _: [encoded(submap(0))])
     for channel in (ch.FAULT, ch.ROBOT_CONFIG):
@@ -239,7 +240,7 @@ def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(
     shell = CentralShell(MemoryBus(network), CENTRE, ["r1"], threading.Event())
     token = Sample(
         ch.ALIVE.key("robot/" + "a" * 25_000),
-        encoded(m.Liveliness(stamp_ns=0, node="robot/" + "a" * 25_000, alive=True)),
+        encoded(build.liveliness(node="robot/" + "a" * 25_000)),
         0, 0, 0,
     )  # fmt: skip
     shell._shell.take(shell._patient([token]))
@@ -260,7 +261,7 @@ def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody() -> None:
     shell.answer(ch.SUBMAPS, "", answer)
     asker = MemoryBus(network)
     with pytest.raises(RuntimeError, match="the answer failed: IndexError"):
-        asker.ask(ch.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="r1"), 1.0)
+        asker.ask(ch.SUBMAPS, "", build.submaps_request(), 1.0)
     assert shell.boundary.faults == 1
 
 

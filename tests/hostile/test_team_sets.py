@@ -41,7 +41,7 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
         places = [(5 + 3 * (i % 7), 2 - (i % 5) * 3) for i in ids]
         mean = np.concatenate([[10.0, 0.0, 0.1], np.zeros(3 * len(nodes)), np.ravel(places)])
     begins = sequence * 10 * S
-    return m.Submap(
+    return build.submap(
         stamp_ns=begins + 10 * S,
         robot=robot,
         incarnation=1,
@@ -191,7 +191,7 @@ def _with_measurements(message, k):
     if not isinstance(message, m.SightingFactor):
         return message
     fields = {name: getattr(message, name) for name in message.__struct_fields__}
-    return m.SightingFactor(**{**fields, "measurements": (k + 1,)})
+    return build.sighting_factor(**{**fields, "measurements": (k + 1,)})
 
 
 def test_a_million_metres_from_the_origin_the_map_is_the_same():
@@ -294,7 +294,7 @@ class HostileTeam(RuleBasedStateMachine):
         self.unsent: list[m.Message] = []
         self.centre = CentralNode(CentralConfig(), list(ROBOTS))
         for robot in ROBOTS:
-            self.centre.handle(m.Liveliness(stamp_ns=0, node=f"robot/{robot}", alive=True), 0)
+            self.centre.handle(build.liveliness(node=f"robot/{robot}"), 0)
         for each in self.team.messages:
             self.hear(each)
 
@@ -327,7 +327,7 @@ class HostileTeam(RuleBasedStateMachine):
 
     @rule()
     def is_withdrawn(self):
-        self.hear(m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="a test"))
+        self.hear(build.withdrawal(robot="r3"))
 
     @invariant()
     def says_what_every_receiver_takes(self):

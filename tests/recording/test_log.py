@@ -26,6 +26,7 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample, opened
 from team.wire.codec import encoded
+from tests import build
 from tests.support import ROOT, examples, odometry, on_its_key, submap, wait_until
 
 
@@ -100,11 +101,10 @@ def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
         sample(
             c.ODOMETRY,
             "alpha",
-            m.Odometry(
+            build.odometry(
                 stamp_ns=stamp,
                 robot="alpha",
                 incarnation=0,
-                number=0,
                 duration_ns=0,
                 forward=0.0,
                 yaw_rate=0.0,

@@ -65,7 +65,7 @@ def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path
 
 
 CONCLUDED = next(message for message in examples() if isinstance(message, m.Concluded))
-GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost")
+GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 
 @pytest.mark.parametrize("peers", [("r1", "r2", "r3"), ()], ids=["peers", "a centre"])
@@ -103,7 +103,7 @@ def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(
         for k in range(20):
             forged = b"\x95\xaa" + f"forged/{k:03}".encode() + bytes(3)
             robot.publish_raw(Sample(c.ODOMETRY.key("r1"), forged, 0, 0, k))
-            status = m.Status(stamp_ns=0, node=f"robot/r{k}", state="x", figures={})
+            status = build.status(node=f"robot/r{k}", state="x")
             robot.publish(Outgoing(c.STATUS, f"robot/r{k}", status))
         loop.take(bus.receive())
         wait_until(lambda: recorder.waiting() == 0 and recorder.dropped > 0)
@@ -214,8 +214,8 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path: Path, endp
         one.message for one in published if one.channel is c.ODOMETRY
     ]
     assert messages_of(list(log.samples()), c.ALIVE) == [
-        m.Liveliness(stamp_ns=0, node="robot/alpha", alive=True),
-        m.Liveliness(stamp_ns=999_000_000, node="robot/alpha", alive=False),
+        build.liveliness(node="robot/alpha"),
+        build.liveliness(stamp_ns=999_000_000, node="robot/alpha", alive=False),
     ]
     assert messages_of(list(log.samples()), c.STATUS)[:-1] == statuses != []
     assert statuses[0].warnings == ("central has not appeared yet",)
@@ -354,9 +354,7 @@ def flows(source: ZenohBus, path: Path) -> None:
     wait_until(heard)
 
 
-PROBE = m.Sightings(
-    stamp_ns=0, robot="probe", incarnation=0, number=0, teammates=(), ranges=b"", bearings=b""
-)
+PROBE = build.sightings(robot="probe", incarnation=0)
 
 
 def test_a_recording_ends_when_asked(path: Path) -> None:

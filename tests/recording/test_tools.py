@@ -30,6 +30,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import NO_COUNTER, Outgoing, Sample
 from team.wire.codec import encoded
+from tests import build
 from tests.recording.test_log import chunks_of
 from tests.support import examples, odometry, on_its_key, submap
 
@@ -47,26 +48,14 @@ def drive(robot: str, seconds: int) -> list[Sample]:
         sampled(
             c.ROBOT_CONFIG,
             robot,
-            m.Configuration(
-                stamp_ns=0,
-                node=f"robot/{robot}",
-                incarnation=1,
-                digest=bytes(8),
-                configuration="{}",
-            ),
+            build.configuration(node=f"robot/{robot}"),
             0,
         )
     ]
     for i in range(10 * seconds):
         stamp = 100 * SECOND + i * SECOND // 10
-        measurement = m.Odometry(
-            stamp_ns=stamp,
-            robot=robot,
-            incarnation=1,
-            number=i,
-            duration_ns=SECOND // 10,
-            forward=0.5,
-            yaw_rate=0.1,
+        measurement = build.odometry(
+            stamp_ns=stamp, robot=robot, number=i, duration_ns=SECOND // 10, forward=0.5
         )
         out.append(sampled(c.ODOMETRY, robot, measurement, i))
         if i % 10 == 9:
@@ -126,8 +115,7 @@ def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
 
 def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
     said = [
-        sampled(c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k)
-        for k in range(3)
+        sampled(c.STATUS, "central", build.status(node="central", state=""), k) for k in range(3)
     ]
     again = [msgspec.structs.replace(s, wall_ns=s.wall_ns + 10**9) for s in said[2:]]
     assert found(recorded(path, said + again)) == ["central/status: 2 messages missing: 0–1"]
@@ -146,12 +134,9 @@ def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path)
             0,
         )
     )
-    done = m.Done(
-        stamp_ns=0, robot="alpha", incarnation=0, measurements=0, steps=0, submaps=3, ledger=()
-    )
+    done = build.done(robot="alpha", incarnation=0, submaps=3)
     said.append(sampled(c.ROBOT_DONE, "alpha", done, 0))
-    tally = m.Tally(
-        stamp_ns=0,
+    tally = build.tally(
         node="robot/alpha",
         since_ns=10**18,
         keys=("robot/alpha/done", "robot/alpha/team/pose"),
@@ -173,9 +158,7 @@ def test_a_log_without_the_end_of_the_streams_says_so(path: Path, tmp_path: Path
     done = sampled(
         c.ROBOT_DONE,
         "alpha",
-        m.Done(
-            stamp_ns=0, robot="alpha", incarnation=1, measurements=10, steps=2, submaps=0, ledger=()
-        ),
+        build.done(robot="alpha", measurements=10, steps=2),
         0,
     )
     end = sampled(
@@ -194,14 +177,14 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
     """A killed robot's second life says what it has published; of the first nobody knows."""
 
     def status(counter: int, wall_s: int) -> Sample:
-        said = m.Status(stamp_ns=counter * 10**9, node="robot/alpha", state="mapping", figures={})
+        said = build.status(stamp_ns=counter * 10**9, node="robot/alpha")
         return msgspec.structs.replace(
             sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9
         )
 
     def tally(node: str, since_s: int, until_s: int, count: int) -> Sample:
         keys = (f"{node}/status",)
-        said = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
+        said = build.tally(node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
         return msgspec.structs.replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
 
     first = [status(k, 10 + k) for k in range(3)]
@@ -217,9 +200,7 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
 def test_views_that_are_missing_can_be_drawn_again(path: Path) -> None:
     views = [
         msgspec.structs.replace(
-            sampled(
-                c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k
-            ),
+            sampled(c.STATUS, "central", build.status(node="central", state=""), k),
             key="view/log",
         )
         for k in (0, 2)
@@ -244,14 +225,8 @@ def test_a_measurement_that_is_there_twice_and_not_the_same_is_named(path: Path)
     other = sampled(
         c.ODOMETRY,
         "alpha",
-        m.Odometry(
-            stamp_ns=100 * SECOND,
-            robot="alpha",
-            incarnation=1,
-            number=3,
-            duration_ns=1,
-            forward=0.5,
-            yaw_rate=0.5,
+        build.odometry(
+            stamp_ns=100 * SECOND, robot="alpha", number=3, duration_ns=1, forward=0.5, yaw_rate=0.5
         ),
         10,
     )
@@ -261,12 +236,8 @@ def test_a_measurement_that_is_there_twice_and_not_the_same_is_named(path: Path)
 
 
 def test_what_the_recorder_knows_that_it_lacks_is_found(path: Path) -> None:
-    last = m.Status(
-        stamp_ns=0,
-        node="recorder",
-        state="done",
-        figures={},
-        warnings=("missing: robot/alpha/team/pose: 7",),
+    last = build.status(
+        node="recorder", state="done", warnings=("missing: robot/alpha/team/pose: 7",)
     )
     said = [*drive("alpha", 1), sampled(c.STATUS, "recorder", last, 0)]
     assert found(recorded(path, said)) == ["recorder: missing: robot/alpha/team/pose: 7"]
@@ -274,19 +245,17 @@ def test_what_the_recorder_knows_that_it_lacks_is_found(path: Path) -> None:
 
 def test_what_no_publisher_counts_is_not_held_against_its_counters(path: Path) -> None:
     alive = [
-        sampled(c.ALIVE, "central", m.Liveliness(stamp_ns=0, node="central", alive=up), 0)
+        sampled(c.ALIVE, "central", build.liveliness(node="central", alive=up), 0)
         for up in (True, False)
     ]
     own = sampled(
         c.STATUS,
         "recorder",
-        m.Status(stamp_ns=0, node="recorder", state="recording", figures={}),
+        build.status(node="recorder", state="recording"),
         4,
     )
     assert found(recorded(path, [*alive, own])) == []
-    other = sampled(
-        c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="waiting", figures={}), 4
-    )
+    other = sampled(c.STATUS, "central", build.status(node="central", state="waiting"), 4)
     assert found(recorded(path.with_name("b.mcap"), [other])) == [
         "central/status: 4 messages missing: 0–3"
     ]
@@ -331,14 +300,14 @@ def spoken(node: str, count: int, since_s: int) -> list[Sample]:
     """A process that publishes a status a second, a fault, and its totals at its end."""
     said: list[Sample] = []
     for k in range(count):
-        status = m.Status(stamp_ns=k * 10**9, node=node, state="mapping", figures={})
+        status = build.status(stamp_ns=k * 10**9, node=node)
         one = sampled(c.STATUS, node, status, k)
         said.append(msgspec.structs.replace(one, wall_ns=(since_s + k) * 10**9))
     until_ns = said[-1].wall_ns + 1
-    done = m.Liveliness(stamp_ns=0, node=node, alive=False)
+    done = build.liveliness(node=node, alive=False)
     said.append(Sample(f"{node}/config", encoded(done), 0, until_ns, 0))
     keys = (c.STATUS.key(node), f"{node}/config")
-    tally = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count, 1))
+    tally = build.tally(node=node, since_ns=since_s * 10**9, keys=keys, counts=(count, 1))
     return [*said, Sample(c.TALLY.key(node), encoded(tally), 0, until_ns + 1, 0)]
 
 
@@ -655,10 +624,9 @@ def test_numbers_read_back_from_csv_are_the_same(
 ) -> None:
     folder = tmp_path_factory.mktemp("csv")
     ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
-    message = m.Observations(
+    message = build.observations(
         stamp_ns=5,
         robot="alpha",
-        incarnation=1,
         number=9,
         ids=from_ids(ids),
         ranges=from_floats(ranges),

@@ -267,7 +267,7 @@ def test_an_answer_that_never_comes_is_an_error(endpoint: str) -> None:
 
         def timed_out() -> bool:
             try:
-                asker.ask(c.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="alpha"), 0.2)
+                asker.ask(c.SUBMAPS, "", build.submaps_request(robot="alpha"), 0.2)
             except BusError as error:
                 return "team/t/central/submaps" in str(error)
             return False  # its declaration is still on its way
@@ -598,12 +598,10 @@ def test_who_was_killed_in_a_run_and_begins_after_its_end_is_told_once(
 
 
 def test_an_order_outlives_the_operator_and_ends_with_the_team(endpoint: str) -> None:
-    order = m.GivenUp(
-        stamp_ns=0, node="robot/alpha", by="operator", reason="it fell into the water"
-    )
+    order = build.given_up(node="robot/alpha", reason="it fell into the water")
 
     def asked(bus: ZenohBus) -> list[m.Message]:
-        bus.request(c.KEPT, "", m.KeptRequest(stamp_ns=0, channels=("given_up",)))
+        bus.request(c.KEPT, "", build.kept_request(channels=("given_up",)))
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
             if found := bus.receive(0.1):
@@ -625,7 +623,7 @@ def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(
     endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A flood of them is neither queued nor passed on, and logs a few lines."""
-    status = m.Status(stamp_ns=0, node="robot/r1", state="x", figures={})
+    status = build.status(state="x")
     with (
         ZenohBus("t", endpoint) as sink,
         ZenohBus("t", endpoint) as source,
@@ -656,7 +654,7 @@ def test_a_bus_receives_samples_of_a_bounded_number_of_keys(
         def dropped() -> bool:
             for k in range(6):
                 node = f"robot/r{k}"
-                status = m.Status(stamp_ns=0, node=node, state="x", figures={})
+                status = build.status(node=node, state="x")
                 source.publish(Outgoing(c.STATUS, node, status))
             seen.update(sample.key for sample in sink.receive(0.02))
             return sink.dropped >= 6
