@@ -276,30 +276,3 @@ def test_replies_to_a_request_come_with_what_arrives(joined: Joined) -> None:
 def test_what_is_no_reply_to_the_question_is_dropped(reply: bytes) -> None:
     with pytest.raises(WireError):
         replied(c.SENT, "alpha", reply, 0)
-
-
-def test_how_long_a_delivery_in_memory_takes_does_not_depend_on_those_who_do_not_receive_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[str] = []
-    owner = c.Channel.owner
-
-    def counted(channel: c.Channel, key: str) -> str | None:
-        asked.append(key)
-        return owner(channel, key)
-
-    monkeypatch.setattr(c.Channel, "owner", counted)
-
-    def cost(robots: int) -> int:
-        network = MemoryNetwork()
-        buses = [MemoryBus(network) for _ in range(robots)]
-        for number, bus in enumerate(buses):
-            bus.subscribe(c.ODOMETRY, f"r{number}")
-        asked.clear()
-        source = MemoryBus(network)
-        for _ in range(3):
-            source.publish_raw(Sample("source/r1/odometry", b"", 0, 0, 0))
-        assert [len(bus.receive()) for bus in buses] == [0, 3, *[0] * (robots - 2)]
-        return len(asked)
-
-    assert max(cost(20), cost(200)) < 20

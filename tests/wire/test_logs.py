@@ -58,8 +58,8 @@ def hostile_status() -> m.Status:
 
 
 def hostile_fault() -> m.Fault:
-    text = HOSTILE
-    return build.fault(origin=text, count=1, message=text, error=text, text=text, place=text)  # fmt: skip
+    texts = dict.fromkeys(("origin", "message", "error", "text", "place"), HOSTILE)
+    return build.fault(count=1, **texts)
 
 
 def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message_without() -> None:
