@@ -381,8 +381,8 @@ def unequal(rng):
 
 
 SEEDS = {
-    "join": 50, "kalman": 20, "kalman-per-axis": 20, "covariance-intersection": 15, "latest": 8,
-    "alone": 4, "joint-fastslam": 8, "batch": 8, "svd-join": 8, "svd-join-spherical": 4,
+    "join": 40, "kalman": 10, "kalman-per-axis": 6, "covariance-intersection": 6, "latest": 4,
+    "alone": 4, "joint-fastslam": 4, "batch": 4, "svd-join": 4, "svd-join-spherical": 4,
 }  # fmt: skip
 
 

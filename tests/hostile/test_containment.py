@@ -23,7 +23,6 @@ from team.robot.node import RobotNode
 from team.shell import FaultyRunError, Shell
 from team.store import SubmapStore
 from team.wire import channels as ch
-from team.wire import logs
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import encoded
@@ -296,41 +295,3 @@ def test_an_interrupt_within_a_compiled_kernel_ends_the_run_and_is_no_fault() ->
     with pytest.raises(KeyboardInterrupt):
         boundary.give(Interrupted(), submap(0))
     assert boundary.faults == 0
-
-
-def test_who_is_refused_without_end_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    boundary = Boundary("robot/r1")
-    for k in range(10_000):
-        boundary.refuse(Sample("robot/r2/submap", b"", 0, 0, k), "of r9, not in this team")
-    assert boundary.refused == 10_000
-    assert logs.AT_ONCE <= len(caplog.records) < 2 * logs.AT_ONCE
-    assert "some are left out" in caplog.records[logs.AT_ONCE - 1].message
-    assert "10000 dropped" in boundary.warnings[0]
-
-
-def test_a_message_of_a_log_is_encoded_only_where_somebody_looks_at_its_bytes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looked: list[m.Message] = []
-
-    def noted(message: m.Message) -> bytes:
-        looked.append(message)
-        return encoded(message)
-
-    monkeypatch.setattr("team.containment.encoded", noted)
-    boundary, node = Boundary("robot/r1"), RobotNode(config("r1"))
-    measurements = published(stream("r1", 4))
-    last = max(k for k, each in enumerate(measurements) if isinstance(each, m.Odometry))
-    for message in measurements[:last]:
-        boundary.give(node, message)
-    assert not looked
-    monkeypatch.setattr(HybridSlam, "drive", _raising)
-    out = boundary.give(node, measurements[last])
-    assert looked == [measurements[last]]
-    assert [each.message.error for each in out if isinstance(each.message, m.Fault)] == [
-        "RuntimeError"
-    ]
-
-
-def _raising(*_: object, **__: object) -> None:
-    raise RuntimeError("it can not")

@@ -13,7 +13,6 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from central.config import CentralConfig
 from central.node import CentralNode
-from team.config import FusionRule
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from team.wire.codec import decoded, encoded
@@ -24,9 +23,7 @@ from tests.hostile.drawing import (
     S,
     Team,
     centre_session,
-    covariance,
     last_words,
-    numbers,
     packed,
     progress,
 )
@@ -221,67 +218,6 @@ def test_any_hostile_team_gets_a_map_and_in_any_order_the_same(seed, robust_c):
     again, _ = centre_session([*shuffled, *shuffled[:3], *team.ends()], config)
     assert again.final is not None
     assert encoded(again.final) == encoded(centre.final)
-
-
-@pytest.mark.parametrize("fusion", ["svd-join", "svd-join-spherical"])
-@FEW
-@given(seed=st.integers(0, 2**32))
-def test_the_other_rule_on_submaps_has_a_map_too(fusion: FusionRule, seed: int):
-    team = Team(np.random.default_rng(seed))
-    for _ in range(8):
-        team.grow()
-    centre, _ = centre_session([*team.messages, *team.ends()], CentralConfig(fusion=fusion))
-    assert centre.final is not None
-
-
-@pytest.mark.parametrize(
-    "fusion", ["kalman", "kalman-per-axis", "covariance-intersection", "latest", "alone"]
-)
-@FEW
-@given(seed=st.integers(0, 2**32))
-def test_rules_on_whole_maps_fuse_what_they_can(fusion: FusionRule, seed: int):
-    rng = np.random.default_rng(seed)
-    messages: list[m.Message] = [start(robot) for robot in ROBOTS]
-    for exchange in (1, 2):
-        for robot in ROBOTS:
-            ids = np.unique(rng.integers(1, 6, 4)).astype(np.uint32)
-            n = 2 * len(ids)
-            made = build.map_estimate(
-                stamp_ns=exchange * S,
-                robot=robot,
-                sequence=exchange,
-                exchange=exchange,
-                ids=from_ids(ids),
-                means=from_floats(numbers(rng, n)),
-                covariance=packed(covariance(rng, n)),
-            )
-            tame = build.map_estimate(
-                stamp_ns=exchange * S,
-                robot=robot,
-                sequence=exchange,
-                exchange=exchange,
-                ids=from_ids(ids),
-                means=from_floats(np.zeros(n)),
-                covariance=packed(np.eye(n)),
-            )
-            try:
-                messages.append(decoded(encoded(made), m.MapEstimate))
-            except ValueError:
-                messages.append(tame)
-    messages += [
-        build.done(stamp_ns=2 * S, robot=robot, measurements=1000, steps=500, last_map=2)
-        for robot in ROBOTS
-    ]
-    messages.append(
-        m.End(
-            stamp_ns=10**12,
-            streams=tuple(
-                m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
-            ),
-        )
-    )
-    centre, _ = centre_session(messages, CentralConfig(fusion=fusion))
-    assert centre.final is not None
 
 
 class HostileTeam(RuleBasedStateMachine):

@@ -12,7 +12,7 @@ from team.peers.exchange import MOST_ASKED, make_answer, make_request
 from team.peers.given import GIVEN_BYTES
 from team.peers.members import LARGEST_MEMBER, Member, member_of
 from team.peers.node import PeerNode
-from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica, intervals
+from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
@@ -188,16 +188,6 @@ def test_what_is_kept_is_bounded_by_robot() -> None:
     assert full.add(start("r2")) == "new"
 
 
-def test_what_is_asked_for_is_bounded_whatever_a_summary_claims() -> None:
-    claim = build.holding(sequences=(0, 2**62))
-    summary = build.set_summary(node="robot/r2", holdings=(claim,))
-    asked = make_request(replica_of(), summary)
-    assert asked is not None
-    assert sum(w.last - w.first + 1 for w in asked.requested) == MOST_ASKED
-    strange = msgspec.structs.replace(claim, robot="r9")
-    assert make_request(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
-
-
 def test_what_is_no_member_is_refused_at_the_door() -> None:
     progress = build.progress(measurements=1)
     with pytest.raises(ValueError, match="no key of a set's members"):
@@ -207,11 +197,6 @@ def test_what_is_no_member_is_refused_at_the_door() -> None:
     own = done("r1", 1)
     with pytest.raises(ValueError, match="a message of 'r1' on the key"):
         member_of("robot/r2/done", own.payload)
-
-
-def test_intervals_are_closed_and_part_by_gaps() -> None:
-    assert intervals({0, 1, 2, 5, 7, 8}, 3) == (0, 2, 5, 5, 7, 8)
-    assert intervals(set(), 0) == ()
 
 
 def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() -> None:
