@@ -8,7 +8,7 @@ from team.wire import messages as m
 
 S = 1_000_000_000
 """One second [ns]."""
-M = TypeVar("M", bound=m.Message)
+M = TypeVar("M")
 ORDINARY: dict[str, Any] = {
     "stamp_ns": 0, "robot": "r1", "incarnation": 1, "sequence": 0, "exchange": 0, "steps": 0,
     "measurements": 0, "submaps": 0, "ledger": (), "number": 0, "pose": b"", "covariance": b"",
@@ -16,7 +16,11 @@ ORDINARY: dict[str, Any] = {
     "digest": bytes(8), "config": bytes(8), "map_digest": bytes(8), "configuration": "{}",
     "by": "operator", "reason": "a test", "figures": {}, "warnings": (), "first": 0, "last": -1,
     "final": False, "provisional": False, "rule": "join", "frame": "r1/1", "members": (),
-    "missing": (), "chi2": 0.0, "dof": 0, "reasons": (),
+    "missing": (), "chi2": 0.0, "dof": 0, "reasons": (), "state": "mapping", "start": True,
+    "serial": 0, "sha256": bytes(32), "holdings": (), "statements": (), "requested": (),
+    "payload": b"", "wall_ns": 0, "counter": 0, "keys": (), "counts": (), "since_ns": 0,
+    "teammates": (), "ids": b"", "ranges": b"", "bearings": b"", "stamps": b"", "poses": b"",
+    "covariances": b"", "signature": b"", "sequences": (), "streams": (),
 }  # fmt: skip
 
 
@@ -46,6 +50,26 @@ configuration = partial(_built, m.Configuration)
 status = partial(_built, m.Status)
 withdrawal = partial(_built, m.Withdrawal)
 measurements_request = partial(_built, m.MeasurementsRequest)
+submaps_request = partial(_built, m.SubmapsRequest)
+increment = partial(_built, m.Increment)
+points = partial(_built, m.Points)
+detections = partial(_built, m.Detections)
+sightings = partial(_built, m.Sightings)
+truth = partial(_built, m.Truth)
+trajectory = partial(_built, m.Trajectory)
+given_up = partial(_built, m.GivenUp)
+team_end = partial(_built, m.TeamEnd)
+withdrawal_heard = partial(_built, m.WithdrawalHeard)
+concluded = partial(_built, m.Concluded)
+set_summary = partial(_built, m.SetSummary)
+members_request = partial(_built, m.MembersRequest)
+members = partial(_built, m.Members)
+kept = partial(_built, m.Kept)
+kept_request = partial(_built, m.KeptRequest)
+tally = partial(_built, m.Tally)
+fault = partial(_built, m.Fault)
+holding = partial(_built, m.Holding)
+requested = partial(_built, m.Requested)
 
 
 def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:

@@ -42,7 +42,7 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
             Outgoing(
                 ch.ALIVE,
                 f"robot/{name}",
-                m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True),
+                build.liveliness(node=f"robot/{name}"),
             )
         )
         yield sample(
@@ -65,7 +65,7 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
                 np.arctan2(1.3 * np.cos(1.3 * angle), -np.sin(angle)),
             ]
             said = np.array(true) + rng.normal(size=3) * [0.2, 0.3, 0.03]
-            truth = m.Truth(
+            truth = build.truth(
                 stamp_ns=at, robot=name, stamps=from_stamps([at]), poses=from_floats(true)
             )
             pose = build.pose_estimate(

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -16,6 +17,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Bus, Sample
 from team.wire.channels import Channel
+from tests import build
 
 ROOT = Path(__file__).parents[1]
 
@@ -133,20 +135,19 @@ def packed(matrix: np.ndarray) -> bytes:
 
 
 def odometry(i: int, robot: str = "alpha") -> m.Odometry:
-    return m.Odometry(
+    return build.odometry(
         stamp_ns=i * 1_000_000,
         robot=robot,
         incarnation=0,
         number=i,
         duration_ns=1_000_000,
         forward=0.5,
-        yaw_rate=0.1,
     )
 
 
 def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
     n = 3 + 2 * landmarks
-    return m.Submap(
+    return build.submap(
         stamp_ns=(i + 1) * 1_000_000,
         robot=robot,
         incarnation=0,
@@ -172,11 +173,9 @@ def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
 
 def peers_examples(digest: bytes) -> Iterator[m.Message]:
     """One of every message between peers."""
-    holding = m.Holding(
-        robot="alpha", incarnation=1, start=True, sequences=(0, 4, 6, 6), digest=digest, newest_ns=9
-    )
+    holding = build.holding(robot="alpha", sequences=(0, 4, 6, 6), digest=digest, newest_ns=9)
     statements = m.Statements(robot="alpha", count=2, digest=digest)
-    yield m.SetSummary(
+    yield build.set_summary(
         stamp_ns=9,
         node="robot/bravo",
         serial=3,
@@ -184,11 +183,11 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
         holdings=(holding,),
         statements=(statements,),
     )
-    wanted = m.Requested(robot="alpha", incarnation=1, start=False, first=5, last=5)
-    yield m.MembersRequest(
+    wanted = build.requested(robot="alpha", start=False, first=5, last=5)
+    yield build.members_request(
         stamp_ns=9, node="robot/bravo", requested=(wanted,), statements=("alpha",)
     )
-    yield m.Members(
+    yield build.members(
         stamp_ns=9,
         node="robot/alpha",
         keys=("robot/alpha/submap",),
@@ -198,7 +197,7 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
     yield m.Certificate(stamp_ns=0, robot="alpha", certificate=b"DER")
     yield m.Signature(stamp_ns=9, robot="alpha", member=4 * digest, signature=b"ECDSA")
     yield m.RadioPlan(stamp_ns=0, robots=("alpha", "bravo"), ends_ns=(9, 8), pairs=b"\x80\x00")
-    yield m.Concluded(
+    yield build.concluded(
         stamp_ns=9, robot="alpha", serial=1, digest=digest, sha256=4 * digest, submaps=7
     )
 
@@ -209,27 +208,18 @@ def examples() -> Iterator[m.Message]:
     means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
     digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
     member = m.VersionEntry(robot="alpha", incarnation=1, sequence=5)
-    yield m.InitialPose(
-        stamp_ns=0,
-        robot="alpha",
-        incarnation=1,
-        number=0,
-        pose=three,
-        covariance=from_floats(spd(3)),
-    )
-    yield m.Odometry(
+    yield build.initial_pose(robot="alpha", pose=three, covariance=from_floats(spd(3)))
+    yield build.odometry(
         stamp_ns=1_000,
         robot="alpha",
-        incarnation=1,
         number=2,
         duration_ns=100_000_000,
         forward=0.25,
         yaw_rate=-0.125,
     )
-    yield m.Increment(
+    yield build.increment(
         stamp_ns=1_000,
         robot="alpha",
-        incarnation=1,
         number=2,
         duration_ns=100_000_000,
         increment=three,
@@ -244,45 +234,36 @@ def examples() -> Iterator[m.Message]:
         wheel_speed=2.5,
         steering=-0.125,
     )
-    yield m.Observations(
+    yield build.observations(
         stamp_ns=2_000,
         robot="alpha",
-        incarnation=1,
         number=3,
         ids=two,
         ranges=from_floats([2.0, 3.5]),
         bearings=from_floats([0.5, -1]),
         covariances=blocks,
     )
-    yield m.Points(
-        stamp_ns=2_000,
-        robot="alpha",
-        incarnation=1,
-        number=3,
-        ids=two,
-        positions=means,
-        covariances=blocks,
+    yield build.points(
+        stamp_ns=2_000, robot="alpha", number=3, ids=two, positions=means, covariances=blocks
     )
-    yield m.Detections(
+    yield build.detections(
         stamp_ns=2_500,
         robot="alpha",
-        incarnation=1,
         number=3,
         ranges=from_floats([2.0, 3.5]),
         bearings=from_floats([0.5, -1]),
         covariances=blocks,
         signatures=from_floats([0.25, 0.5]),
     )
-    yield m.Sightings(
+    yield build.sightings(
         stamp_ns=3_000,
         robot="alpha",
-        incarnation=1,
         number=4,
         teammates=("bravo",),
         ranges=from_floats([6.0]),
         bearings=from_floats([-3.0]),
     )
-    yield m.Truth(
+    yield build.truth(
         stamp_ns=4_000, robot="alpha", stamps=from_stamps([0, 4_000]), poses=from_floats(range(6))
     )
     yield m.TruthLandmarks(stamp_ns=-5, ids=two, positions=means)
@@ -300,13 +281,10 @@ def examples() -> Iterator[m.Message]:
         positions=from_floats([0.0, 0.5, 1.0, 1.5]),
     )
     yield m.KnownMap(stamp_ns=-5, ids=two, positions=means)
-    yield m.Configuration(
-        stamp_ns=0, node="robot/alpha", incarnation=1, digest=digest, configuration='{"seed": 7}'
-    )
-    yield m.Submap(
+    yield build.configuration(node="robot/alpha", digest=digest, configuration='{"seed": 7}')
+    yield build.submap(
         stamp_ns=9_000,
         robot="alpha",
-        incarnation=1,
         sequence=5,
         first_measurement=10,
         last_measurement=19,
@@ -334,10 +312,9 @@ def examples() -> Iterator[m.Message]:
         rows=from_ids([0, 0, 2]),
         landmarks=from_ids([UNNAMED + 1, m.CLUTTER, m.UNCONFIRMED]),
     )
-    yield m.SightingFactor(
+    yield build.sighting_factor(
         stamp_ns=8_500,
         robot="alpha",
-        incarnation=1,
         sequence=5,
         config=digest,
         teammate="bravo",
@@ -346,7 +323,7 @@ def examples() -> Iterator[m.Message]:
         covariance=packed(spd(2)),
         measurements=(12, 14),
     )
-    yield m.Withdrawal(stamp_ns=9_000, robot="alpha", by="operator", reason="its wheel is flat")
+    yield build.withdrawal(stamp_ns=9_000, robot="alpha", reason="its wheel is flat")
     yield m.Verdict(
         stamp_ns=0,
         robot="alpha",
@@ -358,24 +335,21 @@ def examples() -> Iterator[m.Message]:
         by="operator",
         reason="the same tree",
     )
-    yield m.WithdrawalHeard(
-        stamp_ns=9_000, robot="alpha", withdrawn="bravo", by="operator", reason="its wheel is flat"
+    yield build.withdrawal_heard(
+        stamp_ns=9_000, robot="alpha", withdrawn="bravo", reason="its wheel is flat"
     )
-    yield m.MapEstimate(
+    yield build.map_estimate(
         stamp_ns=9_000,
         robot="alpha",
-        incarnation=1,
         sequence=5,
-        exchange=0,
         joint=False,
         ids=two,
         means=means,
         covariance=blocks,
     )
-    yield m.PoseEstimate(
+    yield build.pose_estimate(
         stamp_ns=9_000,
         robot="alpha",
-        incarnation=1,
         sequence=5,
         map_digest=digest,
         pose=three,
@@ -392,17 +366,13 @@ def examples() -> Iterator[m.Message]:
     yield m.Innovation(
         stamp_ns=9_000, robot="alpha", incarnation=1, sequence=5, squared=20.5, dof=22
     )
-    yield m.FusedMap(
+    yield build.fused_map(
         stamp_ns=9_000,
-        rule="join",
         digest=digest,
         frame="alpha/1",
         final=True,
-        provisional=False,
-        exchange=0,
         members=(member,),
         missing=(m.VersionEntry(robot="bravo", incarnation=0, sequence=2),),
-        joint=True,
         ids=two,
         means=means,
         covariance=packed(spd(4)),
@@ -450,10 +420,9 @@ def examples() -> Iterator[m.Message]:
             ),
         ),
     )
-    yield m.Prior(
+    yield build.prior(
         stamp_ns=9_000,
         robot="alpha",
-        incarnation=1,
         sequence=5,
         digest=digest,
         ids=two,
@@ -471,10 +440,9 @@ def examples() -> Iterator[m.Message]:
         frame="bravo/1",
         in_team_frame=True,
     )
-    yield m.Trajectory(
+    yield build.trajectory(
         stamp_ns=9_000,
         robot="alpha",
-        incarnation=1,
         digest=digest,
         stamps=from_stamps([9_000]),
         poses=three,
@@ -483,16 +451,13 @@ def examples() -> Iterator[m.Message]:
         start_covariance=from_floats(spd(3)),
         crosses=from_floats(range(9)),
     )
-    yield m.Progress(
-        stamp_ns=9_000, node="central", robot="alpha", incarnation=1, measurements=128, submaps=6
-    )
+    yield build.progress(stamp_ns=9_000, node="central", robot="alpha", measurements=128, submaps=6)
     yield m.Rendezvous(
         stamp_ns=9_000, robot="alpha", incarnation=1, teammates=("bravo",), submaps=3, waited_s=12.5
     )
-    yield m.Done(
+    yield build.done(
         stamp_ns=9_000,
         robot="alpha",
-        incarnation=1,
         measurements=200,
         steps=99,
         submaps=20,
@@ -505,26 +470,20 @@ def examples() -> Iterator[m.Message]:
         notes=("gap of 3 s",),
     )
     yield m.StreamHead(stamp_ns=9_000, robot="alpha", incarnation=1, measurements=200, state="open")
-    yield m.TeamEnd(stamp_ns=0, by="operator", reason="the batteries are empty")
-    yield m.Status(
+    yield build.team_end(reason="the batteries are empty")
+    yield build.status(
         stamp_ns=9_000,
         node="recorder",
         state="recording",
         figures={"messages": 12.0},
         warnings=("slow disk",),
     )
-    yield m.GivenUp(
-        stamp_ns=9_000, node="robot/alpha", by="operator", reason="it fell into the water"
-    )
-    yield m.KeptRequest(
-        stamp_ns=0, channels=("final_map",), node="robot/alpha", run_ns=5_000_000_000
-    )
-    yield m.Kept(
-        stamp_ns=9_000, key="central/final", payload=b"\x91\xc0", wall_ns=10**18, counter=0
-    )
+    yield build.given_up(stamp_ns=9_000, node="robot/alpha", reason="it fell into the water")
+    yield build.kept_request(channels=("final_map",), node="robot/alpha", run_ns=5_000_000_000)
+    yield build.kept(stamp_ns=9_000, key="central/final", payload=b"\x91\xc0", wall_ns=10**18)
     yield m.FoldRequest(stamp_ns=0)
     yield from peers_examples(digest)
-    yield m.Fault(
+    yield build.fault(
         stamp_ns=9_000,
         node="central",
         origin="robot/alpha/submap",
@@ -535,37 +494,17 @@ def examples() -> Iterator[m.Message]:
         place="central.node:CentralNode.handle:58",
         digest=b"\x01\x02\x03\x04\x05\x06\x07\x08",
     )
-    yield m.Liveliness(stamp_ns=0, node="robot/alpha", alive=True)
-    yield m.Tally(
+    yield build.liveliness(node="robot/alpha")
+    yield build.tally(
         stamp_ns=9_000,
         node="robot/alpha",
         since_ns=10**18,
         keys=("robot/alpha/submap",),
         counts=(6,),
     )
-    yield m.MeasurementsRequest(stamp_ns=0, robot="alpha", incarnation=1, first=5, last=-1)
-    yield m.SubmapsRequest(stamp_ns=0, robot="alpha")
+    yield build.measurements_request(robot="alpha", first=5)
+    yield build.submaps_request(robot="alpha")
 
 
-def fused_map(**fields: object) -> m.FusedMap:
-    """An empty map of the rule `join` in r1's frame, with these fields in place of its own."""
-    return msgspec.structs.replace(_FUSED_MAP, **fields)
-
-
-_FUSED_MAP = m.FusedMap(
-    stamp_ns=0,
-    rule="join",
-    digest=bytes(8),
-    frame="r1/1",
-    final=False,
-    provisional=False,
-    exchange=0,
-    members=(),
-    missing=(),
-    joint=False,
-    ids=b"",
-    means=b"",
-    covariance=b"",
-    chi2=0.0,
-    dof=0,
-)
+fused_map = partial(build.fused_map, joint=False, ids=b"", means=b"", covariance=b"")
+"""A map of the rule `join` in r1's frame, empty unless these fields are given."""

@@ -224,7 +224,7 @@ class Team:
             if to != node and (to in ("world", "central") or node == "central"):
                 key = ch.ALIVE.key(node)
                 self.queues.setdefault((to, key), deque()).append(
-                    m.Liveliness(stamp_ns=0, node=node, alive=alive)
+                    build.liveliness(node=node, alive=alive)
                 )
 
     def send(self, source: str, out: Sequence[Outgoing]) -> None:
@@ -252,13 +252,11 @@ class Team:
         """The process is there again: it takes over the submaps that the centre has."""
         name, node = ch.robot_node(robot.id), robot_node(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
-        request = encoded(m.SubmapsRequest(stamp_ns=0, robot=robot.id))
+        request = encoded(build.submaps_request(robot=robot.id))
         kept = [decoded(reply) for reply in self.centre.answer_submaps(request)]
         if kept:
             node.take_over(kept)
-        self.queues[(name, "central/alive")] = deque(
-            [m.Liveliness(stamp_ns=0, node="central", alive=True)]
-        )
+        self.queues[(name, "central/alive")] = deque([build.liveliness(node="central")])
         latest = [
             self.sent[c.key()][-1:] for c in (ch.KNOWN_MAP, ch.END, ch.FUSED_MAP, ch.FINAL_MAP)
         ]

@@ -33,6 +33,7 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing, opened
 from team.wire.codec import encoded
 from team.wire.digest import NO_MAP, digest_of
+from tests import build
 from tests.support import ROOT, fused_map
 from tests.teams import Team, config, driven, of, published, stream, world_of
 
@@ -219,7 +220,7 @@ def messages():
                 m.StreamEnd(robot=x.robot, incarnation=1, measurements=len(x)) for x in PAIR.streams
             ),
         ),
-        *(m.Liveliness(stamp_ns=0, node=ch.robot_node(x.robot), alive=True) for x in PAIR.streams),
+        *(build.liveliness(node=ch.robot_node(x.robot)) for x in PAIR.streams),
     ]
 
 
@@ -248,7 +249,7 @@ def test_the_centre_gives_the_same_map_for_any_order_duplicates_and_delays(order
 def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_map():
     node, out = CentralNode(CENTRE, ["r1", "r2"]), []
     late = [x for x in messages() if isinstance(x, m.Submap) and x.robot == "r2"]
-    lost = m.Liveliness(stamp_ns=0, node="robot/r2", alive=False)
+    lost = build.liveliness(node="robot/r2", alive=False)
     first = [
         x for x in messages() if getattr(x, "robot", "r1") != "r2" and not isinstance(x, m.End)
     ]
@@ -261,7 +262,7 @@ def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_ma
     rest = [x for x in messages() if x not in first and x not in late]
     for message in [
         late[0],
-        m.Liveliness(stamp_ns=0, node="robot/r2", alive=True),
+        build.liveliness(node="robot/r2"),
         *rest,
         *late[1:],
     ]:
@@ -380,8 +381,8 @@ def unequal(rng):
 
 
 SEEDS = {
-    "join": 50, "kalman": 20, "kalman-per-axis": 20, "covariance-intersection": 15, "latest": 8,
-    "alone": 4, "joint-fastslam": 8, "batch": 8, "svd-join": 8, "svd-join-spherical": 4,
+    "join": 40, "kalman": 10, "kalman-per-axis": 6, "covariance-intersection": 6, "latest": 4,
+    "alone": 4, "joint-fastslam": 4, "batch": 4, "svd-join": 4, "svd-join-spherical": 4,
 }  # fmt: skip
 
 
@@ -401,12 +402,7 @@ def played(seed, estimator, fusion):
         if rng.random() < 0.5:
             team.resume(team.robots[victim].config)
         else:
-            order = m.GivenUp(
-                stamp_ns=0,
-                node=ch.robot_node(victim),
-                by="operator",
-                reason="it fell into the water",
-            )
+            order = build.given_up(node=ch.robot_node(victim), reason="it fell into the water")
             team.send("operator", [Outgoing(ch.GIVEN_UP, order.node, order)])
     team.run()
     return team

@@ -59,13 +59,6 @@ def test_every_name_of_the_library_comes_from_team_and_is_documented() -> None:
     assert [name for name in library.__all__ if f"`{name}`" not in page] == []
 
 
-def test_a_name_that_team_does_not_have_is_named() -> None:
-    with pytest.raises(AttributeError, match="'team' has no attribute 'fast_slam'"):
-        team.fast_slam  # noqa: B018
-    with pytest.raises(AttributeError, match="_nothing"):
-        team._nothing  # noqa: B018
-
-
 def test_to_import_team_or_a_part_of_it_costs_nothing_of_the_library() -> None:
     heavy = "{'numpy', 'numba', 'zenoh', 'mcap'}"
     program = f"import sys, team, team.config; print(sorted({heavy} & {{*sys.modules}}))"
@@ -148,16 +141,13 @@ def ran(name: str, *arguments: str, capsys: pytest.CaptureFixture[str], monkeypa
     return capsys.readouterr().out
 
 
-def test_the_example_of_fastslam_is_short_and_maps_the_landmarks(
+def test_the_example_of_fastslam_maps_the_landmarks(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     out = ran("fastslam.py", str(tmp_path / "f.png"), capsys=capsys, monkeypatch=monkeypatch)
     found = re.fullmatch(r"8 landmarks, RMSE (0\.\d+) m\n", out)
     assert found is not None
     assert float(found[1]) < 0.2
-    lines = (EXAMPLES / "fastslam.py").read_text("utf-8").splitlines()
-    begin, end = (next(k for k, x in enumerate(lines) if x.startswith(y)) for y in ("rng", "print"))
-    assert sum(map(bool, lines[begin : end + 1])) <= 20
     assert (tmp_path / "f.png").stat().st_size > 10_000
 
 

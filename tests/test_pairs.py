@@ -7,7 +7,6 @@ import pytest
 from team.config import Estimator, FusionRule
 from team.pairs import ESTIMATORS, PAIRS, RULES
 from team.registry import is_installed
-from team.sources import sources_of
 
 
 def test_the_names_of_the_rows_are_what_a_user_may_write() -> None:
@@ -27,11 +26,3 @@ def test_each_method_is_in_a_pair_and_pairs_name_rows_only() -> None:
     fed = {rule for row in ESTIMATORS.values() for rule in row.feeds}
     assert named <= set(ESTIMATORS)
     assert fed <= set(RULES)
-
-
-def test_no_kernel_hangs_on_the_methods_that_the_table_names() -> None:
-    """Else every edit of an estimator would compile every kernel anew."""
-    kernel = "team.estimation.hybrid_slam.fastslam_kernel"
-    reached = sources_of(kernel, ("team",), places=False)
-    assert "team.estimation.models" in reached
-    assert not any(name.startswith(("team.robot", "team.wire")) for name in reached)

@@ -1,6 +1,5 @@
 """The project around the code: what is shipped, under which licences, what the texts promise."""
 
-import ast
 import os
 import re
 import shutil
@@ -93,21 +92,6 @@ def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
     } <= shipped
 
 
-def test_the_wheel_installs_the_command_and_carries_the_licence(wheel: zipfile.ZipFile) -> None:
-    about = f"teamslam-{PROJECT['version']}.dist-info"
-    assert "teamslam = sim.__main__:main" in wheel.read(f"{about}/entry_points.txt").decode()
-    assert "Apache License" in wheel.read(f"{about}/licenses/LICENSE").decode()
-
-
-def test_the_version_is_written_once() -> None:
-    assert metadata.version("teamslam") == PROJECT["version"]
-    again = [
-        path for package in PACKAGES for path in (ROOT / package).rglob("*.py")
-        if re.search(r"^__version__\s*=\s*[\"']", path.read_text(), re.MULTILINE)
-    ]  # fmt: skip
-    assert again == []
-
-
 def test_the_changelog_tells_of_this_version() -> None:
     assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
 
@@ -185,87 +169,6 @@ def test_every_make_target_that_a_page_names_exists(page: str) -> None:
     named = commands(ROOT / page, "make") | spoken
     assert named
     assert named <= targets
-
-
-def test_the_readme_names_the_commands_of_a_team() -> None:
-    named = commands(ROOT / "README.md", "teamslam")
-    assert {"launch", "replay", "router", "world", "robot", "central", "record"} <= named
-
-
-HEAVY = (
-    "asyncio", "cryptography", "foxglove", "gtsam", "jaxtyping", "llvmlite", "matplotlib", "mcap",
-    "numba", "numpy", "pandas", "pydantic", "rich", "scipy", "scipy.linalg", "scipy.optimize",
-    "scipy.sparse", "scipy.special", "scipy.stats", "ssl", "zenoh",
-)  # fmt: skip
-"""What takes time or memory to import."""
-COMPUTES = {"asyncio", "jaxtyping", "llvmlite", "numba", "numpy", "scipy", "ssl"}
-PROCESSES: dict[str, tuple[tuple[str, ...], set[str]]] = {
-    "any command": (("sim.cli.main",), set()),
-    "a template's start": (("sim.launch.ahead",), set()),
-    "router": ((), {"zenoh"}),
-    "record": ((), {"mcap", "zenoh"}),
-    "robot": (("team.robot.main",), COMPUTES),
-    "central": (("central.main",), COMPUTES),
-    "world": (("sim.publisher.main",), COMPUTES),
-}  # fmt: skip
-"""What each process imports at its start, and which of HEAVY may come with it.
-
-Without modules: what the command of that name imports.
-"""
-
-
-def imported_by(command: str) -> list[str]:
-    """What a command of sim/cli/nodes.py imports whenever it runs, and its link to the router."""
-    page = ast.parse((ROOT / "sim" / "cli" / "nodes.py").read_text())
-    (body,) = (f.body for f in page.body if isinstance(f, ast.FunctionDef) and f.name == command)
-    lines = [ast.unparse(line) for line in body if isinstance(line, ast.Import | ast.ImportFrom)]
-    assert lines
-    return ["import sim.cli.nodes, team.wire.zenoh.bus", *lines]
-
-
-@pytest.mark.parametrize("process", PROCESSES)
-def test_no_process_waits_for_what_it_does_not_use(process: str) -> None:
-    modules, allowed = PROCESSES[process]
-    imports = [f"import {module}" for module in modules] or imported_by(process)
-    told = f"import sys; print(*(m for m in {HEAVY!r} if m in sys.modules))"
-    code = "\n".join([*imports, told])
-    found = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    ).stdout.split()
-    assert set(found) - allowed == set()
-
-
-def test_texts_and_paths_of_a_command_line_are_converted_without_pydantic(tmp_path: Path) -> None:
-    words = ["router", "--listen", "nowhere", "--keys", str(tmp_path)]
-    code = (
-        f"import sys; from sim.cli.main import main; sys.argv[1:] = {words!r}\n"
-        "try: main()\n"
-        "finally: print('pydantic' in sys.modules)"
-    )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert (ran.returncode, ran.stdout) == (2, "False\n")
-    assert "not an endpoint" in ran.stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (("world", "thesis", "--robots", "many"), "--robots"),
-        (("world", "thesis", "--seed", "-1"), "--seed"),
-        (("view", "no.mcap", "--port", "1.5"), "--port"),
-    ],
-)
-def test_values_that_need_a_check_are_checked(words: tuple[str, ...], complaint: str) -> None:
-    command = [sys.executable, "-m", "sim", *words]
-    ran = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert ran.returncode == 2
-    assert f"'{complaint}'" in ran.stderr
-
-
-def test_ci_checks_and_tests() -> None:
-    script = (ROOT / ".ci" / "run").read_text()
-    assert re.findall(r"^make (\w+)$", script, re.MULTILINE) == ["check", "test"]
-    assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
 
 
 def test_linear_algebra_has_one_thread() -> None:

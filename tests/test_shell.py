@@ -100,7 +100,7 @@ def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_no
     network = MemoryNetwork()
     bus, recorder = Slow(network, clock), MemoryBus(network)
     key = ch.TRAJECTORY.key("r1")
-    totals = m.Tally(stamp_ns=0, node="central", since_ns=7, keys=(key,), counts=(9,))
+    totals = build.tally(node="central", since_ns=7, keys=(key,), counts=(9,))
     bus.publish_totals = lambda: totals  # type: ignore[method-assign]
     recorder.declare_alive(RECORDER)
     bus.watch_alive(RECORDER)
@@ -109,7 +109,7 @@ def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_no
 
     def reports(has: int | None, since_ns: int = 7) -> Callable[[], None]:
         lacking = {} if has is None else {"keys": (key,), "counts": (has,)}
-        empty = m.Tally(stamp_ns=0, node="central", since_ns=since_ns, keys=(), counts=())
+        empty = build.tally(node="central", since_ns=since_ns)
         said = msgspec.structs.replace(empty, **lacking)
         return lambda: recorder.publish(Outgoing(ch.RECORDED, "central", said)) and None
 

@@ -59,14 +59,6 @@ def samples():
     return team_samples(SCENARIO)
 
 
-def test_the_robots_see_each_other_and_the_map_has_it(first):
-    seen = [x for robot in SCENARIO.robots for x in first.sent[ch.SIGHTING_FACTOR.key(robot.id)]]
-    assert len({x.robot for x in seen}) == 2
-    fold = first.centre.maps.fold._ticks.fold
-    assert 0 < len(fold.main.graph.sightings) <= len(seen)
-    assert len(fold.main.graph.sightings) + len(fold.waiting) == len(seen)
-
-
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_final_map_is_the_same_bytes_for_any_interleaving_of_submaps_and_sightings(first, seed):
     assert encoded(team(seed).final) == encoded(first.final)

@@ -8,6 +8,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Sample
 from team.wire.codec import encoded
+from tests import build
 from tests.support import examples
 
 FINAL = msgspec.structs.replace(
@@ -22,7 +23,7 @@ def bus() -> MemoryBus:
     """A bus on which everyone's end is replied, and garbage, whatever was asked for."""
 
     def kept(key: str, payload: bytes) -> bytes:
-        return encoded(m.Kept(stamp_ns=3, key=key, payload=payload, wall_ns=4, counter=5))
+        return encoded(build.kept(stamp_ns=3, key=key, payload=payload, wall_ns=4, counter=5))
 
     network = MemoryNetwork()
     replies = [kept(key, encoded(FINAL)) for key in (CENTRES, OF_R1, OF_R2)]

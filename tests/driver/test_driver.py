@@ -21,6 +21,7 @@ from team.wire.bus import Outgoing, opened
 from team.wire.codec import decoded, encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.support import ROOT, wait_until
 
 S = 10**9
@@ -271,28 +272,16 @@ class Listener:
                 self.got[message.incarnation, message.number] = message
 
     def ask(self, first, last=-1):
-        wanted = m.MeasurementsRequest(
-            stamp_ns=0, robot="r1", incarnation=1, first=first, last=last
-        )
+        wanted = build.measurements_request(first=first, last=last)
         for reply in self.bus.ask(ch.MEASUREMENTS, "r1", wanted, 30.0):
             self.take(reply)
 
     def say(self):
         numbers = {n for i, n in self.got if i == 1}
         whole = next(n for n in count() if n not in numbers)
-        progress = m.Progress(
-            stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=whole, submaps=0
-        )
+        progress = build.progress(measurements=whole)
         self.bus.publish(Outgoing(ch.ROBOT_PROGRESS, "r1", progress))
-        done = m.Done(
-            stamp_ns=0,
-            robot="r1",
-            incarnation=1,
-            measurements=whole,
-            steps=0,
-            submaps=0,
-            ledger=(),
-        )
+        done = build.done(measurements=whole)
         if self.heads and self.heads[-1].state == "ended":
             self.bus.publish(Outgoing(ch.ROBOT_DONE, "r1", done))
 
@@ -330,16 +319,15 @@ def test_without_a_centre_the_robots_own_final_map_is_the_end(tmp_path):
     node = driver._node
     assert node.waits_for == "robot/r1 and central"
     count = driver._journal.count(1)
-    node.handle(m.Done(stamp_ns=0, robot="r1", incarnation=1, measurements=count, steps=0,
-                       submaps=2, ledger=()), 0)  # fmt: skip
+    node.handle(build.done(measurements=count, submaps=2), 0)  # fmt: skip
     assert not node.is_delivered, "its submaps are in no map yet"
     over = {"stamp_ns": 0, "serial": 1, "digest": bytes(8)}
     final = over | {"sha256": bytes(32), "submaps": 2}
-    node.handle(m.Concluded(robot="r2", **final), 0)
+    node.handle(build.concluded(robot="r2", **final), 0)
     assert not node.is_delivered
-    node.handle(m.Concluded(robot="r1", **final), 0)
+    node.handle(build.concluded(robot="r1", **final), 0)
     assert node.is_delivered
-    node.handle(m.SetSummary(node="robot/r1", holdings=(), statements=(), **over), 0)
+    node.handle(build.set_summary(node="robot/r1", holdings=(), statements=(), **over), 0)
     assert node.waits_for == "robot/r1"
     driver.close()
 

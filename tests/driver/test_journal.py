@@ -11,7 +11,6 @@ from team.driver import journal as j
 from team.driver.journal import Journal, JournalError, opened
 from team.driver.node import SourceNode
 from team.driver.order import Sorter
-from team.wire import messages as m
 from team.wire.codec import encoded
 from tests import build
 
@@ -21,9 +20,9 @@ LATENCY_NS = 200_000_000
 def measured(journal, kind, stamp_ns):
     common = {"stamp_ns": stamp_ns, "robot": "r1", "incarnation": 1, "number": 0}
     message = {
-        j.START: lambda: m.InitialPose(pose=b"", covariance=b"", **common),
-        j.ODOMETRY: lambda: m.Odometry(duration_ns=1, forward=0.0, yaw_rate=0.0, **common),
-        j.OBSERVATIONS: lambda: m.Observations(ids=b"", ranges=b"", bearings=b"", **common),
+        j.START: lambda: build.initial_pose(pose=b"", covariance=b"", **common),
+        j.ODOMETRY: lambda: build.odometry(duration_ns=1, forward=0.0, yaw_rate=0.0, **common),
+        j.OBSERVATIONS: lambda: build.observations(ids=b"", ranges=b"", bearings=b"", **common),
     }[kind]()
     journal.append(kind, stamp_ns, encoded(message))
 

@@ -23,10 +23,10 @@ from team.robot.node import RobotNode
 from team.shell import FaultyRunError, Shell
 from team.store import SubmapStore
 from team.wire import channels as ch
-from team.wire import logs
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import encoded
+from tests import build
 from tests.sim.reruns import messages, team_samples, thesis, written
 from tests.support import submap
 from tests.teams import config, published, stream
@@ -216,7 +216,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
 def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew() -> None:
     network = MemoryNetwork()
     centre, viewer = MemoryBus(network), MemoryBus(network)
-    start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
+    start = build.initial_pose()
     centre.answer(ch.SUBMAPS, "", lambda _: [encoded(start)])
     centre.answer(ch.MEASUREMENTS, "r1", lambda _: [encoded(submap(0))])
     for channel in (ch.FAULT, ch.ROBOT_CONFIG):
@@ -239,7 +239,7 @@ def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(
     shell = CentralShell(MemoryBus(network), CENTRE, ["r1"], threading.Event())
     token = Sample(
         ch.ALIVE.key("robot/" + "a" * 25_000),
-        encoded(m.Liveliness(stamp_ns=0, node="robot/" + "a" * 25_000, alive=True)),
+        encoded(build.liveliness(node="robot/" + "a" * 25_000)),
         0, 0, 0,
     )  # fmt: skip
     shell._shell.take(shell._patient([token]))
@@ -260,7 +260,7 @@ def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody() -> None:
     shell.answer(ch.SUBMAPS, "", answer)
     asker = MemoryBus(network)
     with pytest.raises(RuntimeError, match="the answer failed: IndexError"):
-        asker.ask(ch.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="r1"), 1.0)
+        asker.ask(ch.SUBMAPS, "", build.submaps_request(), 1.0)
     assert shell.boundary.faults == 1
 
 
@@ -295,41 +295,3 @@ def test_an_interrupt_within_a_compiled_kernel_ends_the_run_and_is_no_fault() ->
     with pytest.raises(KeyboardInterrupt):
         boundary.give(Interrupted(), submap(0))
     assert boundary.faults == 0
-
-
-def test_who_is_refused_without_end_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    boundary = Boundary("robot/r1")
-    for k in range(10_000):
-        boundary.refuse(Sample("robot/r2/submap", b"", 0, 0, k), "of r9, not in this team")
-    assert boundary.refused == 10_000
-    assert logs.AT_ONCE <= len(caplog.records) < 2 * logs.AT_ONCE
-    assert "some are left out" in caplog.records[logs.AT_ONCE - 1].message
-    assert "10000 dropped" in boundary.warnings[0]
-
-
-def test_a_message_of_a_log_is_encoded_only_where_somebody_looks_at_its_bytes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looked: list[m.Message] = []
-
-    def noted(message: m.Message) -> bytes:
-        looked.append(message)
-        return encoded(message)
-
-    monkeypatch.setattr("team.containment.encoded", noted)
-    boundary, node = Boundary("robot/r1"), RobotNode(config("r1"))
-    measurements = published(stream("r1", 4))
-    last = max(k for k, each in enumerate(measurements) if isinstance(each, m.Odometry))
-    for message in measurements[:last]:
-        boundary.give(node, message)
-    assert not looked
-    monkeypatch.setattr(HybridSlam, "drive", _raising)
-    out = boundary.give(node, measurements[last])
-    assert looked == [measurements[last]]
-    assert [each.message.error for each in out if isinstance(each.message, m.Fault)] == [
-        "RuntimeError"
-    ]
-
-
-def _raising(*_: object, **__: object) -> None:
-    raise RuntimeError("it can not")

@@ -52,7 +52,7 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
     """All that a centre hears of a team, in one possible order."""
     said: list[tuple[ch.Channel, str, m.Message]] = []
     for name, submaps in SUBMAPS.items():
-        here = m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True)
+        here = build.liveliness(node=f"robot/{name}")
         count = len(MEASUREMENTS[name])
         said += [(ch.ALIVE, f"robot/{name}", here), (ch.START, name, MEASUREMENTS[name][0])]
         said += [(ch.SUBMAP, name, submap) for submap in submaps]
@@ -75,7 +75,7 @@ ATTACKS = [
     (
         ch.START,
         "r1",
-        m.InitialPose(stamp_ns=0, robot="r1", incarnation=HUGE, number=0, pose=b"", covariance=b""),
+        build.initial_pose(incarnation=HUGE),
         f"of incarnation {HUGE}",
     ),
     (
@@ -121,13 +121,13 @@ ATTACKS = [
     (
         ch.ORDER,
         "r1",
-        m.Withdrawal(stamp_ns=0, robot="r1", by="central", reason="so"),
+        build.withdrawal(by="central", reason="so"),
         "a message of 'central' on the key",
     ),
     (
         ch.ORDER,
         "r9",
-        m.Withdrawal(stamp_ns=0, robot="r9", by="operator", reason="so"),
+        build.withdrawal(robot="r9", reason="so"),
         "of r9, not in this team",
     ),
 ]
@@ -314,7 +314,7 @@ def test_a_world_goes_on_when_others_took_what_a_stranger_has_published() -> Non
     streams = world_of(*STREAMS.values())
     announced = configured("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
-    here = m.Liveliness(stamp_ns=0, node="recorder", alive=True)
+    here = build.liveliness(node="recorder")
     given(boundary, node, (ch.ALIVE, "recorder", here))
     while node.publish(0.0):
         pass

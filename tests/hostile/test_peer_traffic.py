@@ -31,27 +31,16 @@ def node_of() -> PeerNode:
 
 
 def claim(robot: str = "r2", incarnation: int = 1, last: int = 10**6) -> m.Holding:
-    return m.Holding(
-        robot=robot, incarnation=incarnation, start=True, sequences=(0, last), digest=bytes(8)
-    )
+    return build.holding(robot=robot, incarnation=incarnation, sequences=(0, last))
 
 
 def summary_of(*holdings: m.Holding, serial: int = 0, node: str = LIAR) -> m.SetSummary:
-    return m.SetSummary(
-        stamp_ns=0,
-        node=node,
-        serial=serial,
-        digest=bytes(8),
-        holdings=holdings,
-        statements=(),
-    )
+    return build.set_summary(node=node, serial=serial, holdings=holdings)
 
 
 def members_of(*keys: str, payload: bytes = b"x", signature: bytes = b"", node: str = LIAR):
     n = len(keys)
-    return m.Members(
-        stamp_ns=0, node=node, keys=keys, payloads=(payload,) * n, signatures=(signature,) * n
-    )
+    return build.members(node=node, keys=keys, payloads=(payload,) * n, signatures=(signature,) * n)
 
 
 def asked_in(out: list) -> int:
@@ -112,14 +101,14 @@ def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted() -> N
         pose = start(f"x{k}")
         node.take_carried(members_of(pose.key, payload=pose.payload, node=stranger))
         node.take(pose, stranger)
-        want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=0)
-        request = m.MembersRequest(stamp_ns=0, node=stranger, requested=(want,))
+        want = build.requested(robot="r2", last=0)
+        request = build.members_request(node=stranger, requested=(want,))
         assert node.answer(encoded(request)) == []
     assert set(node.carried) == {"robot/r2"}
     assert "not in this team" in node.last_refused
     centre = PeerCentre(CentralConfig(), ROBOTS)
     for name in ("robot/x1", "robot/r2", "recorder"):
-        centre.handle(m.Liveliness(stamp_ns=0, node=name, alive=True), 0)
+        centre.handle(build.liveliness(node=name), 0)
     assert centre.others == {"robot/r2"}
 
 
@@ -167,7 +156,7 @@ def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> Non
     node = node_of()
     last = build.done(robot="r2", measurements=1, submaps=1)
     node.take(member(ch.ROBOT_DONE, last), "robot/r2")
-    request = m.MembersRequest(stamp_ns=0, node=LIAR, requested=(), statements=("r2",) * 10_000)
+    request = build.members_request(node=LIAR, statements=("r2",) * 10_000)
     (reply,) = node.answer(encoded(request))
     assert len(decoded(reply, m.Members).keys) == 1
 

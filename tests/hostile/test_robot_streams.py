@@ -30,12 +30,7 @@ LANDMARKS = {1: (5.0, 0.0), 2: (0.0, 6.0), 3: (-4.0, 3.0)}
 PAIRS: tuple[tuple[Estimator, FusionRule], ...] = (
     ("hybrid", "join"),
     ("hybrid", "alone"),
-    ("hybrid-thesis", "alone"),
-    ("hybrid-thesis-coded", "alone"),
     ("ekf-slam", "alone"),
-    ("fastslam1", "alone"),
-    ("fastslam2", "alone"),
-    ("localisation", "alone"),
     ("dead-reckoning", "alone"),
 )
 

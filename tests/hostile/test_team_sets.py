@@ -13,7 +13,6 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from central.config import CentralConfig
 from central.node import CentralNode
-from team.config import FusionRule
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from team.wire.codec import decoded, encoded
@@ -24,9 +23,7 @@ from tests.hostile.drawing import (
     S,
     Team,
     centre_session,
-    covariance,
     last_words,
-    numbers,
     packed,
     progress,
 )
@@ -41,7 +38,7 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
         places = [(5 + 3 * (i % 7), 2 - (i % 5) * 3) for i in ids]
         mean = np.concatenate([[10.0, 0.0, 0.1], np.zeros(3 * len(nodes)), np.ravel(places)])
     begins = sequence * 10 * S
-    return m.Submap(
+    return build.submap(
         stamp_ns=begins + 10 * S,
         robot=robot,
         incarnation=1,
@@ -191,7 +188,7 @@ def _with_measurements(message, k):
     if not isinstance(message, m.SightingFactor):
         return message
     fields = {name: getattr(message, name) for name in message.__struct_fields__}
-    return m.SightingFactor(**{**fields, "measurements": (k + 1,)})
+    return build.sighting_factor(**{**fields, "measurements": (k + 1,)})
 
 
 def test_a_million_metres_from_the_origin_the_map_is_the_same():
@@ -223,67 +220,6 @@ def test_any_hostile_team_gets_a_map_and_in_any_order_the_same(seed, robust_c):
     assert encoded(again.final) == encoded(centre.final)
 
 
-@pytest.mark.parametrize("fusion", ["svd-join", "svd-join-spherical"])
-@FEW
-@given(seed=st.integers(0, 2**32))
-def test_the_other_rule_on_submaps_has_a_map_too(fusion: FusionRule, seed: int):
-    team = Team(np.random.default_rng(seed))
-    for _ in range(8):
-        team.grow()
-    centre, _ = centre_session([*team.messages, *team.ends()], CentralConfig(fusion=fusion))
-    assert centre.final is not None
-
-
-@pytest.mark.parametrize(
-    "fusion", ["kalman", "kalman-per-axis", "covariance-intersection", "latest", "alone"]
-)
-@FEW
-@given(seed=st.integers(0, 2**32))
-def test_rules_on_whole_maps_fuse_what_they_can(fusion: FusionRule, seed: int):
-    rng = np.random.default_rng(seed)
-    messages: list[m.Message] = [start(robot) for robot in ROBOTS]
-    for exchange in (1, 2):
-        for robot in ROBOTS:
-            ids = np.unique(rng.integers(1, 6, 4)).astype(np.uint32)
-            n = 2 * len(ids)
-            made = build.map_estimate(
-                stamp_ns=exchange * S,
-                robot=robot,
-                sequence=exchange,
-                exchange=exchange,
-                ids=from_ids(ids),
-                means=from_floats(numbers(rng, n)),
-                covariance=packed(covariance(rng, n)),
-            )
-            tame = build.map_estimate(
-                stamp_ns=exchange * S,
-                robot=robot,
-                sequence=exchange,
-                exchange=exchange,
-                ids=from_ids(ids),
-                means=from_floats(np.zeros(n)),
-                covariance=packed(np.eye(n)),
-            )
-            try:
-                messages.append(decoded(encoded(made), m.MapEstimate))
-            except ValueError:
-                messages.append(tame)
-    messages += [
-        build.done(stamp_ns=2 * S, robot=robot, measurements=1000, steps=500, last_map=2)
-        for robot in ROBOTS
-    ]
-    messages.append(
-        m.End(
-            stamp_ns=10**12,
-            streams=tuple(
-                m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS
-            ),
-        )
-    )
-    centre, _ = centre_session(messages, CentralConfig(fusion=fusion))
-    assert centre.final is not None
-
-
 class HostileTeam(RuleBasedStateMachine):
     """Whatever order, duplicate and withdrawal: the centre goes on, and its set makes its map."""
 
@@ -294,7 +230,7 @@ class HostileTeam(RuleBasedStateMachine):
         self.unsent: list[m.Message] = []
         self.centre = CentralNode(CentralConfig(), list(ROBOTS))
         for robot in ROBOTS:
-            self.centre.handle(m.Liveliness(stamp_ns=0, node=f"robot/{robot}", alive=True), 0)
+            self.centre.handle(build.liveliness(node=f"robot/{robot}"), 0)
         for each in self.team.messages:
             self.hear(each)
 
@@ -327,7 +263,7 @@ class HostileTeam(RuleBasedStateMachine):
 
     @rule()
     def is_withdrawn(self):
-        self.hear(m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="a test"))
+        self.hear(build.withdrawal(robot="r3"))
 
     @invariant()
     def says_what_every_receiver_takes(self):

@@ -43,7 +43,7 @@ ATTACKS = {
     "begins one that nobody reaches": (
         ch.START,
         "r1",
-        m.InitialPose(stamp_ns=0, robot="r1", incarnation=HUGE, number=0, pose=b"", covariance=b""),
+        build.initial_pose(incarnation=HUGE),
     ),
     "says that another is done": (
         ch.ROBOT_DONE,
@@ -58,17 +58,17 @@ ATTACKS = {
     "orders a withdrawal": (
         ch.ORDER,
         "r1",
-        m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="so"),
+        build.withdrawal(reason="so"),
     ),
     "tells that the centre withdrew": (
         ch.WITHDRAWAL,
         "r1",
-        m.Withdrawal(stamp_ns=0, robot="r1", by="central", reason="so"),
+        build.withdrawal(by="central", reason="so"),
     ),
     "lets another repeat it": (
         ch.WITHDRAWALS_HEARD,
         "r1",
-        m.WithdrawalHeard(stamp_ns=0, robot="r1", withdrawn="r1", by="operator", reason="so"),
+        build.withdrawal_heard(withdrawn="r1", reason="so"),
     ),
     "brings a robot of its own": (ch.SUBMAP, "r9", submap(0, "r9")),
     "replaces a measurement": (ch.ODOMETRY, "r1", odometry(0, "r1")),
@@ -96,7 +96,7 @@ def on_every_row() -> Iterator[Outgoing]:
 OWN = Outgoing(
     ch.ROBOT_PROGRESS,
     "r2",
-    m.Progress(stamp_ns=7, node="robot/r2", robot="r2", incarnation=1, measurements=1, submaps=1),
+    build.progress(stamp_ns=7, robot="r2", measurements=1, submaps=1),
 )
 
 
@@ -144,7 +144,7 @@ def test_a_robot_that_was_taken_over_says_nothing_for_others(
         probe = Outgoing(
             ch.STATUS,
             "robot/r2",
-            m.Status(stamp_ns=0, node="robot/r2", state="mapping", figures={}),
+            build.status(node="robot/r2"),
         )
 
         def there() -> bool:
@@ -166,9 +166,9 @@ ENDS = {
     "gives r1 up": (
         ch.GIVEN_UP,
         "robot/r1",
-        m.GivenUp(stamp_ns=0, node="robot/r1", by="operator", reason="so"),
+        build.given_up(reason="so"),
     ),
-    "orders the end": (ch.END_ORDER, "", m.TeamEnd(stamp_ns=0, by="operator", reason="so")),
+    "orders the end": (ch.END_ORDER, "", build.team_end(reason="so")),
 }
 """Messages that the router would store, if r2 could publish them."""
 OWN_END = Outgoing(ch.TEAM_FINAL, "r2", FINAL)
@@ -181,7 +181,7 @@ def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_e
     """The final map of a team with a centre is the centre's, whatever a robot publishes before
     and after it, and garbage hides it from nobody."""
     true = msgspec.structs.replace(FINAL, dof=99)
-    order = Outgoing(ch.ORDER, "r2", m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason=""))
+    order = Outgoing(ch.ORDER, "r2", build.withdrawal(robot="r2", reason=""))
     with door(keys if locked else None) as enter:
         robot, victim, centre = enter("robot-r2"), enter("robot-r1"), enter("central")
         operator = enter("operator")
@@ -189,7 +189,7 @@ def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_e
 
         def stored() -> list[str]:
             names = tuple(channel.name for channel in ch.REPLIES[ch.KEPT])
-            request = m.KeptRequest(stamp_ns=0, channels=names, run_ns=3600 * 10**9)
+            request = build.kept_request(channels=names, run_ns=3600 * 10**9)
             return [
                 replied(ch.KEPT, "", each, 0).key for each in victim.ask(ch.KEPT, "", request, 5.0)
             ]
@@ -230,8 +230,8 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
     keys: Folders, *, locked: bool
 ) -> None:
     forged = [encoded(odometry(5, "r1"))]
-    end = m.Kept(stamp_ns=0, key="central/final", payload=encoded(FINAL), wall_ns=0, counter=0)
-    wanted = m.MeasurementsRequest(stamp_ns=0, robot="r1", incarnation=1, first=0, last=-1)
+    end = build.kept(key="central/final", payload=encoded(FINAL))
+    wanted = build.measurements_request()
     with door(keys if locked else None) as enter:
         robot, attacker = enter("robot-r1"), enter("robot-r2")
         attacker.answer(ch.MEASUREMENTS, "r1", lambda _: forged)
@@ -248,7 +248,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         serving.start()
         try:
             found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
-            found += answers(robot, ch.SUBMAPS, "", m.SubmapsRequest(stamp_ns=0, robot="r1"))
+            found += answers(robot, ch.SUBMAPS, "", build.submaps_request())
             ended = TheEnd(robot).missed()
         finally:
             over.set()

@@ -13,6 +13,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats
 from team.wire.bus import Outgoing
 from team.wire.codec import decoded, encoded
+from tests import build
 from tests.support import packed, spd, submap
 
 PACKED = packed(spd(2))
@@ -23,13 +24,8 @@ def member(channel: ch.Channel, message: m.Message) -> Member:
 
 
 def start(robot: str, incarnation: int = 1) -> Member:
-    pose = m.InitialPose(
-        stamp_ns=0,
-        robot=robot,
-        incarnation=incarnation,
-        number=0,
-        pose=from_floats([0.0, 0.0, 0.0]),
-        covariance=b"",
+    pose = build.initial_pose(
+        robot=robot, incarnation=incarnation, pose=from_floats([0.0, 0.0, 0.0])
     )
     return member(ch.START, pose)
 
@@ -38,10 +34,9 @@ def parcel(robot: str, sequence: int, mates: Sequence[str] = ()) -> list[Member]
     """A submap behind the inter-robot measurements from it."""
     own = msgspec.structs.replace(submap(sequence, robot, 1), incarnation=1, sightings=len(mates))
     factors = [
-        m.SightingFactor(
+        build.sighting_factor(
             stamp_ns=own.stamp_ns,
             robot=robot,
-            incarnation=1,
             sequence=sequence,
             config=own.config,
             teammate=mate,
@@ -56,14 +51,8 @@ def parcel(robot: str, sequence: int, mates: Sequence[str] = ()) -> list[Member]
 
 
 def done(robot: str, submaps: int) -> Member:
-    last = m.Done(
-        stamp_ns=submaps * 1_000_000,
-        robot=robot,
-        incarnation=1,
-        measurements=10 * submaps,
-        steps=0,
-        submaps=submaps,
-        ledger=(),
+    last = build.done(
+        stamp_ns=submaps * 1_000_000, robot=robot, measurements=10 * submaps, submaps=submaps
     )
     return member(ch.ROBOT_DONE, last)
 

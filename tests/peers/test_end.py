@@ -6,25 +6,23 @@ from central.config import CentralConfig
 from central.peers.robot import PeerRobot
 from team.config import RobotConfig
 from team.wire import channels as ch
-from team.wire import messages as m
 from team.wire.bus import Sample
 from team.wire.codec import encoded
+from tests import build
 from tests.peers.teams import member
 
 ROBOTS = ("r1", "r2", "r3")
 ORDERS = {
     "given up": (
         ch.GIVEN_UP,
-        m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost"),
+        build.given_up(node="robot/r3", reason="lost"),
     ),
-    "withdrawn": (ch.ORDER, m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="broken")),
+    "withdrawn": (ch.ORDER, build.withdrawal(robot="r3", reason="broken")),
 }
 
 
 def ended(robot: str) -> Sample:
-    concluded = m.Concluded(
-        stamp_ns=0, robot=robot, serial=1, digest=bytes(8), sha256=bytes(32), submaps=0
-    )
+    concluded = build.concluded(robot=robot, serial=1)
     return Sample(ch.CONCLUDED.key(robot), encoded(concluded), 0, 0, 0)
 
 
@@ -50,7 +48,7 @@ def test_an_end_in_another_robots_name_and_garbage_are_nobodys(peer: PeerRobot) 
 
 def test_nobody_is_left_alone_while_another_is_there(peer: PeerRobot) -> None:
     peer.take_end([ended("r1"), ended("r3")])
-    peer.handle(m.Liveliness(stamp_ns=0, node="robot/r3", alive=True), 0)
+    peer.handle(build.liveliness(node="robot/r3"), 0)
     assert not peer.is_left_alone
 
 

@@ -11,6 +11,7 @@ from team.peers.node import PeerNode
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import encoded
+from tests import build
 from tests.peers.teams import done, member, parcel, start
 
 ROBOTS = ("r1", "r2")
@@ -18,8 +19,8 @@ END = m.End(
     stamp_ns=0,
     streams=tuple(m.StreamEnd(robot=r, incarnation=1, measurements=20) for r in ROBOTS),
 )
-ORDER = member(ch.ORDER, m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="broken"))
-_GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="not seen")
+ORDER = member(ch.ORDER, build.withdrawal(robot="r2", reason="broken"))
+_GIVEN_UP = build.given_up(node="robot/r2", reason="not seen")
 GIVEN_UP = Member(ch.GIVEN_UP.key("robot/r2"), encoded(_GIVEN_UP), _GIVEN_UP)
 
 

@@ -19,6 +19,7 @@ from team.peers.proofs import OPERATOR, Proofs, signed_order
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
+from tests import build
 from tests.peers.teams import member, parcel, start
 
 ROBOTS = ("r1", "r2", "r3")
@@ -83,12 +84,8 @@ def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(
 def test_a_signature_of_somebody_else_proves_nothing(nodes: dict[str, PeerNode]) -> None:
     forged = parcel("r1", 5)[0]
     signature = proofs_of(nodes["r2"])._signer.sign(forged.hash)
-    batch = m.Members(
-        stamp_ns=0,
-        node="robot/r2",
-        keys=(forged.key,),
-        payloads=(forged.payload,),
-        signatures=(signature,),
+    batch = build.members(
+        node="robot/r2", keys=(forged.key,), payloads=(forged.payload,), signatures=(signature,)
     )
     assert nodes["r3"].take_carried(batch) == []
     assert "not signed by r1" in nodes["r3"].last_refused
@@ -97,11 +94,10 @@ def test_a_signature_of_somebody_else_proves_nothing(nodes: dict[str, PeerNode])
 def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(
     nodes: dict[str, PeerNode], folder: Path
 ) -> None:
-    order = m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="broken")
+    order = build.withdrawal(reason="broken")
     said = member(ch.ORDER, order)
     carrier = Signer(credentials_of(folder, "robot-r2", "t"))
-    batch = m.Members(
-        stamp_ns=0,
+    batch = build.members(
         node="robot/r2",
         keys=(said.key,),
         payloads=(said.payload,),
@@ -255,11 +251,10 @@ def test_an_order_by_an_operators_key_that_is_revoked_is_refused_once_the_next_o
     present = Signer(credentials_of(tmp_path, "operator", "t"))
 
     def carried(signer: Signer, robot: str, to: PeerNode, stamp_ns: int = 0) -> list[Member]:
-        order = m.Withdrawal(stamp_ns=stamp_ns, robot=robot, by="operator", reason="broken")
+        order = build.withdrawal(stamp_ns=stamp_ns, robot=robot, reason="broken")
         said = member(ch.ORDER, order)
         return to.take_carried(
-            m.Members(
-                stamp_ns=0,
+            build.members(
                 node="robot/r2",
                 keys=(said.key,),
                 payloads=(said.payload,),

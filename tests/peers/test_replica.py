@@ -12,10 +12,11 @@ from team.peers.exchange import MOST_ASKED, make_answer, make_request
 from team.peers.given import GIVEN_BYTES
 from team.peers.members import LARGEST_MEMBER, Member, member_of
 from team.peers.node import PeerNode
-from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica, intervals
+from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
+from tests import build
 from tests.peers.teams import done, member, parcel, said, start
 from tests.support import examples
 
@@ -46,17 +47,8 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> Non
     )
     for each in (start("r2"), *(m_ for k in range(4) for m_ in parcel("r2", k))):
         honest.take(each, "robot/r2")
-    claim = m.Holding(
-        robot="r2",
-        incarnation=1,
-        start=True,
-        sequences=(0, 2_000_000),
-        digest=bytes(8),
-        newest_ns=0,
-    )
-    lie = m.SetSummary(
-        stamp_ns=0, node="robot/r3", serial=0, digest=bytes(8), holdings=(claim,) * 3, statements=()
-    )
+    claim = build.holding(robot="r2", sequences=(0, 2_000_000), newest_ns=0)
+    lie = build.set_summary(node="robot/r3", holdings=(claim,) * 3)
     asked: list[str] = []
     for second in range(12):
         out = [*node.take_summary(lie), *node.tick(float(second))]
@@ -79,8 +71,8 @@ def test_questions_without_end_are_given_so_many_bytes_a_second() -> None:
     node = PeerNode("robot/r1", ("r1", "r2"))
     for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
         node.take(each, "robot/r2")
-    want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=39)
-    request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", requested=(want,)))
+    want = build.requested(robot="r2", last=39)
+    request = encoded(build.members_request(node="robot/r2", requested=(want,)))
     one = sum(map(len, node.answer(request)))
     node._given.note(GIVEN_BYTES)
     assert one > 0
@@ -94,8 +86,8 @@ def test_questions_in_another_nodes_name_take_nothing_from_that_node() -> None:
     node = PeerNode("robot/r1", ("r1", "r2", "r3"))
     for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
         node.take(each, "robot/r2")
-    want = m.Requested(robot="r2", incarnation=1, start=True, first=0, last=39)
-    request = encoded(m.MembersRequest(stamp_ns=0, node="robot/r2", requested=(want,)))
+    want = build.requested(robot="r2", last=39)
+    request = encoded(build.members_request(node="robot/r2", requested=(want,)))
     while node._given._bytes < GIVEN_BYTES // 4:  # more than one node was given in a second
         assert node.answer(request)
         node._given.note(GIVEN_BYTES // 16)
@@ -104,9 +96,7 @@ def test_questions_in_another_nodes_name_take_nothing_from_that_node() -> None:
 
 def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_is_valid() -> None:
     replica = Replica(("r1", "r2"))
-    last = m.Concluded(
-        stamp_ns=0, robot="r1", serial=2**63 - 1, digest=bytes(8), sha256=bytes(32), submaps=0
-    )
+    last = build.concluded(serial=2**63 - 1)
     with pytest.raises(RefusedError, match="no peer has more than"):
         replica.add(member(ch.CONCLUDED, last))
     node = PeerNode("robot/r1", ("r1", "r2"))
@@ -198,22 +188,8 @@ def test_what_is_kept_is_bounded_by_robot() -> None:
     assert full.add(start("r2")) == "new"
 
 
-def test_what_is_asked_for_is_bounded_whatever_a_summary_claims() -> None:
-    claim = m.Holding(robot="r1", incarnation=1, start=True, sequences=(0, 2**62), digest=bytes(8))
-    summary = m.SetSummary(
-        stamp_ns=0, node="robot/r2", serial=0, digest=bytes(8), holdings=(claim,), statements=()
-    )
-    asked = make_request(replica_of(), summary)
-    assert asked is not None
-    assert sum(w.last - w.first + 1 for w in asked.requested) == MOST_ASKED
-    strange = msgspec.structs.replace(claim, robot="r9")
-    assert make_request(replica_of(), msgspec.structs.replace(summary, holdings=(strange,))) is None
-
-
 def test_what_is_no_member_is_refused_at_the_door() -> None:
-    progress = m.Progress(
-        stamp_ns=0, node="robot/r1", robot="r1", incarnation=1, measurements=1, submaps=0
-    )
+    progress = build.progress(measurements=1)
     with pytest.raises(ValueError, match="no key of a set's members"):
         member_of("robot/r1/progress", encoded(progress))
     with pytest.raises(ValueError, match="too large"):
@@ -221,11 +197,6 @@ def test_what_is_no_member_is_refused_at_the_door() -> None:
     own = done("r1", 1)
     with pytest.raises(ValueError, match="a message of 'r1' on the key"):
         member_of("robot/r2/done", own.payload)
-
-
-def test_intervals_are_closed_and_part_by_gaps() -> None:
-    assert intervals({0, 1, 2, 5, 7, 8}, 3) == (0, 2, 5, 5, 7, 8)
-    assert intervals(set(), 0) == ()
 
 
 def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() -> None:

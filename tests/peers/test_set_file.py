@@ -17,6 +17,7 @@ from team.peers.set_file import MAGIC, Keeper, SetFile, SetFileError, record_of
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import encoded
+from tests import build
 from tests.peers.teams import said
 
 MEMBERS = [each for occasion in said("r1", 4, "r2") for each in occasion]
@@ -153,7 +154,7 @@ def test_what_is_known_to_be_lost_is_named_by_its_number(
 
 def test_a_record_within_a_damaged_one_is_not_taken(tmp_path: Path) -> None:
     """Its author has put it there: only what the process itself has written counts."""
-    order = m.GivenUp(stamp_ns=0, node="robot/r2", by="nobody", reason="")
+    order = build.given_up(node="robot/r2", by="nobody", reason="")
     forged = member_of(ch.GIVEN_UP.key("robot/r2"), encoded(order))
     body = msgpack.packb(["robot/r1/submap", record_of(forged) * 3, b""])
     outer = bytearray(struct.pack("<II", len(body), zlib.crc32(body)) + body)

@@ -21,6 +21,7 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.recording.test_shell import FINAL, logged
 from tests.support import wait_until
 from tests.test_shell import Waiting
@@ -29,15 +30,7 @@ TRAJECTORIES = [f"r{k}" for k in range(1, 51)]
 
 
 def trajectory(robot: str) -> m.Trajectory:
-    return m.Trajectory(
-        stamp_ns=0,
-        robot=robot,
-        incarnation=0,
-        digest=FINAL.digest,
-        stamps=b"",
-        poses=b"",
-        covariances=b"",
-    )
+    return build.trajectory(robot=robot, incarnation=0, digest=FINAL.digest)
 
 
 @contextmanager
@@ -127,7 +120,7 @@ def test_each_life_of_a_process_is_counted_by_itself_and_each_sample_once() -> N
     assert there.of_process(key, 50) == (2, 2)
 
     def lacks(count: int, awaited: set[str]) -> dict[str, int]:
-        tally = m.Tally(stamp_ns=0, node="central", since_ns=50, keys=(key,), counts=(count,))
+        tally = build.tally(node="central", since_ns=50, keys=(key,), counts=(count,))
         return there.lacking(tally, awaited)
 
     assert lacks(2, set()) == {}

@@ -1,6 +1,5 @@
 """The recorder and the replayer as processes see them: on a bus, until the team has finished."""
 
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-import zenoh
 
 from team.recording import recorder as recorder_module
 from team.recording.check import holes
@@ -20,7 +18,6 @@ from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.codec import decoded, encoded
-from team.wire.zenoh.attachment import Attachment, pack
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests import build
@@ -65,7 +62,7 @@ def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path
 
 
 CONCLUDED = next(message for message in examples() if isinstance(message, m.Concluded))
-GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost")
+GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 
 @pytest.mark.parametrize("peers", [("r1", "r2", "r3"), ()], ids=["peers", "a centre"])
@@ -103,7 +100,7 @@ def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(
         for k in range(20):
             forged = b"\x95\xaa" + f"forged/{k:03}".encode() + bytes(3)
             robot.publish_raw(Sample(c.ODOMETRY.key("r1"), forged, 0, 0, k))
-            status = m.Status(stamp_ns=0, node=f"robot/r{k}", state="x", figures={})
+            status = build.status(node=f"robot/r{k}", state="x")
             robot.publish(Outgoing(c.STATUS, f"robot/r{k}", status))
         loop.take(bus.receive())
         wait_until(lambda: recorder.waiting() == 0 and recorder.dropped > 0)
@@ -214,8 +211,8 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path: Path, endp
         one.message for one in published if one.channel is c.ODOMETRY
     ]
     assert messages_of(list(log.samples()), c.ALIVE) == [
-        m.Liveliness(stamp_ns=0, node="robot/alpha", alive=True),
-        m.Liveliness(stamp_ns=999_000_000, node="robot/alpha", alive=False),
+        build.liveliness(node="robot/alpha"),
+        build.liveliness(stamp_ns=999_000_000, node="robot/alpha", alive=False),
     ]
     assert messages_of(list(log.samples()), c.STATUS)[:-1] == statuses != []
     assert statuses[0].warnings == ("central has not appeared yet",)
@@ -354,9 +351,7 @@ def flows(source: ZenohBus, path: Path) -> None:
     wait_until(heard)
 
 
-PROBE = m.Sightings(
-    stamp_ns=0, robot="probe", incarnation=0, number=0, teammates=(), ranges=b"", bearings=b""
-)
+PROBE = build.sightings(robot="probe", incarnation=0)
 
 
 def test_a_recording_ends_when_asked(path: Path) -> None:
@@ -372,69 +367,6 @@ def test_a_recording_ends_when_asked(path: Path) -> None:
     log = open_log(path)
     assert log.complete
     assert messages_of(list(log.samples()), c.ODOMETRY) == [odometry(1)]
-
-
-def plain_subscriber(endpoint: str, arrived: list[tuple[str, bytes, bytes]]) -> zenoh.Session:
-    """A foreign session on everything that the team `t` publishes."""
-    config = zenoh.Config.from_json5(
-        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
-        "scouting: {multicast: {enabled: false}}, "
-        "transport: {shared_memory: {enabled: false}}}"
-    )
-    session = zenoh.open(config)
-
-    def take(sample: zenoh.Sample) -> None:
-        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        arrived.append((str(sample.key_expr), sample.payload.to_bytes(), attachment))
-
-    session.declare_subscriber("team/t/**", zenoh.handlers.Callback(take, indirect=False))
-    return session
-
-
-def test_a_replay_is_the_log_byte_by_byte_in_its_order(path: Path, endpoint: str) -> None:
-    measurements, submaps = [encoded(odometry(i)) for i in range(50)], [encoded(submap(0))]
-    keys = [c.ODOMETRY, c.SUBMAP, c.ROBOT_PROGRESS, c.TRUTH, c.STATUS]
-    with Recorder(path, "t", {}) as recorder:
-        recorder.write(
-            Sample(channel.key("alpha"), (submaps + measurements)[i % 51], i, 2 * i, i)
-            for i in range(4_000)
-            for channel in keys
-        )
-    log = open_log(path)
-    arrived: list[tuple[str, bytes, bytes]] = []
-    with plain_subscriber(endpoint, arrived), ZenohBus("t", endpoint) as bus:
-
-        def heard() -> bool:
-            bus.publish_raw(Sample("source/probe/sightings", b"", 0, 0, 0))
-            return bool(arrived)
-
-        wait_until(heard)
-        assert replay(bus, log.samples(), math.inf, threading.Event()) == 20_000
-        wait_until(lambda: sum("/probe/" not in key for key, _, _ in arrived) >= 20_000)
-    assert [one for one in arrived if "/probe/" not in one[0]] == [
-        (
-            f"team/t/{one.key}",
-            one.payload,
-            pack(f"team/t/{one.key}", Attachment(one.stamp_ns, one.wall_ns, one.counter)),
-        )
-        for one in log.samples()
-    ]
-
-
-def test_a_replayed_recording_is_recorded_the_same(path: Path, tmp_path: Path) -> None:
-    network = MemoryNetwork()
-    bus, team = MemoryBus(network), MemoryBus(network)
-    with Recorder(path, "t", {}) as recorder:
-        loop = RecordLoop(bus, recorder, ())
-        team_of(team)
-        loop.take(bus.receive())
-    again = MemoryNetwork()
-    sink, source = MemoryBus(again), MemoryBus(again)
-    with Recorder(tmp_path / "again.mcap", "t", {}) as recorder:
-        loop = RecordLoop(sink, recorder, ())
-        replay(source, open_log(path).samples(), math.inf, threading.Event())
-        loop.take(sink.receive())
-    assert list(open_log(tmp_path / "again.mcap").samples()) == list(open_log(path).samples())
 
 
 def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them() -> None:

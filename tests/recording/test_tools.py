@@ -30,6 +30,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.bus import NO_COUNTER, Outgoing, Sample
 from team.wire.codec import encoded
+from tests import build
 from tests.recording.test_log import chunks_of
 from tests.support import examples, odometry, on_its_key, submap
 
@@ -43,32 +44,11 @@ def sampled(channel: c.Channel, name: str, message: m.Message, counter: int) -> 
 
 def drive(robot: str, seconds: int) -> list[Sample]:
     """A configuration at zero, ten odometry measurements a second and a submap each second."""
-    out = [
-        sampled(
-            c.ROBOT_CONFIG,
-            robot,
-            m.Configuration(
-                stamp_ns=0,
-                node=f"robot/{robot}",
-                incarnation=1,
-                digest=bytes(8),
-                configuration="{}",
-            ),
-            0,
-        )
-    ]
+    out = [sampled(c.ROBOT_CONFIG, robot, build.configuration(node=f"robot/{robot}"), 0)]
     for i in range(10 * seconds):
         stamp = 100 * SECOND + i * SECOND // 10
-        measurement = m.Odometry(
-            stamp_ns=stamp,
-            robot=robot,
-            incarnation=1,
-            number=i,
-            duration_ns=SECOND // 10,
-            forward=0.5,
-            yaw_rate=0.1,
-        )
-        out.append(sampled(c.ODOMETRY, robot, measurement, i))
+        driven = build.odometry(stamp_ns=stamp, robot=robot, number=i, duration_ns=SECOND // 10)
+        out.append(sampled(c.ODOMETRY, robot, driven, i))
         if i % 10 == 9:
             times = {"stamp_ns": stamp, "start_ns": stamp - SECOND}
             said = msgspec.structs.replace(submap(i // 10, robot), **times)
@@ -100,108 +80,116 @@ def whole(path: Path) -> Log:
 # Check.
 
 
-def test_nothing_is_wrong_with_a_sound_log(whole: Log) -> None:
-    assert found(whole) == []
+def status(counter: int, wall_s: int = 0, node: str = "central", **fields: object) -> Sample:
+    said = build.status(node=node, **fields)
+    sample = sampled(c.STATUS, node, said, counter)
+    return msgspec.structs.replace(sample, wall_ns=10**18 + wall_s * SECOND + counter)
 
 
-def test_lost_messages_are_named_by_their_counters(path: Path) -> None:
-    lost = [s for s in drive("alpha", 2) if s.counter not in (3, 4, 8) or "odometry" not in s.key]
-    assert found(recorded(path, lost)) == [
-        "source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8"
-    ]
+def later(samples: list[Sample], **fields: object) -> list[Sample]:
+    """The samples of a second life of their publisher."""
+    return [msgspec.structs.replace(s, wall_ns=s.wall_ns + SECOND, **fields) for s in samples]
 
 
-def test_a_recorder_that_came_late_is_told_but_a_cut_is_not(tmp_path: Path) -> None:
-    late = drive("alpha", 2)[6:]
-    assert found(recorded(tmp_path / "a.mcap", late)) == [
-        "source/alpha: 5 measurements of incarnation 1 missing: 0–4"
-    ]
-    assert found(recorded(tmp_path / "b.mcap", late, cut="said")) == []
-
-
-def test_a_publisher_that_starts_again_has_lost_nothing(path: Path) -> None:
-    again = [msgspec.structs.replace(s, wall_ns=s.wall_ns + 10**9) for s in drive("alpha", 1)]
-    assert found(recorded(path, drive("alpha", 1) + again)) == []
-
-
-def test_a_publisher_that_starts_again_unheard_is_told(path: Path) -> None:
-    said = [
-        sampled(c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k)
-        for k in range(3)
-    ]
-    again = [msgspec.structs.replace(s, wall_ns=s.wall_ns + 10**9) for s in said[2:]]
-    assert found(recorded(path, said + again)) == ["central/status: 2 messages missing: 0–1"]
-
-
-def test_what_a_stream_is_known_to_have_and_the_log_has_not_is_named(path: Path) -> None:
-    """Nothing behind the last message shows that there was more, but the words of others do."""
-    said = drive("alpha", 1)
-    said.append(
+ONE, TWO = drive("alpha", 1), drive("alpha", 2)
+END = sampled(c.END, "", build.end(alpha=10), 0)
+DONE = sampled(c.ROBOT_DONE, "alpha", build.done(robot="alpha", measurements=10, steps=2), 0)
+MORE = [
+    sampled(c.END, "", build.end(alpha=12), 0),
+    sampled(c.ROBOT_DONE, "alpha", build.done(robot="alpha", incarnation=0, submaps=3), 0),
+    msgspec.structs.replace(
         sampled(
-            c.END,
-            "",
-            m.End(
-                stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=12),)
-            ),
-            0,
-        )
-    )
-    done = m.Done(
-        stamp_ns=0, robot="alpha", incarnation=0, measurements=0, steps=0, submaps=3, ledger=()
-    )
-    said.append(sampled(c.ROBOT_DONE, "alpha", done, 0))
-    tally = m.Tally(
-        stamp_ns=0,
-        node="robot/alpha",
-        since_ns=10**18,
-        keys=("robot/alpha/done", "robot/alpha/team/pose"),
-        counts=(1, 4),
-    )
-    said.append(
-        msgspec.structs.replace(sampled(c.TALLY, "robot/alpha", tally, 0), wall_ns=10**18 + 100)
-    )
-    assert found(recorded(path, said)) == [
-        "robot/alpha/team/pose: 4 messages missing: 0–3",
-        "source/alpha: 2 measurements of incarnation 1 missing: 10–11",
-        "robot/alpha/submap: 2 submaps of incarnation 0 missing: 1–2",
-    ]
-
-
-def test_a_log_without_the_end_of_the_streams_says_so(path: Path, tmp_path: Path) -> None:
-    """Whoever has heard of the end shows that there was one."""
-    said = drive("alpha", 1)
-    done = sampled(
-        c.ROBOT_DONE,
-        "alpha",
-        m.Done(
-            stamp_ns=0, robot="alpha", incarnation=1, measurements=10, steps=2, submaps=0, ledger=()
+            c.TALLY, "robot/alpha",
+            build.tally(node="robot/alpha", since_ns=10**18,
+                        keys=("robot/alpha/done", "robot/alpha/team/pose"), counts=(1, 4)), 0,
         ),
-        0,
-    )
-    end = sampled(
-        c.END,
-        "",
-        m.End(stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=10),)),
-        0,
-    )
-    lacking = "world/end: missing: the number of measurements is unknown"
-    assert found(recorded(path, [*said, done])) == [lacking]
-    assert found(recorded(tmp_path / "whole.mcap", [*said, done, end])) == []
-    assert found(recorded(tmp_path / "cut.mcap", [*said, done], cut="said")) == []
+        wall_ns=10**18 + 100,
+    ),
+]  # fmt: skip
+"""The counts of others: more measurements, submaps and poses than the log has."""
+OTHER = sampled(
+    c.ODOMETRY, "alpha", build.odometry(stamp_ns=100 * SECOND, robot="alpha", number=3), 10
+)
+SWAPPED = [*ONE[:2], ONE[5], *ONE[3:5], ONE[2], *ONE[6:]]
+ALIVE = [
+    sampled(c.ALIVE, "central", build.liveliness(node="central", alive=up), 0)
+    for up in (True, False)
+]
+FIRST_LOST = "source/alpha: 5 measurements of incarnation 1 missing: 0–4"
+NO_END = "world/end: missing: the number of measurements is unknown"
+FOUND: dict[str, tuple[list[Sample], list[str]]] = {
+    "nothing": (TWO, []),
+    "lost messages": (
+        [s for s in TWO if s.counter not in (3, 4, 8) or "odometry" not in s.key],
+        ["source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8"],
+    ),
+    "a recorder that came late": (TWO[6:], [FIRST_LOST]),
+    "a publisher that starts again": (ONE + later(ONE), []),
+    "a publisher that starts again, first messages lost": (
+        [status(0), status(1), status(2), *later([status(2)])],
+        ["central/status: 2 messages missing: 0–1"],
+    ),
+    "counts of others": (
+        ONE + MORE,
+        [
+            "robot/alpha/team/pose: 4 messages missing: 0–3",
+            "source/alpha: 2 measurements of incarnation 1 missing: 10–11",
+            "robot/alpha/submap: 2 submaps of incarnation 0 missing: 1–2",
+        ],
+    ),
+    "no end of the streams": ([*ONE, DONE], [NO_END]),
+    "the end of the streams": ([*ONE, DONE, END], []),
+    "measurements that came as replies": (
+        [
+            later([s], counter=NO_COUNTER)[0] if s.counter in (2, 3) else s
+            for s in drive("alpha", 5)
+        ],
+        [],
+    ),
+    "a measurement twice, with other contents": (
+        [*ONE, OTHER],
+        ["source/alpha: 1 measurements of incarnation 1 there twice, and not the same"],
+    ),
+    "the last words of the recorder": (
+        [*ONE, status(0, node="recorder", warnings=("missing: robot/alpha/team/pose: 7",))],
+        ["recorder: missing: robot/alpha/team/pose: 7"],
+    ),
+    "tokens and the recorder's own status": ([*ALIVE, status(4, node="recorder")], []),
+    "the first statuses": ([status(4)], ["central/status: 4 messages missing: 0–3"]),
+    "one late and one twice": (
+        [*SWAPPED, SWAPPED[-2]],
+        ["source/alpha/odometry: 1 message twice, the first is 9"],
+    ),
+    "views": (
+        [msgspec.structs.replace(status(k), key="view/log") for k in (0, 2)],
+        ["view/log: 1 message missing: 1; `teamslam view LOG --export NEW` draws all views again"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FOUND)
+def test_the_check_names_every_loss_and_nothing_else(path: Path, case: str) -> None:
+    samples, expected = FOUND[case]
+    assert found(recorded(path, samples)) == expected
+
+
+@pytest.mark.parametrize("samples", [TWO[6:], [*ONE, DONE]], ids=["beginning", "end"])
+def test_a_cut_log_lacks_nothing_outside_of_its_cut(path: Path, samples: list[Sample]) -> None:
+    assert found(recorded(path, samples, cut="said")) == []
 
 
 def test_a_process_without_a_last_word_is_named(path: Path) -> None:
     """A killed robot's second life says what it has published; of the first nobody knows."""
 
     def status(counter: int, wall_s: int) -> Sample:
-        said = m.Status(stamp_ns=counter * 10**9, node="robot/alpha", state="mapping", figures={})
+        said = build.status(stamp_ns=counter * 10**9, node="robot/alpha")
         return msgspec.structs.replace(
             sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9
         )
 
     def tally(node: str, since_s: int, until_s: int, count: int) -> Sample:
         keys = (f"{node}/status",)
-        said = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
+        said = build.tally(node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
         return msgspec.structs.replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
 
     first = [status(k, 10 + k) for k in range(3)]
@@ -212,92 +200,6 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
     both = [*first, *second, tally("robot/alpha", 9, 13, 3), last]
     assert found(recorded(path.with_name("both.mcap"), both)) == []
     assert found(recorded(path.with_name("memory.mcap"), first)) == []
-
-
-def test_views_that_are_missing_can_be_drawn_again(path: Path) -> None:
-    views = [
-        msgspec.structs.replace(
-            sampled(
-                c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="", figures={}), k
-            ),
-            key="view/log",
-        )
-        for k in (0, 2)
-    ]
-    (named,) = found(recorded(path, views))
-    assert named == (
-        "view/log: 1 message missing: 1; `teamslam view LOG --export NEW` draws all views again"
-    )
-
-
-def test_what_was_asked_for_later_is_not_held_against_the_counters(path: Path) -> None:
-    late = [
-        msgspec.structs.replace(s, counter=NO_COUNTER, wall_ns=s.wall_ns + 50)
-        if s.counter in (2, 3)
-        else s
-        for s in drive("alpha", 5)
-    ]
-    assert found(recorded(path, late)) == []
-
-
-def test_a_measurement_that_is_there_twice_and_not_the_same_is_named(path: Path) -> None:
-    other = sampled(
-        c.ODOMETRY,
-        "alpha",
-        m.Odometry(
-            stamp_ns=100 * SECOND,
-            robot="alpha",
-            incarnation=1,
-            number=3,
-            duration_ns=1,
-            forward=0.5,
-            yaw_rate=0.5,
-        ),
-        10,
-    )
-    assert found(recorded(path, [*drive("alpha", 1), other])) == [
-        "source/alpha: 1 measurements of incarnation 1 there twice, and not the same"
-    ]
-
-
-def test_what_the_recorder_knows_that_it_lacks_is_found(path: Path) -> None:
-    last = m.Status(
-        stamp_ns=0,
-        node="recorder",
-        state="done",
-        figures={},
-        warnings=("missing: robot/alpha/team/pose: 7",),
-    )
-    said = [*drive("alpha", 1), sampled(c.STATUS, "recorder", last, 0)]
-    assert found(recorded(path, said)) == ["recorder: missing: robot/alpha/team/pose: 7"]
-
-
-def test_what_no_publisher_counts_is_not_held_against_its_counters(path: Path) -> None:
-    alive = [
-        sampled(c.ALIVE, "central", m.Liveliness(stamp_ns=0, node="central", alive=up), 0)
-        for up in (True, False)
-    ]
-    own = sampled(
-        c.STATUS,
-        "recorder",
-        m.Status(stamp_ns=0, node="recorder", state="recording", figures={}),
-        4,
-    )
-    assert found(recorded(path, [*alive, own])) == []
-    other = sampled(
-        c.STATUS, "central", m.Status(stamp_ns=0, node="central", state="waiting", figures={}), 4
-    )
-    assert found(recorded(path.with_name("b.mcap"), [other])) == [
-        "central/status: 4 messages missing: 0–3"
-    ]
-
-
-def test_a_message_that_is_there_twice_is_named_and_one_that_came_late_is_sound(path: Path) -> None:
-    samples = drive("alpha", 1)
-    samples[2], samples[5] = samples[5], samples[2]
-    assert found(recorded(path, [*samples, samples[-2]])) == [
-        "source/alpha/odometry: 1 message twice, the first is 9"
-    ]
 
 
 @settings(deadline=None, max_examples=150)
@@ -331,14 +233,14 @@ def spoken(node: str, count: int, since_s: int) -> list[Sample]:
     """A process that publishes a status a second, a fault, and its totals at its end."""
     said: list[Sample] = []
     for k in range(count):
-        status = m.Status(stamp_ns=k * 10**9, node=node, state="mapping", figures={})
+        status = build.status(stamp_ns=k * 10**9, node=node)
         one = sampled(c.STATUS, node, status, k)
         said.append(msgspec.structs.replace(one, wall_ns=(since_s + k) * 10**9))
     until_ns = said[-1].wall_ns + 1
-    done = m.Liveliness(stamp_ns=0, node=node, alive=False)
+    done = build.liveliness(node=node, alive=False)
     said.append(Sample(f"{node}/config", encoded(done), 0, until_ns, 0))
     keys = (c.STATUS.key(node), f"{node}/config")
-    tally = m.Tally(stamp_ns=0, node=node, since_ns=since_s * 10**9, keys=keys, counts=(count, 1))
+    tally = build.tally(node=node, since_ns=since_s * 10**9, keys=keys, counts=(count, 1))
     return [*said, Sample(c.TALLY.key(node), encoded(tally), 0, until_ns + 1, 0)]
 
 
@@ -655,10 +557,9 @@ def test_numbers_read_back_from_csv_are_the_same(
 ) -> None:
     folder = tmp_path_factory.mktemp("csv")
     ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
-    message = m.Observations(
+    message = build.observations(
         stamp_ns=5,
         robot="alpha",
-        incarnation=1,
         number=9,
         ids=from_ids(ids),
         ranges=from_floats(ranges),

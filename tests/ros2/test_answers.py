@@ -17,6 +17,7 @@ from team.ros2_answers import Answers, LiveAnswers, RosPublisher, landmark_block
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.zenoh.foreign import ForeignKeys
+from tests import build
 from tests.ros2.test_live import free_port
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import examples, packed, spd, wait_until
@@ -31,7 +32,7 @@ def posed(stamp_ns: int, pose: tuple[float, float, float], *, inside: bool = Tru
     fields |= {"stamp_ns": stamp_ns, "robot": "r1", "pose": from_floats(pose)}
     P = np.diag([0.04, 0.09, 0.01])
     fields |= {"covariance": from_floats(P), "in_team_frame": inside}
-    return m.PoseEstimate(**fields)
+    return build.pose_estimate(**fields)
 
 
 def decoded(answer):
@@ -107,7 +108,7 @@ def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint: bool) -> Non
     data = packed(P) if joint else from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
     fields = {name: getattr(fused, name) for name in fused.__struct_fields__}
     changed = {"ids": ids, "means": from_floats(range(6)), "covariance": data, "joint": joint}
-    np.testing.assert_array_equal(landmark_blocks(m.FusedMap(**(fields | changed))), blocks)
+    np.testing.assert_array_equal(landmark_blocks(build.fused_map(**fields | changed)), blocks)
 
 
 def test_an_ellipse_has_the_directions_of_its_covariance() -> None:

@@ -18,7 +18,7 @@ from team.config import RobotConfig, Sensor
 from team.driver.journal import Journal
 from team.driver.measured import MeasurementError
 from team.driver.node import SourceNode
-from team.ros2.arrivals import MOST_PUBLISHERS, Backlog, Lost, number_of
+from team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
 from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics, TopicsError, load_topics
 from team.ros2.translator import Measured
@@ -387,17 +387,6 @@ def test_odometry_that_does_not_come_is_named_with_what_to_look_at(
     assert not heard.warnings()
     (said,) = silent.warnings()
     assert "/r1/odom: no message yet: look at its name, at `domain`" in said
-
-
-def test_a_backlog_keeps_the_order_of_each_topic() -> None:
-    backlog = Backlog()
-    for k in range(3):
-        backlog.put("/a", "kind", bytes([k]))
-    assert [arrived.payload for _ in range(3) if (arrived := backlog.next_of("/a"))] == [
-        b"\x00", b"\x01", b"\x02",
-    ]  # fmt: skip
-    assert backlog.next_of("/a") is None
-    assert backlog.oldest_s == 0.0
 
 
 def test_of_a_shared_tf_a_driver_takes_what_its_own_robot_saw() -> None:

@@ -16,6 +16,7 @@ from team.ros2_driver import Ros2Driver
 from team.wire import messages as m
 from team.wire.codec import encoded
 from team.wire.zenoh.foreign import ForeignSample
+from tests import build
 from tests.ros2 import messages as ros
 from tests.teams import world_of
 
@@ -67,9 +68,7 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path: Path, use: str) -> None:
     world = WorldNode(
         world_of(stream),
         frozenset(),
-        m.Configuration(
-            stamp_ns=0, node="world", incarnation=0, digest=bytes(8), configuration="{}"
-        ),
+        build.configuration(node="world", incarnation=0),
     )
     out = [each.message for _ in range(4) for each in world.publish(0.0)]
     expected = [each for each in out if isinstance(each, m.Measurement)]

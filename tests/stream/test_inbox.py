@@ -5,16 +5,15 @@ from hypothesis import strategies as st
 
 from team.stream.inbox import Inbox
 from team.wire import messages as m
+from tests import build
 
 
 def measurement(number, incarnation=0):
-    return m.Odometry(
+    return build.odometry(
         stamp_ns=number * 1_000,
-        robot="r1",
         incarnation=incarnation,
         number=number,
         duration_ns=1_000,
-        forward=1.0,
         yaw_rate=0.0,
     )
 

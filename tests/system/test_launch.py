@@ -54,14 +54,6 @@ def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
         assert result["channels"][key]["messages"] > 0
 
 
-def test_the_json_of_a_launch_says_what_every_process_took(launched: Launched) -> None:
-    for name, process in launched.result["processes"].items():
-        assert 0.0 < process["cpu_s"] < launched.result["wall_s"], name
-        assert 5.0 < process["pss_mb"] < process["peak_rss_mb"], name
-    page = (launched.log.parent / "report.html").read_text()
-    assert '<h2 id="processes">' in page
-
-
 def test_every_published_measurement_is_consumed_once(launched: Launched) -> None:
     for name, robot in launched.result["robots"].items():
         assert robot["measurements_published"] == robot["measurements_consumed"] > 2 * STEPS
@@ -119,10 +111,7 @@ async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, ob
     ("estimator", "rule"),
     [
         ("hybrid-thesis", "kalman-per-axis"),
-        ("hybrid", "covariance-intersection"),
-        ("hybrid", "joint-fastslam"),
         ("dead-reckoning", "batch"),
-        ("ekf-slam", "latest"),
     ],
 )
 async def test_every_kind_of_pair_ends_with_the_bytes_of_a_team_in_memory(

@@ -35,9 +35,9 @@ from sim.world.streams import WorldStreams
 from team.config import RobotConfig
 from team.peers.members import CHANNELS, Member, about
 from team.wire import channels as ch
-from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
+from tests import build
 
 SECOND = 10**9
 DEATHS = 30
@@ -149,7 +149,7 @@ class Storm:
 
 def order_of(robot: str) -> Member:
     """An operator's order."""
-    order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=REASON)
+    order = build.withdrawal(robot=robot, reason=REASON)
     return Member(ch.ORDER.key(robot), encoded(order), order)
 
 

@@ -35,6 +35,7 @@ from team.wire import messages as m
 from team.wire.bus import BusError, Sample
 from team.wire.codec import encoded
 from team.wire.zenoh.bus import ZenohBus
+from tests import build
 from tests.trials.kills import PROGRAM, await_text, children, expected_of, shortened
 
 ROBOTS = ("r1", "r2")
@@ -44,18 +45,16 @@ LARGE = 3 * 2**20
 def claims(rng: random.Random, node: str, serial: int) -> m.SetSummary:
     """A summary that has everything of everyone."""
     holdings = tuple(
-        m.Holding(
+        build.holding(
             robot=robot,
             incarnation=life,
-            start=True,
             sequences=(0, rng.randrange(10**3, 10**9)),
             digest=rng.randbytes(8),
         )
         for robot in ROBOTS
         for life in range(1, 40)
     )
-    return m.SetSummary(
-        stamp_ns=0,
+    return build.set_summary(
         node=node,
         serial=serial,
         digest=rng.randbytes(8),
@@ -66,13 +65,10 @@ def claims(rng: random.Random, node: str, serial: int) -> m.SetSummary:
 
 def given(rng: random.Random, node: str) -> bytes:
     """An answer: a large payload, a large signature, a robot that nobody knows."""
-    start = m.InitialPose(stamp_ns=0, robot="x9", incarnation=1, number=0, pose=b"", covariance=b"")
-    done = m.Concluded(
-        stamp_ns=0, robot="r1", serial=0, digest=bytes(8), sha256=bytes(32), submaps=0
-    )
+    start = build.initial_pose(robot="x9")
+    done = build.concluded()
     return encoded(
-        m.Members(
-            stamp_ns=0,
+        build.members(
             node=node,
             keys=("robot/r1/submap", ch.CONCLUDED.key("r1"), ch.START.key("x9")),
             payloads=(rng.randbytes(LARGE), encoded(done), encoded(start)),
@@ -106,8 +102,8 @@ def storm(bus: ZenohBus, over: threading.Event, rate: float) -> Counter[str]:
                     bus.publish_raw(Sample(ch.SET_SUMMARY.key(node), payload, 0, 0, total))
                     sent["summaries"] += 1
                 case 1:
-                    want = m.Requested(robot=robot, incarnation=1, start=True, first=0, last=10**6)
-                    asked = m.MembersRequest(stamp_ns=total, node=node, requested=(want,))
+                    want = build.requested(robot=robot, last=10**6)
+                    asked = build.members_request(stamp_ns=total, node=node, requested=(want,))
                     bus.request(ch.MEMBERS, node, asked)
                     sent["requests"] += 1
                 case 2 if sent["tokens"] < 300:

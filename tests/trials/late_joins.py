@@ -17,10 +17,10 @@ import time
 from collections.abc import Sequence
 
 from team.wire import channels as ch
-from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 
 MESSAGES = 24
 """That each publisher sends, some before the join and some after it."""
@@ -55,7 +55,7 @@ def joined(endpoint: str, team: str, publishers: int, rng: random.Random) -> dic
     def say(count: int) -> None:
         for robot in robots:
             text = "x" * 1_500
-            message = m.Withdrawal(stamp_ns=count, robot=robot, by="operator", reason=text)
+            message = build.withdrawal(stamp_ns=count, robot=robot, reason=text)
             buses[robot].publish(Outgoing(ch.WITHDRAWAL, robot, message))
 
     def go_on() -> None:

@@ -36,7 +36,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import zenoh
-from rosbags.rosbag2 import StoragePlugin, Writer
 
 from sim.datasets.folder_writer import write_folder
 from sim.in_memory.team import final_map, run_team
@@ -46,15 +45,15 @@ from sim.scenarios.toml import folder_scenario
 from sim.world.streams import RobotStream
 from team.recording.reader import open_log
 from team.ros2.bags import opened_bag
-from team.ros2.definitions import types
 from team.wire import channels as ch
 from team.wire.bus import opened
 from team.wire.messages import FusedMap
+from tests.ros2 import messages as ros
 from tests.trials.kills import PROGRAM
 
 EXACT = ("zip", "csv")
 BY_POINTS = ("mcap", "db3", "rmw", "bridge", "log")
-STORE = types()
+STORE = ros.STORE
 ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 START_SIGMAS = (0.05, 0.03)
 """As the UTIAS reader has them [m, rad]."""
@@ -65,101 +64,33 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 # The bag.
 
 
-def header(stamp_ns: int, frame: str) -> Any:
-    """A ROS 2 header."""
-    at = STORE.types["builtin_interfaces/msg/Time"](*(int(v) for v in divmod(stamp_ns, 10**9)))
-    return STORE.types["std_msgs/msg/Header"](stamp=at, frame_id=frame)
-
-
-def of(name: str, **fields: Any) -> Any:
-    """A message of ours by its type's short name."""
-    return STORE.types[name.replace("/", "/msg/")](**fields)
-
-
-def pose(x: float, y: float) -> Any:
-    """A pose without rotation."""
-    rotation = of("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-    return of("geometry_msgs/Pose", position=of("geometry_msgs/Point", x=x, y=y, z=0.0),
-              orientation=rotation)  # fmt: skip
-
-
-def odometry(stamp_ns: int, forward: float, yaw_rate: float) -> bytes:
-    """Speeds that hold from then on."""
-    nothing = np.zeros(36)
-    twist = of(
-        "geometry_msgs/Twist",
-        linear=of("geometry_msgs/Vector3", x=forward, y=0.0, z=0.0),
-        angular=of("geometry_msgs/Vector3", x=0.0, y=0.0, z=yaw_rate),
-    )
-    message = of(
-        "nav_msgs/Odometry",
-        header=header(stamp_ns, "odom"),
-        child_frame_id="base_link",
-        pose=of("geometry_msgs/PoseWithCovariance", pose=pose(0.0, 0.0), covariance=nothing),
-        twist=of("geometry_msgs/TwistWithCovariance", twist=twist, covariance=nothing),
-    )
-    return bytes(STORE.serialize_cdr(message, ODOMETRY))
-
-
-def detections(stamp_ns: int, seen: list[tuple[int, float, float]]) -> bytes:
-    """Tags by number, as points of the base's frame."""
-    nothing = np.zeros(36)
-    box = of("vision_msgs/BoundingBox3D", center=pose(0.0, 0.0),
-             size=of("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0))  # fmt: skip
-    each = [
-        of(
-            "vision_msgs/Detection3D",
-            header=header(stamp_ns, "base_link"),
-            results=[
-                of(
-                    "vision_msgs/ObjectHypothesisWithPose",
-                    hypothesis=of("vision_msgs/ObjectHypothesis", class_id=str(tag), score=1.0),
-                    pose=of(
-                        "geometry_msgs/PoseWithCovariance", pose=pose(x, y), covariance=nothing
-                    ),
-                )
-            ],
-            bbox=box,
-            id=str(tag),
-        )
-        for tag, x, y in seen
-    ]
-    message = of(
-        "vision_msgs/Detection3DArray", header=header(stamp_ns, "base_link"), detections=each
-    )
-    return bytes(STORE.serialize_cdr(message, TAGS))
-
-
-def of_robot(stream: RobotStream) -> list[tuple[int, str, str, bytes]]:
-    """(stamp, topic, type, CDR) of all that a robot measured."""
-    found: list[tuple[int, str, str, bytes]] = []
+def of_robot(stream: RobotStream) -> list[ros.Message]:
+    """Messages of all that a robot measured."""
+    found: list[ros.Message] = []
     intervals = stream.intervals
     begins = (intervals.end_ns - intervals.duration_ns).tolist()
     rows = zip(begins, intervals.forward.tolist(), intervals.yaw_rate.tolist(), strict=True)
     for at, v, w in [*rows, (int(intervals.end_ns[-1]), 0.0, 0.0)]:
-        found.append((at, f"/{stream.robot}/odom", ODOMETRY, odometry(at, v, w)))
-    seen: dict[int, list[tuple[int, float, float]]] = {}
+        found.append((at, f"/{stream.robot}/odom", ODOMETRY, ros.odometry(at, ros.pose(), v, w)))
+    seen: dict[int, list[tuple[str, Any]]] = {}
     for scans, mates in ((stream.landmark_detections, False), (stream.teammate_detections, True)):
         for k, at in enumerate(scans.stamps_ns.tolist()):
             for i in range(scans.offsets[k], scans.offsets[k + 1]):
                 tag = int(stream.teammates[scans.ids[i]][1:]) if mates else int(scans.ids[i])
                 r, b = float(scans.ranges[i]), float(scans.bearings[i])
-                point = (tag, float(r * np.cos(b)), float(r * np.sin(b)))
-                seen.setdefault(at, []).append(point)
+                at_tag = ros.pose(float(r * np.cos(b)), float(r * np.sin(b)))
+                seen.setdefault(at, []).append((str(tag), at_tag))
     topic = f"/{stream.robot}/detections"
-    return found + [(at, topic, TAGS, detections(at, tags)) for at, tags in seen.items()]
+    return found + [
+        (at, topic, TAGS, ros.detections(at, "base_link", tags)) for at, tags in seen.items()
+    ]
 
 
 def write_bags(streams: tuple[RobotStream, ...], folder: Path) -> None:
     """Both bags, and the file that tells their topics."""
     messages = sorted((m for s in streams for m in of_robot(s)), key=lambda m: m[0])
-    for name, plugin in (("mcap", StoragePlugin.MCAP), ("db3", StoragePlugin.SQLITE3)):
-        with Writer(folder / name, version=9, storage_plugin=plugin) as bag:
-            open_: dict[str, Any] = {}
-            for at, topic, kind, data in messages:
-                if topic not in open_:
-                    open_[topic] = bag.add_connection(topic, kind, typestore=STORE)
-                bag.write(open_[topic], at, data)
+    for name in ("mcap", "db3"):
+        ros.write_bag(folder / name, messages, db3=name == "db3")
     lines = []
     for s in streams:
         lines += [f"[robots.{s.robot}]", f'odometry = "/{s.robot}/odom"', 'use = "twist"']

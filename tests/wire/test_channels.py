@@ -4,7 +4,7 @@ import pytest
 
 from team.wire import channels as c
 from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample, opened
+from team.wire.bus import Sample, opened
 from team.wire.codec import WireError, encoded
 from team.wire.views import PARTICLES, view_of
 from tests.support import odometry, submap
@@ -60,7 +60,3 @@ def test_a_view_is_of_its_row_and_is_opened_by_nobody() -> None:
     assert view_of("robot/alpha/particles") is None
     with pytest.raises(WireError, match="no channel has the key 'view/map'"):
         opened(Sample("view/map", b"", 0, 0, 0))
-
-
-def test_an_outgoing_message_knows_its_key() -> None:
-    assert Outgoing(c.SUBMAP, "alpha", submap(0)).key == "robot/alpha/submap"

@@ -20,6 +20,7 @@ from team.wire.bus import Outgoing
 from team.wire.codec import encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.support import ROOT, submap
 
 PAGE = ROOT / "docs" / "wire.md"
@@ -170,10 +171,9 @@ def test_the_pages_program_reads_a_submap_from_a_live_team() -> None:
 
 def test_the_pages_example_bytes_are_those_of_the_code() -> None:
     assert encoded(
-        m.Odometry(
+        build.odometry(
             stamp_ns=1_000,
             robot="alpha",
-            incarnation=1,
             number=2,
             duration_ns=100_000_000,
             forward=0.25,

@@ -54,17 +54,12 @@ def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
 
 
 def hostile_status() -> m.Status:
-    return build.status(
-        node="robot/r1", state=HOSTILE, figures={HOSTILE: 1.0}, warnings=(HOSTILE,) * 2
-    )
+    return build.status(state=HOSTILE, figures={HOSTILE: 1.0}, warnings=(HOSTILE,) * 2)
 
 
 def hostile_fault() -> m.Fault:
-    text = HOSTILE
-    return m.Fault(
-        stamp_ns=0, node="robot/r1", origin=text, count=1, message=text, error=text, text=text,
-        place=text, digest=bytes(8),
-    )  # fmt: skip
+    texts = dict.fromkeys(("origin", "message", "error", "text", "place"), HOSTILE)
+    return build.fault(count=1, **texts)
 
 
 def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message_without() -> None:
@@ -75,7 +70,7 @@ def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message
     assert texts == [PRINTABLE] * 4
     assert readable(message) is message
     json = '{\n  "a": 1}'
-    configured = build.configuration(node="robot/r1", incarnation=0, configuration=json)
+    configured = build.configuration(incarnation=0, configuration=json)
     key = ch.ROBOT_CONFIG.key("r1")
     assert shown(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, "is data, not words"
 

@@ -9,6 +9,7 @@ from team.wire.bus import Sample, replied
 from team.wire.codec import WireError, encoded
 from team.wire.zenoh import stored as stored_module
 from team.wire.zenoh.stored import StoredMessages
+from tests import build
 from tests.support import examples
 
 S = 10**9
@@ -16,7 +17,7 @@ FINAL = msgspec.structs.replace(
     next(e for e in examples() if isinstance(e, m.FusedMap)), final=True
 )
 CONCLUDED = next(e for e in examples() if isinstance(e, m.Concluded))
-GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r1", by="operator", reason="lost")
+GIVEN_UP = build.given_up(reason="lost")
 
 
 def sample(channel: ch.Channel, name: str, message: m.Message, counter: int = 7) -> Sample:
@@ -34,8 +35,8 @@ def of(
     run_s: float = 0.0,
     node: str = "",
 ) -> list[Sample]:
-    request = m.KeptRequest(
-        stamp_ns=0, channels=tuple(c.name for c in channels), node=node, run_ns=round(run_s * S)
+    request = build.kept_request(
+        channels=tuple(c.name for c in channels), node=node, run_ns=round(run_s * S)
     )
     return [replied(ch.KEPT, "", reply, 0) for reply in stored.answer(request, now_s)]
 
@@ -145,7 +146,7 @@ def test_every_order_of_an_operator_is_stored_with_its_signature() -> None:
 def test_the_router_can_not_be_made_to_reply_with_another_channel() -> None:
     kept = m.Kept(
         stamp_ns=0, key="central/end", wall_ns=0, counter=0,
-        payload=encoded(m.TeamEnd(stamp_ns=0, by="operator", reason="so")),
+        payload=encoded(build.team_end(reason="so")),
     )  # fmt: skip
     with pytest.raises(WireError, match="stores nothing on the key"):
         replied(ch.KEPT, "", encoded(kept), 0)
