@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from central.desk.names import in_order
-from central.desk.verification.recorded import Recorded, RerunError, Stream
+from central.desk.verification.recorded import Recorded, RerunError
 from central.desk.verification.robot import dispositions
 from team.robot.ledger import IN_SIGHTING
+from team.store import Stream
 from team.wire import channels as ch
 from team.wire import messages as m
 

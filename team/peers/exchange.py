@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import islice
 
 from team.door import MOST_LIVES
-from team.peers.members import Member, Stream
+from team.peers.members import Member
 from team.peers.replica import (
     MOST_INTERVALS,
     MOST_SEQUENCES,
@@ -13,6 +13,7 @@ from team.peers.replica import (
     Replica,
     intervals,
 )
+from team.store import Stream
 from team.wire import messages as m
 
 MOST_REQUESTED = 64

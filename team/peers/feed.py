@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
-from team.peers.members import Stream
 from team.peers.replica import Replica
+from team.store import Stream
 from team.wire import messages as m
 
 

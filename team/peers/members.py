@@ -13,8 +13,6 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import NO_COUNTER, Sample, opened
 
-Stream = tuple[str, int]
-"""(robot, incarnation)."""
 STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
 STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.CONCLUDED, ch.CERTIFICATE)
 CHANNELS = (*STREAMED, *STATED)

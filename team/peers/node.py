@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from team.peers.exchange import is_oversized, list_requested, make_answer, make_request
 from team.peers.feed import feed_order, new_of_streams
 from team.peers.given import GIVEN_BYTES, Given
-from team.peers.members import CHANNELS, Member, Stream, member_of
+from team.peers.members import CHANNELS, Member, member_of
 from team.peers.proofs import Proofs
 from team.peers.replica import SHARE, RefusedError, Replica
+from team.store import Stream
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing, Sample

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeVar
 
 from team.door import MOST_COUNT, MOST_LIVES
-from team.peers.members import Member, Stream, about
+from team.peers.members import Member, about
+from team.store import Stream
 from team.wire import messages as m
 
 MOST_SEQUENCES = 200_000

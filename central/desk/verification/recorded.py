@@ -13,13 +13,12 @@ from central.desk.verification.measurements import RecordedMeasurements
 from team.config import RobotConfig
 from team.former_names import with_current_names
 from team.recording.reader import Log, LogError
+from team.store import Stream
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
-Stream = tuple[str, int]
-"""(robot, incarnation)."""
 T = TypeVar("T")
 Identity = tuple[object, ...]
 """A message's key and the names of its inputs."""
