@@ -38,19 +38,9 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
         )
     )
     for name in names:
+        yield sample(Outgoing(ch.ALIVE, f"robot/{name}", build.liveliness(node=f"robot/{name}")))
         yield sample(
-            Outgoing(
-                ch.ALIVE,
-                f"robot/{name}",
-                build.liveliness(node=f"robot/{name}"),
-            )
-        )
-        yield sample(
-            Outgoing(
-                ch.START,
-                name,
-                build.initial_pose(robot=name, pose=from_floats([0, 0, 0])),
-            )
+            Outgoing(ch.START, name, build.initial_pose(robot=name, pose=from_floats([0, 0, 0])))
         )
     phase = rng.uniform(0.0, 2.0 * np.pi, robots)
     reach = rng.uniform(0.1, 0.45, robots) * size_m

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -504,6 +504,15 @@ def examples() -> Iterator[m.Message]:
     )
     yield build.measurements_request(robot="alpha", first=5)
     yield build.submaps_request(robot="alpha")
+
+
+K = TypeVar("K", bound=m.Message)
+
+
+def example(kind: type[K], **fields: object) -> K:
+    """The example of a class, with these fields in place of its own."""
+    found = next(each for each in examples() if isinstance(each, kind))
+    return msgspec.structs.replace(found, **fields)
 
 
 fused_map = partial(build.fused_map, joint=False, ids=b"", means=b"", covariance=b"")

@@ -11,13 +11,7 @@ import numpy as np
 from central.config import CentralConfig
 from central.node import make_centre
 from sim.publisher.node import WorldNode, expected_nodes
-from sim.world.streams import (
-    Detections,
-    Intervals,
-    RobotStream,
-    StartPose,
-    WorldStreams,
-)
+from sim.world.streams import Detections, Intervals, RobotStream, StartPose, WorldStreams
 from team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.pairs import NEEDS_MAP
 from team.robot.node import RobotNode, robot_node
@@ -124,11 +118,7 @@ def world_of(*streams: RobotStream) -> WorldStreams:
 
 def published(each: RobotStream) -> list[m.Measurement]:
     """The measurements of one stream as the world publishes them."""
-    world = WorldNode(
-        world_of(each),
-        frozenset(),
-        build.configuration(node="world", incarnation=0),
-    )
+    world = WorldNode(world_of(each), frozenset(), build.configuration(node="world", incarnation=0))
     out: list[Outgoing] = []
     while not world.ended:
         out += world.publish(0.0)

@@ -214,12 +214,7 @@ def messages():
             for o in driven(RobotNode(config(each.robot, pose_s=1e6)), published(each))
             if o.channel in (ch.SUBMAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
         ),
-        m.End(
-            stamp_ns=12_000_000_000,
-            streams=tuple(
-                m.StreamEnd(robot=x.robot, incarnation=1, measurements=len(x)) for x in PAIR.streams
-            ),
-        ),
+        build.end(12_000_000_000, **{x.robot: len(x) for x in PAIR.streams}),
         *(build.liveliness(node=ch.robot_node(x.robot)) for x in PAIR.streams),
     ]
 
@@ -260,12 +255,7 @@ def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_ma
     assert [member.robot for member in closed.members] == ["r1"]
     assert not closed.provisional
     rest = [x for x in messages() if x not in first and x not in late]
-    for message in [
-        late[0],
-        build.liveliness(node="robot/r2"),
-        *rest,
-        *late[1:],
-    ]:
+    for message in [late[0], build.liveliness(node="robot/r2"), *rest, *late[1:]]:
         out += node.handle(message, 0)
     (final,) = of(out, ch.FINAL_MAP)
     assert encoded(final) == expected_final()

@@ -1,6 +1,5 @@
 """The end of a team is taken from its author only, whatever is replied to who asks for it."""
 
-import msgspec
 import pytest
 
 from team.the_end import TheEnd
@@ -9,11 +8,9 @@ from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Sample
 from team.wire.codec import encoded
 from tests import build
-from tests.support import examples
+from tests.support import example
 
-FINAL = msgspec.structs.replace(
-    next(each for each in examples() if isinstance(each, m.FusedMap)), final=True
-)
+FINAL = example(m.FusedMap)
 CENTRES = ch.FINAL_MAP.key()
 OF_R1, OF_R2 = (ch.TEAM_FINAL.key(robot) for robot in ("r1", "r2"))
 

@@ -355,8 +355,7 @@ def robot_session(
         answers = [each.message for each in out if isinstance(each.message, m.Submap)]
         if answers:
             out += node.handle(
-                build.progress(node="central", robot=node.robot, submaps=len(answers)),
-                0,
+                build.progress(node="central", robot=node.robot, submaps=len(answers)), 0
             )
     for each in [*out, Outgoing(out[0].channel, "", node.status())]:
         decoded(encoded(each.message), type(each.message))

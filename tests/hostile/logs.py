@@ -128,10 +128,7 @@ def far_counters(path: Path) -> Path:
         (
             ch.END,
             "",
-            m.End(
-                stamp_ns=2**61,
-                streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=far),),
-            ),
+            build.end(2**61, alpha=far),
         ),
     ]
     return log_of(path, records_of([(c, n, encoded(message)) for c, n, message in told]))

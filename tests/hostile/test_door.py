@@ -16,20 +16,15 @@ from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
 from team.wire.digest import configured
 from tests import build
-from tests.support import examples, submap
+from tests.support import example, submap
 from tests.teams import Submaps, of, published, stream, world_of
 
 HUGE = 2**62
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
 SUBMAPS = Submaps(list(STREAMS.values()))
-END = m.End(
-    stamp_ns=0,
-    streams=tuple(
-        m.StreamEnd(robot=n, incarnation=1, measurements=len(s)) for n, s in STREAMS.items()
-    ),
-)
-FINAL = next(e for e in examples() if isinstance(e, m.FusedMap))
+END = build.end(**{n: len(s) for n, s in STREAMS.items()})
+FINAL = example(m.FusedMap)
 
 
 def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
@@ -72,24 +67,9 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
 STRANGE = msgspec.structs.replace(submap(0), robot="r9")
 ATTACKS = [
     (ch.SUBMAP, "r9", STRANGE, "of r9, not in this team"),
-    (
-        ch.START,
-        "r1",
-        build.initial_pose(incarnation=HUGE),
-        f"of incarnation {HUGE}",
-    ),
-    (
-        ch.ROBOT_DONE,
-        "r1",
-        build.done(incarnation=HUGE),
-        f"of incarnation {HUGE}",
-    ),
-    (
-        ch.ROBOT_DONE,
-        "r1",
-        build.done(measurements=5, submaps=HUGE),
-        f"counts to {HUGE}",
-    ),
+    (ch.START, "r1", build.initial_pose(incarnation=HUGE), f"of incarnation {HUGE}"),
+    (ch.ROBOT_DONE, "r1", build.done(incarnation=HUGE), f"of incarnation {HUGE}"),
+    (ch.ROBOT_DONE, "r1", build.done(measurements=5, submaps=HUGE), f"counts to {HUGE}"),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, HUGE), f"counts to {HUGE}"),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, 1, 4e9), "days after its stream began"),
     (ch.ROBOT_PROGRESS, "r1", progress("r2", 5, 1), "a message of 'r2' on the key"),
@@ -99,14 +79,11 @@ ATTACKS = [
         build.progress(node="central", measurements=5, submaps=1),
         "a message of 'central'",
     ),
-    (ch.END, "", m.End(stamp_ns=0, streams=()), "an end that does not know of r1, r2"),
+    (ch.END, "", build.end(), "an end that does not know of r1, r2"),
     (
         ch.END,
         "",
-        m.End(
-            stamp_ns=0,
-            streams=tuple(m.StreamEnd(robot=n, incarnation=1, measurements=3) for n in STREAMS),
-        ),
+        build.end(**dict.fromkeys(STREAMS, 3)),
         "ends with measurement 3",
     ),
     (
@@ -124,12 +101,7 @@ ATTACKS = [
         build.withdrawal(by="central", reason="so"),
         "a message of 'central' on the key",
     ),
-    (
-        ch.ORDER,
-        "r9",
-        build.withdrawal(robot="r9", reason="so"),
-        "of r9, not in this team",
-    ),
+    (ch.ORDER, "r9", build.withdrawal(robot="r9", reason="so"), "of r9, not in this team"),
 ]
 
 
@@ -173,23 +145,15 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     far = msgspec.structs.replace(odometry, stamp_ns=odometry.stamp_ns + 2 * LATE_NS)
     acknowledged = build.progress(node="central", submaps=10**6)
     attacks = [
-        (
-            ch.START,
-            build.initial_pose(incarnation=HUGE),
-            f"of incarnation {HUGE}",
-        ),
-        (
-            ch.START,
-            build.initial_pose(incarnation=100),
-            "of incarnation 100, while 1 is in",
-        ),
+        (ch.START, build.initial_pose(incarnation=HUGE), f"of incarnation {HUGE}"),
+        (ch.START, build.initial_pose(incarnation=100), "of incarnation 100, while 1 is in"),
         (ch.ODOMETRY, msgspec.structs.replace(odometry, number=HUGE), f"counts to {HUGE}"),
         (ch.ODOMETRY, far, "days after its stream began"),
         (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),
-        (ch.END, m.End(stamp_ns=0, streams=()), "an end that does not know of r1"),
+        (ch.END, build.end(), "an end that does not know of r1"),
         (
             ch.END,
-            m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=2),)),
+            build.end(r1=2),
             "ends with measurement 2 of r1",
         ),
     ]

@@ -185,7 +185,7 @@ def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold
         key=lambda each: each.hash,
     )
     assert node.take(smallest, "robot/r2")
-    end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r2", incarnation=1, measurements=10),))
+    end = build.end(r2=10)
     fold.note(end)
     assert fold.restarts == 2
     final = fold.final

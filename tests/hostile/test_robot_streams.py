@@ -68,10 +68,7 @@ def drive(
         out += [look, (odd or {}).get(k) or own]
     return [
         *out,
-        m.End(
-            stamp_ns=steps * S,
-            streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=2 * steps + 1),),
-        ),
+        build.end(steps * S, r1=2 * steps + 1),
     ]
 
 

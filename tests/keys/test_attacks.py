@@ -28,38 +28,22 @@ from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests import build
 from tests.keys.certificates import TEAM, Folders
-from tests.support import examples, odometry, submap, wait_until
+from tests.support import example, examples, odometry, submap, wait_until
 
 HUGE = 2**62
-FINAL = msgspec.structs.replace(
-    next(e for e in examples() if isinstance(e, m.FusedMap)), final=True
-)
-CONCLUDED = msgspec.structs.replace(
-    next(e for e in examples() if isinstance(e, m.Concluded)), robot="r1"
-)
+FINAL = example(m.FusedMap)
+CONCLUDED = example(m.Concluded, robot="r1")
 ATTACKS = {
-    "ends the run": (ch.END, "", m.End(stamp_ns=0, streams=())),
+    "ends the run": (ch.END, "", build.end()),
     "forges the final map": (ch.FINAL_MAP, "", FINAL),
-    "begins one that nobody reaches": (
-        ch.START,
-        "r1",
-        build.initial_pose(incarnation=HUGE),
-    ),
-    "says that another is done": (
-        ch.ROBOT_DONE,
-        "r1",
-        build.done(incarnation=HUGE),
-    ),
+    "begins one that nobody reaches": (ch.START, "r1", build.initial_pose(incarnation=HUGE)),
+    "says that another is done": (ch.ROBOT_DONE, "r1", build.done(incarnation=HUGE)),
     "frees another's credit": (
         ch.ROBOT_PROGRESS,
         "r1",
         build.progress(measurements=HUGE, submaps=HUGE),
     ),
-    "orders a withdrawal": (
-        ch.ORDER,
-        "r1",
-        build.withdrawal(reason="so"),
-    ),
+    "orders a withdrawal": (ch.ORDER, "r1", build.withdrawal(reason="so")),
     "tells that the centre withdrew": (
         ch.WITHDRAWAL,
         "r1",
@@ -78,7 +62,7 @@ ATTACKS = {
         "r1",
         build.progress(node="recorder", measurements=HUGE, submaps=HUGE),
     ),
-    "gives the truth": (ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth))),
+    "gives the truth": (ch.TRUTH, "r1", example(m.Truth)),
 }
 """What r2 says that is not its own to say."""
 
@@ -94,9 +78,7 @@ def on_every_row() -> Iterator[Outgoing]:
 
 
 OWN = Outgoing(
-    ch.ROBOT_PROGRESS,
-    "r2",
-    build.progress(stamp_ns=7, robot="r2", measurements=1, submaps=1),
+    ch.ROBOT_PROGRESS, "r2", build.progress(stamp_ns=7, robot="r2", measurements=1, submaps=1)
 )
 
 
@@ -141,11 +123,7 @@ def test_a_robot_that_was_taken_over_says_nothing_for_others(
         said = [*(Outgoing(*attack) for attack in ATTACKS.values()), *on_every_row()]
         for out in said:
             victim.subscribe(out.channel)
-        probe = Outgoing(
-            ch.STATUS,
-            "robot/r2",
-            build.status(node="robot/r2"),
-        )
+        probe = Outgoing(ch.STATUS, "robot/r2", build.status(node="robot/r2"))
 
         def there() -> bool:
             robot.publish(probe)
@@ -163,11 +141,7 @@ ENDS = {
     "ends the team in the centre's name": (ch.FINAL_MAP, "", FINAL),
     "ends the team as r1": (ch.TEAM_FINAL, "r1", FINAL),
     "concludes as r1": (ch.CONCLUDED, "r1", CONCLUDED),
-    "gives r1 up": (
-        ch.GIVEN_UP,
-        "robot/r1",
-        build.given_up(reason="so"),
-    ),
+    "gives r1 up": (ch.GIVEN_UP, "robot/r1", build.given_up(reason="so")),
     "orders the end": (ch.END_ORDER, "", build.team_end(reason="so")),
 }
 """Messages that the router would store, if r2 could publish them."""
@@ -286,7 +260,7 @@ def test_a_team_works_with_keys_late_joiners_caches_tokens_and_queries(keys: Fol
 
 
 def test_no_estimator_hears_the_truth(keys: Folders) -> None:
-    truth = Outgoing(ch.TRUTH, "r1", next(e for e in examples() if isinstance(e, m.Truth)))
+    truth = Outgoing(ch.TRUTH, "r1", example(m.Truth))
     with door(keys) as enter:
         world, robot, recorder = enter("world"), enter("robot-r1"), enter("recorder")
         for bus in (robot, recorder):
@@ -294,7 +268,7 @@ def test_no_estimator_hears_the_truth(keys: Folders) -> None:
             bus.subscribe(ch.END)
         world.publish(truth)
         wait_until(lambda: recorder.receive(0.05), what="the truth at the recorder")
-        world.publish(Outgoing(ch.END, "", m.End(stamp_ns=0, streams=())))
+        world.publish(Outgoing(ch.END, "", build.end()))
         assert arriving(robot, "world/end") == []
 
 
@@ -319,9 +293,7 @@ def refusal(endpoint: str, node: Path | None, **changed: object) -> tuple[str, f
 
 
 def test_each_side_names_a_certificate_that_it_refuses(
-    keys: Folders,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    keys: Folders, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     own = credentials_of(keys.own, "router"), load_roster(keys.own)

@@ -13,10 +13,7 @@ from tests.peers.teams import member
 
 ROBOTS = ("r1", "r2", "r3")
 ORDERS = {
-    "given up": (
-        ch.GIVEN_UP,
-        build.given_up(node="robot/r3", reason="lost"),
-    ),
+    "given up": (ch.GIVEN_UP, build.given_up(node="robot/r3", reason="lost")),
     "withdrawn": (ch.ORDER, build.withdrawal(robot="r3", reason="broken")),
 }
 

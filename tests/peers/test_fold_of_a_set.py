@@ -15,10 +15,7 @@ from tests import build
 from tests.peers.teams import done, member, parcel, start
 
 ROBOTS = ("r1", "r2")
-END = m.End(
-    stamp_ns=0,
-    streams=tuple(m.StreamEnd(robot=r, incarnation=1, measurements=20) for r in ROBOTS),
-)
+END = build.end(**dict.fromkeys(ROBOTS, 20))
 ORDER = member(ch.ORDER, build.withdrawal(robot="r2", reason="broken"))
 _GIVEN_UP = build.given_up(node="robot/r2", reason="not seen")
 GIVEN_UP = Member(ch.GIVEN_UP.key("robot/r2"), encoded(_GIVEN_UP), _GIVEN_UP)

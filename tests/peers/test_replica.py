@@ -18,7 +18,7 @@ from team.wire import messages as m
 from team.wire.codec import decoded, encoded
 from tests import build
 from tests.peers.teams import done, member, parcel, said, start
-from tests.support import examples
+from tests.support import example
 
 ROBOTS = ("r1", "r2")
 
@@ -102,7 +102,7 @@ def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_
     node = PeerNode("robot/r1", ("r1", "r2"))
     node.take(member(ch.CONCLUDED, msgspec.structs.replace(last, serial=MOST_COUNT)), "robot/r1")
     fold = PeerFold(CentralConfig(), ("r1", "r2"), node)
-    fold.final = next(each for each in examples() if isinstance(each, m.FusedMap))
+    fold.final = example(m.FusedMap)
     concluded = fold.conclusion("r1")
     assert concluded is not None
     assert decoded(encoded(concluded)) == concluded

@@ -1,6 +1,5 @@
 """Recorder, reader and repair: what goes in comes out, and what is broken is named."""
 
-import contextlib
 import hashlib
 import json
 import struct
@@ -23,33 +22,22 @@ from team.recording.reader import LARGEST_CHUNK, DamagedChunkError, Log, LogErro
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.repair import repair_log
 from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample, opened
+from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
 from tests import build
-from tests.support import ROOT, examples, odometry, on_its_key, submap, wait_until
-
-
-def sample(channel: c.Channel, name: str, message: m.Message, counter: int = 0) -> Sample:
-    key = Outgoing(channel, name, message).key
-    return Sample(key, encoded(message), message.stamp_ns, 10**18 + counter, counter)
+from tests.recording.logs import recorded, recorded_examples, sampled
+from tests.support import ROOT, odometry, submap, wait_until
 
 
 def stream(count: int) -> list[Sample]:
     """Interleaved measurements and submaps of two robots."""
     return [
-        sample(c.SUBMAP, robot, submap(i, robot), i)
+        sampled(c.SUBMAP, robot, submap(i, robot), i)
         if i % 10 == 9
-        else sample(c.ODOMETRY, robot, odometry(i, robot), i)
+        else sampled(c.ODOMETRY, robot, odometry(i, robot), i)
         for i in range(count)
         for robot in ("alpha", "bravo")
     ]
-
-
-def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
-    with Recorder(path, "t", metadata) as recorder:
-        recorder.write(samples)
-    return open_log(path)
 
 
 @pytest.fixture
@@ -58,16 +46,8 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_every_recorded_message_comes_back_sound(path: Path) -> None:
-    by_class = {
-        kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds
-    }
-    kept = [
-        on_its_key(by_class[type(message)], "alpha", message)
-        for message in examples()
-        if type(message) in by_class
-    ]
-    samples = [sample(by_class[type(message)], "alpha", message) for message in kept]
-    assert [opened(one)[2] for one in recorded(path, samples).samples()] == kept
+    log = recorded(path, [sample for _, _, sample in recorded_examples()])
+    assert [opened(one)[2] for one in log.samples()] == [x for _, x, _ in recorded_examples()]
 
 
 @settings(deadline=None, max_examples=40)
@@ -92,7 +72,7 @@ def test_any_bytes_are_kept_as_they_came(
 
 def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
     samples = [
-        sample(
+        sampled(
             c.ODOMETRY,
             "alpha",
             build.odometry(
@@ -364,29 +344,6 @@ def test_a_record_longer_than_any_of_ours_is_refused_unread(path: Path) -> None:
         file.truncate(LARGEST_CHUNK + 2**20)
     with pytest.raises(LogError, match=f"record of {LARGEST_CHUNK + 1} bytes"):
         list(open_log(path).samples())
-
-
-@settings(deadline=None, max_examples=300)
-@given(st.data())
-def test_a_damaged_log_gives_samples_or_a_log_error(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "fuzzed.mcap"
-    whole = _small_log(tmp_path_factory)
-    damaged = bytearray(whole)
-    for _ in range(data.draw(st.integers(1, 4))):
-        i = data.draw(st.integers(0, len(damaged) - 1))
-        damaged[i] = data.draw(st.integers(0, 255))
-    path.write_bytes(damaged[: data.draw(st.integers(len(damaged) // 2, len(damaged)))])
-    with contextlib.suppress(LogError):
-        assert len(list(open_log(path).samples())) <= 2 * 60
-
-
-def _small_log(factory: pytest.TempPathFactory) -> bytes:
-    path = factory.getbasetemp() / "small.mcap"
-    if not path.exists():
-        recorded(path, stream(60))
-    return path.read_bytes()
 
 
 def test_measurement_is_lazy(path: Path, noise: list[Sample]) -> None:

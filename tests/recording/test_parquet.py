@@ -13,49 +13,28 @@ from sim.cli import log as cli_log
 from sim.cli.main import app
 from team.recording import parquet_tables
 from team.recording.parquet_tables import export_parquet
-from team.recording.reader import Log, open_log
-from team.recording.recorder import Recorder
 from team.recording.tables import numbers_of, table_of
 from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.bus import Sample
-from team.wire.codec import encoded
-from tests.support import examples, odometry
+from tests.recording.logs import recorded, recorded_examples, sampled
+from tests.support import odometry
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pip install '.[parquet]'")
 
 
-def sampled(channel: c.Channel, message: m.Message, counter: int) -> Sample:
-    name = getattr(message, "node", "alpha") if "{node}" in channel.template else "alpha"
-    return Sample(channel.key(name), encoded(message), message.stamp_ns, 7 + counter, counter)
-
-
-def recorded(path: Path, samples: list[Sample]) -> Log:
-    with Recorder(path, "demo", {}) as recorder:
-        recorder.write(samples)
-    return open_log(path)
-
-
 def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
-    by_class = {
-        kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds
-    }
-    by_class[m.Configuration] = (
-        c.ROBOT_CONFIG
-    )  # of the three nodes that announce one, the example's
-    kept = [message for message in examples() if type(message) in by_class]
-    samples = [sampled(by_class[type(x)], x, i) for i, x in enumerate(kept)]
+    kept = recorded_examples()
+    samples = [sample for _, _, sample in kept]
     samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))
     exported = export_parquet(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1
-    assert len(exported.rows) == len({table_of(by_class[type(x)], x) for x in kept})
-    for i, message in enumerate(kept):
-        table = pq.read_table(
-            tmp_path / "out" / f"{table_of(by_class[type(message)], message)}.parquet"
-        )
+    assert len(exported.rows) == len({table_of(of, x) for of, x, _ in kept})
+    for i, (channel, message, sample) in enumerate(kept):
+        table = pq.read_table(tmp_path / "out" / f"{table_of(channel, message)}.parquet")
         (row,) = [r for r in table.to_pylist() if r["counter"] == i]
-        assert row["key"] == samples[i].key
-        assert row["wall_ns"] == 7 + i
+        assert row["key"] == sample.key
+        assert row["wall_ns"] == sample.wall_ns
         for field in msgspec.structs.fields(message):
             value, back = getattr(message, field.name), row[field.name]
             if isinstance(value, bytes) and field.type == m.Digest:
@@ -71,7 +50,7 @@ def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
 
 def test_a_long_table_is_written_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet_tables, "GROUP_ROWS", 10)
-    samples = [sampled(c.ODOMETRY, odometry(k), k) for k in range(35)]
+    samples = [sampled(c.ODOMETRY, "alpha", odometry(k), k) for k in range(35)]
     log = recorded(tmp_path / "log.mcap", samples)
     assert export_parquet(log, tmp_path / "out", [c.ODOMETRY]).rows == {
         tmp_path / "out" / "odometry.parquet": 35
@@ -87,7 +66,7 @@ def test_a_long_table_is_written_in_groups(tmp_path: Path, monkeypatch: pytest.M
 def test_without_pyarrow_the_command_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, odometry(1), 1)]).path
+    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
     command = ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "parquet"]
     monkeypatch.setattr(cli_log, "find_spec", lambda name: None)
     refused = CliRunner().invoke(app, command)
@@ -100,7 +79,7 @@ def test_without_pyarrow_the_command_says_what_to_install(
 
 
 def test_paths_are_exported_and_a_log_without_any_says_so(tmp_path: Path) -> None:
-    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, odometry(1), 1)]).path
+    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
     refused = CliRunner().invoke(
         app, ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "tum"]
     )

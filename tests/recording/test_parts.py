@@ -26,6 +26,7 @@ from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from team.wire.codec import decoded, encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
+from tests import build
 from tests.recording.test_shell import FINAL, POSE, Team, logged
 from tests.support import odometry, received, wait_until
 
@@ -315,9 +316,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
         Outgoing(
             c.END,
             "",
-            m.End(
-                stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=0, measurements=said),)
-            ),
+            build.end(incarnation=0, alpha=said),
         )
     )
     for now_s in (1e9, 2e9, 3e9):

@@ -21,9 +21,9 @@ from team.wire.codec import decoded, encoded
 from team.wire.zenoh.bus import ZenohBus
 from team.wire.zenoh.router import router
 from tests import build
-from tests.support import Link, examples, odometry, received, submap, wait_until
+from tests.support import Link, example, odometry, received, submap, wait_until
 
-FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
+FINAL = example(m.FusedMap)
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path
     assert told == [[], [PROGRESS_EVERY], [], [PROGRESS_EVERY + 10], []]
 
 
-CONCLUDED = next(message for message in examples() if isinstance(message, m.Concluded))
+CONCLUDED = example(m.Concluded)
 GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 
@@ -246,10 +246,7 @@ class Team:
 
     def ends(self, until: Callable[[], bool]) -> None:
         """The end of a run: what is left is asked for while the source is there."""
-        end = m.End(
-            stamp_ns=0,
-            streams=(m.StreamEnd(robot="alpha", incarnation=0, measurements=len(self.published)),),
-        )
+        end = build.end(incarnation=0, alpha=len(self.published))
         self.bus.publish(Outgoing(c.END, "", end))
         self.bus.publish(Outgoing(c.FINAL_MAP, "", FINAL))
 
@@ -261,7 +258,7 @@ class Team:
         self.bus.close()
 
 
-POSE = next(message for message in examples() if isinstance(message, m.PoseEstimate))
+POSE = example(m.PoseEstimate)
 
 
 def logged(path: Path, channel: c.Channel) -> int:
@@ -313,9 +310,7 @@ def test_what_nobody_has_any_more_is_named(path: Path) -> None:
             Outgoing(
                 c.END,
                 "",
-                m.End(
-                    stamp_ns=0, streams=(m.StreamEnd(robot="alpha", incarnation=0, measurements=7),)
-                ),
+                build.end(incarnation=0, alpha=7),
             )
         )
         stop.set()
@@ -380,5 +375,6 @@ def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them() -> None:
                 stop.set()  # before the fourth, which is due in days
 
     samples = [Sample("view/x", b"", stamp, 0, 0) for stamp in (0, 10**8, 2 * 10**8, 10**15)]
+    began = time.monotonic()
     assert replay(Watched(MemoryNetwork()), samples, 2.0, stop) == 3
-    assert published[2] - published[0] >= 0.09
+    assert published[2] - began >= 0.1

@@ -28,18 +28,14 @@ from team.recording.tables import table_of
 from team.wire import channels as c
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import NO_COUNTER, Outgoing, Sample
+from team.wire.bus import NO_COUNTER, Sample
 from team.wire.codec import encoded
 from tests import build
+from tests.recording.logs import recorded, recorded_examples, sampled
 from tests.recording.test_log import chunks_of
-from tests.support import examples, odometry, on_its_key, submap
+from tests.support import odometry, submap
 
 SECOND = 10**9
-
-
-def sampled(channel: c.Channel, name: str, message: m.Message, counter: int) -> Sample:
-    key = Outgoing(channel, name, message).key
-    return Sample(key, encoded(message), message.stamp_ns, 10**18 + counter, counter)
 
 
 def drive(robot: str, seconds: int) -> list[Sample]:
@@ -54,12 +50,6 @@ def drive(robot: str, seconds: int) -> list[Sample]:
             said = msgspec.structs.replace(submap(i // 10, robot), **times)
             out.append(sampled(c.SUBMAP, robot, said, i // 10))
     return out
-
-
-def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
-    with Recorder(path, "t", metadata) as recorder:
-        recorder.write(samples)
-    return open_log(path)
 
 
 def found(log: Log) -> list[str]:
@@ -576,20 +566,13 @@ def test_numbers_read_back_from_csv_are_the_same(
 
 
 def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: Path) -> None:
-    by_class = {
-        kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds
-    }
-    kept = [on_its_key(by_class[type(x)], "alpha", x) for x in examples() if type(x) in by_class]
-    samples = [
-        sampled(by_class[type(x)], getattr(x, "robot", "alpha"), x, i) for i, x in enumerate(kept)
-    ]
-    samples += [
-        msgspec.structs.replace(samples[0], payload=b"\x90"),
-        Sample("view/scene", b"?", 0, 0, 0),
-    ]
+    kept = recorded_examples()
+    samples = [sample for _, _, sample in kept]
+    samples.append(msgspec.structs.replace(samples[0], payload=b"\x90"))
+    samples.append(Sample("view/scene", b"?", 0, 0, 0))
     exported = export_csv(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1
-    assert {path.stem for path in exported.rows} == {table_of(by_class[type(x)], x) for x in kept}
+    assert {path.stem for path in exported.rows} == {table_of(of, x) for of, x, _ in kept}
     for path, count in exported.rows.items():
         rows = rows_of(path)
         assert len(rows) == count

@@ -66,9 +66,7 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path: Path, use: str) -> None:
     robot.close()  # nobody is there to take the stream
     (stream,) = folder(FolderWorld(path=str(tmp_path / "set")), [RobotConfig(id="r1")]).streams
     world = WorldNode(
-        world_of(stream),
-        frozenset(),
-        build.configuration(node="world", incarnation=0),
+        world_of(stream), frozenset(), build.configuration(node="world", incarnation=0)
     )
     out = [each.message for _ in range(4) for each in world.publish(0.0)]
     expected = [each for each in out if isinstance(each, m.Measurement)]

@@ -108,11 +108,7 @@ async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, ob
 
 
 @pytest.mark.parametrize(
-    ("estimator", "rule"),
-    [
-        ("hybrid-thesis", "kalman-per-axis"),
-        ("dead-reckoning", "batch"),
-    ],
+    ("estimator", "rule"), [("hybrid-thesis", "kalman-per-axis"), ("dead-reckoning", "batch")]
 )
 async def test_every_kind_of_pair_ends_with_the_bytes_of_a_team_in_memory(
     estimator: str, rule: str, team: Processes

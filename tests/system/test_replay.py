@@ -75,8 +75,7 @@ async def test_a_replay_can_be_its_own_router_and_waits_for_who_listens(
     launched: Launched, team: Processes
 ) -> None:
     replay = await team.start(
-        *("replay", launched.log, "--speed", "max"),
-        *("--listen", "tcp/127.0.0.1:0", "--wait", "8"),
+        *("replay", launched.log, "--speed", "max"), *("--listen", "tcp/127.0.0.1:0", "--wait", "8")
     )
     await replay.says("listening at tcp/")
     await replay.says("\n")

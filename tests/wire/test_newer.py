@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from team.wire import messages as m
 from team.wire.newer import further, is_newer_map, is_newer_prior, later_end
 from tests import build
-from tests.support import examples
+from tests.support import example
 
-PRIOR = next(each for each in examples() if isinstance(each, m.Prior))
-MAP = next(each for each in examples() if isinstance(each, m.FusedMap))
+PRIOR = example(m.Prior)
+MAP = example(m.FusedMap)
 vectors = st.dictionaries(st.sampled_from(["r1", "r2", "r3"]), st.integers(0, 3))
 
 
@@ -87,13 +87,7 @@ def test_progress_never_goes_back(said: list[m.Progress]) -> None:
 
 
 def test_an_older_end_does_not_take_measurements_back() -> None:
-    first = m.End(
-        stamp_ns=1,
-        streams=(
-            m.StreamEnd(robot="r1", incarnation=1, measurements=90),
-            m.StreamEnd(robot="r2", incarnation=1, measurements=40),
-        ),
-    )
+    first = build.end(1, r1=90, r2=40)
     later = m.End(
         stamp_ns=2,
         streams=(

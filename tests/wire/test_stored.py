@@ -10,13 +10,11 @@ from team.wire.codec import WireError, encoded
 from team.wire.zenoh import stored as stored_module
 from team.wire.zenoh.stored import StoredMessages
 from tests import build
-from tests.support import examples
+from tests.support import example
 
 S = 10**9
-FINAL = msgspec.structs.replace(
-    next(e for e in examples() if isinstance(e, m.FusedMap)), final=True
-)
-CONCLUDED = next(e for e in examples() if isinstance(e, m.Concluded))
+FINAL = example(m.FusedMap)
+CONCLUDED = example(m.Concluded)
 GIVEN_UP = build.given_up(reason="lost")
 
 
@@ -134,7 +132,7 @@ def test_every_order_of_an_operator_is_stored_with_its_signature() -> None:
     assert {c for c in ch.CHANNELS if c.template.startswith("operator/")} == set(ch.ORDERS)
     stored = StoredMessages()
     for channel in ch.ORDERS:
-        message = next(e for e in examples() if isinstance(e, channel.message))
+        message = example(channel.message)
         if isinstance(message, m.Withdrawal | m.TeamEnd):
             message = msgspec.structs.replace(message, by="operator")
         name = getattr(message, "robot", getattr(message, "node", ""))

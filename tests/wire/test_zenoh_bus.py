@@ -28,7 +28,7 @@ from tests import build
 from tests.support import (
     ROOT,
     Link,
-    examples,
+    example,
     nobody_listens,
     odometry,
     received,
@@ -37,9 +37,7 @@ from tests.support import (
 )
 from tests.trials.late_joins import storm
 
-FINAL = msgspec.structs.replace(
-    next(message for message in examples() if isinstance(message, m.FusedMap)), final=True
-)
+FINAL = example(m.FusedMap)
 
 
 @pytest.fixture
@@ -419,9 +417,7 @@ def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
         assert len(set(asked)) == 15, "each is asked in its turn"
 
 
-def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(
-    endpoint: str,
-) -> None:
+def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(endpoint: str) -> None:
     with client(endpoint, 5.0, None) as session:
         source = zenoh.SourceInfo(session.declare_publisher("any").id, 0)
         recovery = Recovery(session, "team/t/", lambda item: None)

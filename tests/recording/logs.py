@@ -1,0 +1,30 @@
+"""Logs of samples for the tests of recorder, reader and tools."""
+
+from pathlib import Path
+
+from team.recording.reader import Log, open_log
+from team.recording.recorder import Recorder
+from team.wire import channels as c
+from team.wire import messages as m
+from team.wire.bus import Outgoing, Sample
+from team.wire.codec import encoded
+from tests.support import examples, on_its_key
+
+
+def sampled(channel: c.Channel, name: str, message: m.Message, counter: int = 0) -> Sample:
+    key = Outgoing(channel, name, message).key
+    return Sample(key, encoded(message), message.stamp_ns, 10**18 + counter, counter)
+
+
+def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
+    """A complete log of these samples, of the team `t`."""
+    with Recorder(path, "t", metadata) as recorder:
+        recorder.write(samples)
+    return open_log(path)
+
+
+def recorded_examples() -> list[tuple[c.Channel, m.Message, Sample]]:
+    """An example of every message that a log holds, with its channel and its sample."""
+    of = {kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds}
+    kept = [(of[type(x)], on_its_key(of[type(x)], "alpha", x)) for x in examples() if type(x) in of]
+    return [(channel, x, sampled(channel, "alpha", x, i)) for i, (channel, x) in enumerate(kept)]
