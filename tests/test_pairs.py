@@ -31,7 +31,7 @@ def test_each_method_is_in_a_pair_and_pairs_name_rows_only() -> None:
 
 def test_no_kernel_hangs_on_the_methods_that_the_table_names() -> None:
     """Else every edit of an estimator would compile every kernel anew."""
-    kernel = "team.estimation.hybrid_slam.fastslam_kernel"
+    kernel = "team.estimation.hybrid_slam.consensus_kernel"
     reached = sources_of(kernel, ("team",), places=False)
     assert "team.estimation.models" in reached
     assert not any(name.startswith(("team.robot", "team.wire")) for name in reached)

@@ -1,7 +1,7 @@
 """Build the native core: the backend that pyproject.toml names, and the build of a source tree.
 
     python team/core/building/backend.py             build into team/core
-    python team/core/building/backend.py --checked   with sanitizers, into build/core-checked
+    python team/core/building/backend.py --checked   with sanitizers (TEAMSLAM_CORE=checked)
 
 Wheels are scikit-build-core's. An editable install builds into the source tree and adds that tree
 to the path, nothing else: no import hook stands before a second checkout on PYTHONPATH.
@@ -69,7 +69,7 @@ def compiler() -> Iterator[list[str]]:
 
 
 def build_in_place(*, checked: bool = False) -> None:
-    """Build the core of this source tree into team/core, or a checked one into its build folder."""
+    """Build the core of this source tree into team/core, or a checked one beside it."""
     folder = ROOT / "build" / ("core-checked" if checked else f"core-{sys.version_info[1]}")
     with compiler() as options:
         _cmake(
@@ -79,8 +79,6 @@ def build_in_place(*, checked: bool = False) -> None:
             *options,
         )
         _cmake("--build", str(folder))
-    if checked:
-        return
     for built in sorted(folder.glob(f"{MODULES}.so")):
         # Replaced, not rewritten: a process may have the old one in memory.
         new = SOURCES / f"{built.name}.new"

@@ -1,7 +1,7 @@
 // The extension module: every array that crosses is checked once, then C++ trusts it.
 //
-// nanobind checks type, dimensions and layout (and copies where only the layout differs); the
-// functions here check lengths and finiteness.
+// nanobind checks type, dimensions and layout; it converts numbers, and copies where only the layout
+// differs, but never converts ids, which would wrap. The functions here check lengths and finiteness.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
@@ -20,6 +20,24 @@ using namespace teamslam;
 namespace elementary = teamslam::elementary;
 using window::Gaussian, window::Particles, window::Rows, window::Scan, window::Window;
 
+// Numbers as an array of numpy.int64: nanobind makes one of "long long", which is another type to
+// whatever looks at the type and not at its size.
+struct Places {
+  std::vector<std::int64_t> numbers;
+};
+
+template <>
+struct nanobind::detail::type_caster<Places> {
+  using Array = nb::ndarray<nb::numpy, std::int64_t, nb::ndim<1>, nb::c_contig>;
+  NB_TYPE_CASTER(Places, make_caster<Array>::Name)
+
+  static handle from_cpp(Places&& places, rv_policy, cleanup_list*) noexcept {
+    auto* kept = new std::vector<std::int64_t>(std::move(places.numbers));
+    capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<std::int64_t>*>(p); });
+    return nb::cast(Array(kept->data(), {kept->size()}, owner)).attr("view")("int64").release();
+  }
+};
+
 namespace {
 
 // Arrays from Python, and arrays to Python.
@@ -35,7 +53,6 @@ using MadeNumbers = Made<double, nb::ndim<1>>;
 using MadeTable = Made<double, nb::ndim<2>>;
 using MadeStack = Made<double, nb::ndim<3>>;
 using MadeIds = Made<std::uint32_t, nb::ndim<1>>;
-using MadePlaces = Made<std::int64_t, nb::ndim<1>>;
 using MadeGaussian = std::tuple<MadeIds, MadeNumbers, MadeTable, int>;
 using MadeParticles = std::tuple<MadeTable, MadeNumbers, MadeIds, MadeStack, MadeStack>;
 
@@ -269,8 +286,7 @@ void bind_particles(nb::module_& m) {
       [](const Numbers& log_weights, double uniform) {
         check(uniform >= 0.0 && uniform < 1.0, "uniform must be in [0, 1)");
         const std::vector<std::size_t> parents = window::systematic_parents(log_weights_of(log_weights), uniform);
-        const std::size_t n = parents.size();
-        return made<std::int64_t, nb::ndim<1>>(std::vector<std::int64_t>(parents.begin(), parents.end()), {n});
+        return Places{{parents.begin(), parents.end()}};
       },
       "log_weights"_a, "uniform"_a,
       "Resample systematically: particle i is the parent of floor(M w_i) or ceil(M w_i) particles.\n\n"
@@ -330,7 +346,7 @@ void bind_particles(nb::module_& m) {
                                           path_of(paths, means.shape(0)), sights, noise_of(noise));
         return std::tuple(made_landmarks(solved, 0, 2), made_landmarks(solved, 2, 3));
       },
-      "ids"_a, "means"_a, "covariances"_a, "paths"_a, "keyframes"_a, "seen"_a, "measurements"_a, "own"_a, "noise"_a,
+      "ids"_a.noconvert(), "means"_a, "covariances"_a, "paths"_a, "keyframes"_a.noconvert(), "seen"_a.noconvert(), "measurements"_a, "own"_a, "noise"_a,
       "Solve each landmark of each particle by Gauss-Newton over its measurements, given the particle's path.\n\n"
       "ids: of the L landmarks, whose means and covariances are the starts. Of each of N measurements\n"
       "keyframes is its place in the paths (K, M, 3), and seen its landmark. Returns means and covariances.");
@@ -373,7 +389,7 @@ void bind_window(nb::module_& m) {
           "particles"_a, "noise"_a, "improved"_a = true, "mount"_a = std::array<double, 3>{0.0, 0.0, 0.0},
           "Open a window: every particle exactly at zero, without landmarks or measurements.\n\n"
           "noise: (range_variance, range_per_m2, range_white, bearing_variance, bearing_white), as of\n"
-          "`sensitivity_kernel.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base.")
+          "`fastslam.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base.")
       .def_static(
           "of_particles",
           [](const Table& poses, const Numbers& log_weights, const Ids& ids, const Stack& means, const Stack& covariances,
@@ -383,7 +399,7 @@ void bind_window(nb::module_& m) {
             opened.replace(std::move(particles), Rows(poses.shape(0)));
             return opened;
           },
-          "poses"_a, "log_weights"_a, "ids"_a, "means"_a, "covariances"_a, "noise"_a, "improved"_a = true,
+          "poses"_a, "log_weights"_a, "ids"_a.noconvert(), "means"_a, "covariances"_a, "noise"_a, "improved"_a = true,
           "Make a window whose particles are these, without a keyframe.")
       .def("copy", [](const Window& self) { return Window(self); }, "Copy the window.")
       .def(
@@ -394,10 +410,20 @@ void bind_window(nb::module_& m) {
             return self.advance(increment_of(motion, covariance), scan_of(ids, ranges, bearings, own),
                                 uniform.value_or(window::NO_RESAMPLING), normals_of(normals, self.settings().particles));
           },
-          "motion"_a, "covariance"_a, "ids"_a, "ranges"_a, "bearings"_a, "own"_a, "uniform"_a.none(), "normals"_a,
+          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "uniform"_a.none(), "normals"_a,
           "Take a keyframe: the motion since the last one, then its measurements (there may be none).\n\n"
           "own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are\n"
           "resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3).\n"
+          "Raises MotionError, and leaves the window as it was.")
+      .def(
+          "step",
+          [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
+             const Numbers& bearings, const Table& own, const Table& normals) {
+            return self.step(increment_of(motion, covariance), scan_of(ids, ranges, bearings, own),
+                             normals_of(normals, self.settings().particles));
+          },
+          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "normals"_a,
+          "Take a keyframe as `advance` does, without resampling and innovation; returns the log evidence.\n\n"
           "Raises MotionError, and leaves the window as it was.")
       .def(
           "move",
@@ -416,7 +442,7 @@ void bind_window(nb::module_& m) {
             return std::tuple(found.squared, made_numbers(std::move(found.error)),
                               made<double, nb::ndim<2>>(std::move(found.S), {n, n}));
           },
-          "motion"_a, "covariance"_a, "ids"_a, "ranges"_a, "bearings"_a, "own"_a,
+          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
           "Predict the measurements of known landmarks; returns (v' inv(S) v, v, S), v = z - h. Raises MotionError.")
       .def("close", [](const Window& self) { return made_gaussian(self.close()); },
            "Match moments with the landmarks solved again along the paths: the submap of the window.\n\n"
@@ -442,6 +468,8 @@ void bind_window(nb::module_& m) {
           },
           "paths"_a, "log_weights"_a, "means"_a, "covariances"_a,
           "Replace the paths (K, M, 3), with the particles at their ends, the weights and the landmarks.")
+      .def("of_base", &Window::of_base,
+           "Copy the window as one of the base: poses and landmarks in the frame of the base's start.")
       .def("particles", [](const Window& self) { return made_particles(self.particles()); },
            "Copy (poses (M, 3), log_weights (M,), ids (L,), means (M, L, 2), covariances (M, L, 3)).")
       .def(
@@ -486,7 +514,7 @@ void bind_window(nb::module_& m) {
               measurements.insert(measurements.end(), {each.range, each.bearing});
               if (has_claims) own.insert(own.end(), {each.claim.rr, each.claim.rb, each.claim.bb, each.claim.form});
             }
-            return std::tuple(made<std::int64_t, nb::ndim<1>>(std::move(keyframes), {n}),
+            return std::tuple(Places{std::move(keyframes)},
                               made<std::uint32_t, nb::ndim<1>>(std::move(ids), {n}),
                               made<double, nb::ndim<2>>(std::move(measurements), {n, 2}),
                               made<double, nb::ndim<2>>(std::move(own), {n, has_claims ? 4u : 0u}));
@@ -500,6 +528,13 @@ void bind_window(nb::module_& m) {
             return made<std::uint32_t, nb::ndim<1>>(std::vector<std::uint32_t>(ids), {ids.size()});
           },
           "Copy the landmarks' numbers in order of first sight.")
+      .def(
+          "nodes",
+          [](const Window& self) {
+            const auto nodes = self.nodes();
+            return Places{{nodes.begin(), nodes.end()}};
+          },
+          "Copy the keyframe of each pose node.")
       .def_prop_ro("landmarks", [](const Window& self) { return self.particles().landmarks(); }, "Number of landmarks.")
       .def_prop_ro("keyframes", &Window::keyframes, "Number of keyframes.")
       .def_prop_ro("effective", &Window::effective, "Number of effective particles after the last keyframe.");
@@ -512,6 +547,7 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   m.attr("level") = TEAMSLAM_LEVEL;
   m.attr("digest") = TEAMSLAM_DIGEST;
   m.attr("width") = pack::WIDTH;
+  m.attr("POSE_JITTER") = nb::make_tuple(window::POSE_JITTER[0], window::POSE_JITTER[1], window::POSE_JITTER[2]);
   nb::exception<NotFiniteError>(m, "NotFiniteError", PyExc_ValueError);
   nb::exception<window::MotionError>(m, "MotionError", PyExc_ValueError);
   bind_elementary(m);

@@ -13,6 +13,31 @@ Lower3 factor_of(const Increment& increment) {
   return L;
 }
 
+// Poses of the sensor become those of the base, in place; three rows each.
+void move_poses(const se2::Mount& mount, Rows& poses) {
+  for (std::size_t j = 0; j < poses.rows(); j += 3)
+    for (std::size_t i = 0; i < poses.stride(); i++) {
+      const auto [x, y, heading] = mount.base_pose({poses[j][i], poses[j + 1][i], poses[j + 2][i]});
+      poses[j][i] = x;
+      poses[j + 1][i] = y;
+      poses[j + 2][i] = heading;
+    }
+}
+
+// Landmarks from the sensor's start become those from the base's, in place; five rows each.
+void move_landmarks(const se2::Mount& mount, Rows& map) {
+  for (std::size_t j = 0; j < map.rows(); j += 5)
+    for (std::size_t i = 0; i < map.stride(); i++) {
+      const auto [x, y] = mount.base_point({map[j][i], map[j + 1][i]});
+      const auto [xx, xy, yy] = mount.base_spread({map[j + 2][i], map[j + 3][i], map[j + 4][i]});
+      map[j][i] = x;
+      map[j + 1][i] = y;
+      map[j + 2][i] = xx;
+      map[j + 3][i] = xy;
+      map[j + 4][i] = yy;
+    }
+}
+
 }  // namespace
 
 Window::Window(const Settings& settings)
@@ -46,15 +71,24 @@ Step Window::advance(const Increment& increment, const Scan& scan, double unifor
   const std::vector<Reading> readings = readings_of(scan);
   const Innovation innovation = innovation_of(particles_, increment.mean, L, slots_of(scan), readings);
   if (uniform >= 0.0) particles_.resample(uniform, path_);
-  const std::vector<Sighting> found = particles_.find(scan.ids, readings);
-  particles_.step(increment.mean, L, settings_.is_improved, found, normals);
+  const double log_evidence = take(increment.mean, L, scan, readings, normals);
+  return {effective_, log_evidence, innovation.squared, innovation.error.size()};
+}
+
+double Window::step(const Increment& increment, const Scan& scan, std::span<const double> normals) {
+  return take(increment.mean, factor_of(increment), scan, readings_of(scan), normals);
+}
+
+double Window::take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
+                    std::span<const double> normals) {
+  particles_.step(motion, L, settings_.is_improved, particles_.find(scan.ids, readings), normals);
   const std::span<double> log_weights(particles_.log_weights.data(), particles_.count());
   const double log_evidence = normalise(log_weights);
   effective_ = effective_sample_size(log_weights);
   for (std::size_t k = 0; k < scan.ids.size(); k++)
     sights_.push_back({scan.ids[k], keyframes(), scan.ranges[k], scan.bearings[k], scan.claim(k)});
   path_.append(particles_.pose);
-  return {effective_, log_evidence, innovation.squared, innovation.error.size()};
+  return log_evidence;
 }
 
 void Window::move(const Increment& increment, std::span<const double> normals) {
@@ -75,6 +109,17 @@ void Window::replace(Particles particles, Rows path) {
   effective_ = effective_sample_size({particles_.log_weights.data(), particles_.count()});
 }
 
+Window Window::of_base() const {
+  Window based = *this;
+  if (settings_.mount.is_mounted()) {
+    move_poses(settings_.mount, based.particles_.pose);
+    move_poses(settings_.mount, based.path_);
+    move_landmarks(settings_.mount, based.particles_.map);
+    based.settings_.mount = {};
+  }
+  return based;
+}
+
 Rows Window::solved_landmarks() const {
   return landmarks_along_paths(particles_.ids, particles_.map, path_, sights_, settings_.noise);
 }
@@ -89,25 +134,9 @@ Gaussian Window::gaussian(bool with_nodes, Rows landmarks) const {
       for (std::size_t k = 0; k < 3; k++) node.set(k, path_[3 * keyframe + k], 1);
       poses.append(node);
     }
-  const se2::Mount& mount = settings_.mount;
-  if (mount.is_mounted()) {
-    for (std::size_t j = 0; j < poses.rows(); j += 3)
-      for (std::size_t i = 0; i < poses.stride(); i++) {
-        const auto [x, y, heading] = mount.base_pose({poses[j][i], poses[j + 1][i], poses[j + 2][i]});
-        poses[j][i] = x;
-        poses[j + 1][i] = y;
-        poses[j + 2][i] = heading;
-      }
-    for (std::size_t j = 0; j < landmarks.rows(); j += 5)
-      for (std::size_t i = 0; i < landmarks.stride(); i++) {
-        const auto [x, y] = mount.base_point({landmarks[j][i], landmarks[j + 1][i]});
-        const auto [xx, xy, yy] = mount.base_spread({landmarks[j + 2][i], landmarks[j + 3][i], landmarks[j + 4][i]});
-        landmarks[j][i] = x;
-        landmarks[j + 1][i] = y;
-        landmarks[j + 2][i] = xx;
-        landmarks[j + 3][i] = xy;
-        landmarks[j + 4][i] = yy;
-      }
+  if (settings_.mount.is_mounted()) {
+    move_poses(settings_.mount, poses);
+    move_landmarks(settings_.mount, landmarks);
   }
   return submap_moments(poses, {particles_.log_weights.data(), particles_.count()}, particles_.ids, landmarks);
 }

@@ -57,6 +57,9 @@ class Window {
   // and the step of the particles. Throws MotionError, and is then as it was.
   Step advance(const Increment& increment, const Scan& scan, double uniform, std::span<const double> normals);
 
+  // A keyframe without resampling, whose innovation is not asked for; returns its log evidence.
+  double step(const Increment& increment, const Scan& scan, std::span<const double> normals);
+
   // Moves the particles without a keyframe; the weights stay. Throws MotionError.
   void move(const Increment& increment, std::span<const double> normals);
 
@@ -77,6 +80,9 @@ class Window {
   // The landmarks of each particle solved over all measurements, rows in order of first sight.
   Rows solved_landmarks() const;
 
+  // The window as one of the base: poses and landmarks in the frame of the base's start.
+  Window of_base() const;
+
   // Replaces the paths of the particles, and what follows from them.
   void replace(Particles particles, Rows path);
 
@@ -90,6 +96,8 @@ class Window {
 
  private:
   Gaussian gaussian(bool with_nodes, Rows landmarks) const;
+  double take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
+              std::span<const double> normals);
   std::vector<Reading> readings_of(const Scan& scan) const;
   std::vector<std::size_t> slots_of(const Scan& scan) const;
 
