@@ -40,7 +40,7 @@ if not TYPE_CHECKING:
         )
 
 digest, level, width = _core.digest, _core.level, _core.width
-POSE_JITTER: tuple[float, float, float] = _core.POSE_JITTER
+POSE_JITTER = _core.POSE_JITTER
 MotionError, NotFiniteError = _core.MotionError, _core.NotFiniteError
 Step, Window = _core.Step, _core.Window
 atan2, exp, expm1, hypot = _core.atan2, _core.exp, _core.expm1, _core.hypot

@@ -14,7 +14,7 @@ digest: str
 
 width: int
 
-POSE_JITTER: tuple
+POSE_JITTER: tuple[float, ...]
 
 class NotFiniteError(ValueError):
     pass

@@ -182,6 +182,13 @@ def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path() -
             core.landmarks_along_paths(*solved, wrong, seen, measurements, own, NOISE)
 
 
+@pytest.mark.parametrize("count", [1, 7, 8, 127, 128, 129, 1000, 4099])
+def test_the_sum_of_squares_in_the_sample_factor_has_the_order_of_numpy(count: int) -> None:
+    weights = RNG.dirichlet(np.ones(count))
+    squares = float(np.add.reduce(weights * weights))
+    assert core.sample_factor(weights) == 1.0 / (1.0 - 5.0 * min(squares, 0.1))
+
+
 @settings(deadline=None, max_examples=60)
 @given(
     st.integers(1, 40), st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([NOISE, CONSTANT])

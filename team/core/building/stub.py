@@ -27,7 +27,7 @@ def made_stub() -> str:
     made.put(made.module)
     sys.path.remove(str(FOLDER))
     text = ARRAY.sub(r"\1", made.get()).replace("from typing import Annotated\n", "")
-    return VALUE.sub(r"\1", text)
+    return VALUE.sub(r"\1", text).replace(": tuple\n", ": tuple[float, ...]\n")
 
 
 if __name__ == "__main__":
