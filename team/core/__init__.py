@@ -6,12 +6,9 @@ environment variable TEAMSLAM_CORE (base or avx2) overrides the choice. docs/cor
 """
 
 import os
+import sys
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from team.core import _core_base as _core
 
 
 def _levels() -> tuple[str, ...]:
@@ -26,27 +23,74 @@ def _levels() -> tuple[str, ...]:
     return ("avx2", "base") if "avx2" in flags else ("base",)
 
 
-if not TYPE_CHECKING:
-    for _level in _levels():
+def _import_library() -> None:
+    """Import the library of the best level as `team.core._core`."""
+    for each in _levels():
         try:
-            _core = import_module(f"team.core._core_{_level}")
+            sys.modules[f"{__name__}._core"] = import_module(f"{__name__}._core_{each}")
         except ModuleNotFoundError:
             continue
-        break
-    else:
-        raise ImportError(
-            "the native core of team is not built: run `make setup`, or"
-            " `python team/core/building/backend.py` in a source tree"
-        )
+        return
+    raise ImportError(
+        "the native core of team is not built: run `make setup`, or"
+        " `python team/core/building/backend.py` in a source tree"
+    )
 
-digest, level, width = _core.digest, _core.level, _core.width
-POSE_JITTER = _core.POSE_JITTER
-MotionError, NotFiniteError = _core.MotionError, _core.NotFiniteError
-Step, Window = _core.Step, _core.Window
-atan2, exp, expm1, hypot = _core.atan2, _core.exp, _core.expm1, _core.hypot
-log, log1p, sin_and_cos = _core.log, _core.log1p, _core.sin_and_cos
-effective_sample_size, normalise = _core.effective_sample_size, _core.normalise
-systematic_parents, mean_direction = _core.systematic_parents, _core.mean_direction
-sample_factor, on_group, moments = _core.sample_factor, _core.on_group, _core.moments
-landmarks_along_paths = _core.landmarks_along_paths
-normalised_square, semidefinite_factor = _core.normalised_square, _core.semidefinite_factor
+
+_import_library()
+
+from team.core._core import (  # noqa: E402 - the level is chosen before
+    POSE_JITTER,
+    MotionError,
+    NotFiniteError,
+    Step,
+    Window,
+    atan2,
+    digest,
+    effective_sample_size,
+    exp,
+    expm1,
+    hypot,
+    landmarks_along_paths,
+    level,
+    log,
+    log1p,
+    mean_direction,
+    moments,
+    normalise,
+    normalised_square,
+    on_group,
+    sample_factor,
+    semidefinite_factor,
+    sin_and_cos,
+    systematic_parents,
+    width,
+)
+
+__all__ = [
+    "POSE_JITTER",
+    "MotionError",
+    "NotFiniteError",
+    "Step",
+    "Window",
+    "atan2",
+    "digest",
+    "effective_sample_size",
+    "exp",
+    "expm1",
+    "hypot",
+    "landmarks_along_paths",
+    "level",
+    "log",
+    "log1p",
+    "mean_direction",
+    "moments",
+    "normalise",
+    "normalised_square",
+    "on_group",
+    "sample_factor",
+    "semidefinite_factor",
+    "sin_and_cos",
+    "systematic_parents",
+    "width",
+]

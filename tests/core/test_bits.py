@@ -91,7 +91,7 @@ def test_the_type_stub_is_that_of_the_library() -> None:
         [sys.executable, "-c", script, FOLDER / "building"],
         check=True, capture_output=True, text=True,
     )  # fmt: skip
-    assert made.stdout == (FOLDER / "_core_base.pyi").read_text()
+    assert made.stdout == (FOLDER / "_core.pyi").read_text()
 
 
 def test_the_level_can_be_chosen() -> None:

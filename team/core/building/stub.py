@@ -1,4 +1,4 @@
-"""Write the type stub of the core, team/core/_core_base.pyi, from the built library.
+"""Write the type stub of the core, team/core/_core.pyi, from the built library.
 
     python team/core/building/stub.py
 
@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1]
-STUB = FOLDER / "_core_base.pyi"
+STUB, LIBRARY = FOLDER / "_core.pyi", "_core_base"
 ARRAY = re.compile(r"Annotated\[(NDArray\[numpy\.\w+\]), dict\([^\[\]]*?\)\]")
 
 VALUE = re.compile(r"^(\w+: .*?) = .*$", re.M)
@@ -23,7 +23,7 @@ def made_stub() -> str:
     from nanobind.stubgen import StubGen
 
     sys.path.insert(0, str(FOLDER))
-    made = StubGen(module=import_module(STUB.stem), quiet=True)
+    made = StubGen(module=import_module(LIBRARY), quiet=True)
     made.put(made.module)
     sys.path.remove(str(FOLDER))
     text = ARRAY.sub(r"\1", made.get()).replace("from typing import Annotated\n", "")
