@@ -24,7 +24,7 @@ LISTED := install --require-hashes --no-deps --requirement
 # The core is built without build isolation, by these.
 BUILDING := cmake nanobind ninja scikit-build-core
 CORE := $(wildcard team/core/src/* team/core/building/* team/core/CMakeLists.txt)
-COMPILER := $(shell command -v c++ || command -v g++ || command -v clang++)
+COMPILER := $(if $(filter environment,$(origin CXX)),$(CXX),$(shell command -v c++ || command -v g++ || command -v clang++))
 NEEDS_ZIG = $(if $(COMPILER),,@echo "No C++ compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt)
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
@@ -74,7 +74,7 @@ bench: $(VENV)/.dev $(VENV)/.core
 # The pictures are made once; `make clean` lets them be made anew.
 PICTURES := docs/generated
 RUNS := run hidden peers
-docs: $(VENV)/.dev $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
+docs: $(VENV)/.dev $(VENV)/.core $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
   $(PICTURES)/benchmarks.png
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
 	@echo "docs/_build/site/index.html"

@@ -37,6 +37,11 @@ def log1p(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
 def expm1(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """E to the power of each x, less 1."""
 
+def normal_below(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    The probability that a standard normal variable stays below each x, to 1e-15.
+    """
+
 def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """The direction of each (x, y) in [-pi, pi]."""
 

@@ -200,4 +200,18 @@ inline double hypot(double x, double y) {
   return pack::sqrt(ax * ax + ay * ay);
 }
 
+// The probability that a standard normal variable stays below x: ½ + φ(x) (x + x³/3 + x⁵/15 + …),
+// Marsaglia 2004; 0 and 1 beyond ±9.
+inline double normal_below(double x) {
+  if (!(std::fabs(x) < 9.0)) return x != x ? x : x > 0.0 ? 1.0 : 0.0;
+  double term = x, total = x, k = 1.0;
+  while (std::fabs(term) > 1e-17 * std::fabs(total)) {
+    k += 2.0;
+    term *= x * x / k;
+    total += term;
+  }
+  const double density = exp(-0.5 * x * x) / pack::sqrt(TWO_PI);
+  return min(max(0.5 + density * total, 0.0), 1.0);
+}
+
 }  // namespace teamslam::elementary

@@ -261,6 +261,9 @@ void bind_elementary(nb::module_& m) {
   m.def("log", [](const Numbers& x) { return each_of(x, elementary::log); }, "x"_a, "The natural logarithm of each x.");
   m.def("log1p", [](const Numbers& x) { return each_of(x, elementary::log1p); }, "x"_a, "The logarithm of each 1 + x.");
   m.def("expm1", [](const Numbers& x) { return each_of(x, elementary::expm1); }, "x"_a, "E to the power of each x, less 1.");
+  m.def(
+      "normal_below", [](const Numbers& x) { return each_of(x, elementary::normal_below); }, "x"_a,
+      "The probability that a standard normal variable stays below each x, to 1e-15.");
   m.def("atan2", [](const Numbers& y, const Numbers& x) { return each_of_both(y, x, elementary::atan2); }, "y"_a, "x"_a,
         "The direction of each (x, y) in [-pi, pi].");
   m.def("hypot", [](const Numbers& x, const Numbers& y) { return each_of_both(x, y, elementary::hypot); }, "x"_a, "y"_a,
