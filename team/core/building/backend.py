@@ -19,8 +19,6 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,49 +34,49 @@ def has_compiler() -> bool:
     return bool(os.environ.get("CXX")) or any(map(shutil.which, COMPILERS))
 
 
-@contextmanager
-def compiler() -> Iterator[list[str]]:
+def compiler_options() -> list[str]:
     """Options of CMake for the compiler; Zig's, under names that CMake can call, is used if needed.
 
     Zig builds its C++ library anew for each target, so the options name one target for all levels
     and for CMake's trials.
     """
     if has_compiler():
-        yield []
-        return
+        return []
     print(
         "No C++ compiler (c++, g++, clang++) is on the PATH: building with the one of the ziglang"
         " wheel, which takes about four minutes, once.",
         file=sys.stderr,
         flush=True,
     )
-    with tempfile.TemporaryDirectory() as folder:
-        for name in ("c++", "ar", "ranlib"):
-            path = Path(folder) / f"zig-{name}"
-            path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {name} "$@"\n', "utf-8")
-            path.chmod(0o755)
-        target = "-O2 -mcpu=x86_64_v2" if platform.machine() in ("x86_64", "AMD64") else "-O2"
-        yield [
-            f"-DCMAKE_CXX_COMPILER={folder}/zig-c++",
-            f"-DCMAKE_AR={folder}/zig-ar",
-            f"-DCMAKE_RANLIB={folder}/zig-ranlib",
-            f"-DCMAKE_CXX_FLAGS={target}",
-            "-DCMAKE_TRY_COMPILE_TARGET_TYPE=STATIC_LIBRARY",
-            "-DTEAMSLAM_ZIG=ON",
-        ]
+    # At a lasting place: CMake begins anew where the compiler is another one.
+    folder = ROOT / "build" / "zig"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("c++", "ar", "ranlib"):
+        path = folder / f"zig-{name}"
+        path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {name} "$@"\n', "utf-8")
+        path.chmod(0o755)
+    target = "-O2 -mcpu=x86_64_v2" if platform.machine() in ("x86_64", "AMD64") else "-O2"
+    return [
+        f"-DCMAKE_CXX_COMPILER={folder}/zig-c++",
+        f"-DCMAKE_AR={folder}/zig-ar",
+        f"-DCMAKE_RANLIB={folder}/zig-ranlib",
+        f"-DCMAKE_CXX_FLAGS={target}",
+        "-DCMAKE_TRY_COMPILE_TARGET_TYPE=STATIC_LIBRARY",
+        "-DTEAMSLAM_ZIG=ON",
+    ]
 
 
 def build_in_place(*, checked: bool = False) -> None:
     """Build the core of this source tree into team/core, or a checked one beside it."""
-    folder = ROOT / "build" / ("core-checked" if checked else f"core-{sys.version_info[1]}")
-    with compiler() as options:
-        _cmake(
-            *("-S", str(SOURCES), "-B", str(folder), "-G", "Ninja"),
-            f"-DPython_EXECUTABLE={sys.executable}",
-            f"-DTEAMSLAM_CHECKED={'ON' if checked else 'OFF'}",
-            *options,
-        )
-        _cmake("--build", str(folder))
+    kind = "checked" if checked else "own" if has_compiler() else "zig"
+    folder = ROOT / "build" / f"core-{sys.version_info[1]}-{kind}"
+    _cmake(
+        *("-S", str(SOURCES), "-B", str(folder), "-G", "Ninja"),
+        f"-DPython_EXECUTABLE={sys.executable}",
+        f"-DTEAMSLAM_CHECKED={'ON' if checked else 'OFF'}",
+        *compiler_options(),
+    )
+    _cmake("--build", str(folder))
     for built in sorted(folder.glob(f"{MODULES}.so")):
         # Replaced, not rewritten: a process may have the old one in memory.
         new = SOURCES / f"{built.name}.new"
@@ -131,15 +129,11 @@ def build_wheel(
     """Build the wheel."""
     from scikit_build_core import build
 
-    with compiler() as options:
-        settings = dict(config_settings or {}) | {
-            f"cmake.define.{k}": v for k, v in _pairs(options)
-        }
-        return build.build_wheel(directory, settings, metadata_directory)
-
-
-def _pairs(options: list[str]) -> list[tuple[str, str]]:
-    return [tuple(each.removeprefix("-D").split("=", 1)) for each in options]  # type: ignore[misc]
+    settings = dict(config_settings or {})
+    for option in compiler_options():
+        name, _, value = option.removeprefix("-D").partition("=")
+        settings[f"cmake.define.{name}"] = value
+    return build.build_wheel(directory, settings, metadata_directory)
 
 
 def build_editable(
