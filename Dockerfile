@@ -6,13 +6,14 @@
 ARG BASE=python:3.11-slim
 FROM ${BASE} AS build
 WORKDIR /src
-COPY pyproject.toml README.md LICENSE hashes-run.txt ./
+COPY pyproject.toml README.md LICENSE hashes-run.txt hashes-zig.txt ./
 COPY team team
 COPY central central
 COPY sim sim
 # What is installed is known by its hash beforehand, what builds the wheel too.
-RUN sed -n '/^\(pip\|setuptools\)==/,/[^\\]$/p' hashes-run.txt > build.txt \
- && pip install --no-cache-dir --require-hashes --no-deps --requirement build.txt \
+# The slim image has no C++ compiler: that of the ziglang wheel builds the core, for any x86-64.
+RUN sed -n '/^\(pip\|cmake\|nanobind\|ninja\|packaging\|pathspec\|scikit-build-core\)==/,/[^\\]$/p' hashes-run.txt > build.txt \
+ && pip install --no-cache-dir --require-hashes --no-deps --requirement build.txt --requirement hashes-zig.txt \
  && pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /dist .
 
 FROM ${BASE}

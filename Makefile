@@ -1,9 +1,12 @@
-# Needs make and a Python of 3.11 or newer; everything else goes into .venv, at pinned versions.
+# Needs make, a Python of 3.11 or newer and a C++20 compiler (without one that of the ziglang wheel is
+# fetched); everything else goes into .venv, at pinned versions.
 #
 #   make run        a team maps a random place; what `make test` needs is not installed for it
 #   make test       all tests
 #   make bounds     extreme messages at every node, the kernels compiled once more with checked indices
 #   make check      format, lint, strict types, the direction of imports
+#   make core       builds the native core anew where a source of it has changed
+#   make check-core the core's tests in a build with sanitizers and bounds checks
 #   make bench      the benchmarks against their committed baselines; half an hour on a free machine
 #   make docs       the documentation site, docs/_build/site/index.html, and the pictures of its gallery
 #   make setup      what all of these need
@@ -18,6 +21,11 @@ PIP := PIP_BUILD_CONSTRAINT=constraints.txt $(OWN)
 # Every distribution comes with a hash that is known beforehand; what a platform needs beyond the list
 # (none on Linux) is pinned by nothing and still installed by the step after it.
 LISTED := install --require-hashes --no-deps --requirement
+# The core is built without build isolation, by these.
+BUILDING := cmake nanobind ninja scikit-build-core
+CORE := $(wildcard team/core/src/* team/core/building/* team/core/CMakeLists.txt)
+COMPILER := $(if $(filter environment,$(origin CXX)),$(CXX),$(shell command -v c++ || command -v g++ || command -v clang++))
+NEEDS_ZIG = $(if $(COMPILER),,@echo "No C++ compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt)
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 # One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
@@ -32,18 +40,18 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: run test bounds check bench docs setup constraints clean
+.PHONY: run test bounds check core check-core bench docs setup constraints clean
 
-run: $(VENV)/.runtime
+run: $(VENV)/.runtime $(VENV)/.core
 	$(BIN)/teamslam launch waypoints --speed 20
 
 # tests/conftest.py says which worker gets what.
-test: $(VENV)/.dev
+test: $(VENV)/.dev $(VENV)/.core
 	tests/get-chromium
 	$(BIN)/pytest --numprocesses 3
 
 # Of their own folder, since a kernel's cached code does not name the option; some ten minutes at first.
-bounds: $(VENV)/.dev
+bounds: $(VENV)/.dev $(VENV)/.core
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/bounds TEAMSLAM_STORM=20 \
 	  $(BIN)/pytest -o faulthandler_timeout=0 --numprocesses 3 tests/hostile
 
@@ -53,13 +61,20 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.dev
+# The libraries of the sanitizers come before Python, which does not know them; memory that Python
+# keeps until it ends is no leak. CORE_TESTS adds tests of what is above the core.
+check-core: $(VENV)/.dev
+	$(BIN)/python team/core/building/backend.py --checked
+	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libstdc++.so)" \
+	  ASAN_OPTIONS=detect_leaks=0 TEAMSLAM_CORE=checked $(BIN)/pytest tests/core $(CORE_TESTS)
+
+bench: $(VENV)/.dev $(VENV)/.core
 	$(BIN)/python -m benchmarks.every
 
 # The pictures are made once; `make clean` lets them be made anew.
 PICTURES := docs/generated
 RUNS := run hidden peers
-docs: $(VENV)/.dev $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
+docs: $(VENV)/.dev $(VENV)/.core $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
   $(PICTURES)/benchmarks.png
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
 	@echo "docs/_build/site/index.html"
@@ -77,19 +92,22 @@ $(PICTURES)/%.png: examples/%.py | $(VENV)/.dev
 	mkdir -p $(@D)
 	$(BIN)/python $< $@
 
-setup: $(VENV)/.dev
+setup: $(VENV)/.dev $(VENV)/.core
+
+core: $(VENV)/.core
 
 constraints: $(VENV)/.dev
 	@echo '# Made by `make constraints`: every distribution that a run, a test or a check takes.' > $@.new
-	$(BIN)/pip freeze --all --exclude-editable >> $@.new
+	$(BIN)/pip freeze --all --exclude setuptools --exclude-editable >> $@.new
 	mv $@.new $@.txt
 	$(BIN)/python -m venv $(VENV)/uv
 	$(VENV)/uv/bin/python -m pip install --quiet uv
 	$(HASHED) --no-deps constraints.txt --output-file hashes.txt
-	echo setuptools pip | tr ' ' '\n' | $(HASHED) --constraint constraints.txt pyproject.toml - --output-file hashes-run.txt
+	echo ziglang | $(HASHED) --no-deps - --output-file hashes-zig.txt
+	echo $(BUILDING) pip | tr ' ' '\n' | $(HASHED) --constraint constraints.txt pyproject.toml - --output-file hashes-run.txt
 
 clean:
-	rm -rf $(VENV) build dist runs docs/_build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist runs team/core/*.so docs/_build docs/generated *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find team central sim tests benchmarks docs examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A Python that is too old, that is only a launcher's stub or that can not make environments is
@@ -113,11 +131,18 @@ $(VENV)/.python:
 $(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes-run.txt) packages at pinned versions into $(VENV): a minute or two, once"
 	$(PIP) $(LISTED) hashes-run.txt
+	$(NEEDS_ZIG)
 	$(OWN) install --constraint constraints.txt --no-build-isolation --editable .
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes.txt) packages at pinned versions into $(VENV): a minute or two, once"
 	$(PIP) $(LISTED) hashes.txt
+	$(NEEDS_ZIG)
 	$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	touch $(VENV)/.runtime $@
+
+# An install has built the core; it is built again once one of its sources is newer.
+$(VENV)/.core: $(CORE) | $(VENV)/.runtime
+	$(BIN)/python team/core/building/backend.py
+	touch $@

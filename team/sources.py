@@ -47,7 +47,7 @@ def _imported(source: bytes, places: bool) -> tuple[str, ...]:
 
 @lru_cache
 def _path(module: str) -> Path | None:
-    """The source of a module; None if the name is no module's."""
+    """The source of a module; None if the name is no module's, or the module is a library."""
     if not module:
         return None
     loaded = sys.modules.get(module)
@@ -55,4 +55,6 @@ def _path(module: str) -> Path | None:
         spec = find_spec(module) if loaded is None else loaded.__spec__
     except ModuleNotFoundError:
         return None
-    return None if spec is None or not spec.has_location else Path(str(spec.origin))
+    if spec is None or not spec.has_location or not str(spec.origin).endswith(".py"):
+        return None
+    return Path(str(spec.origin))

@@ -57,22 +57,6 @@ def base_points(points: Float[np.ndarray, "*n 2"], mount: Pose) -> Float[np.ndar
     return found
 
 
-def base_covariances(
-    covariances: Float[np.ndarray, "*n 3"], mount: Pose
-) -> Float[np.ndarray, "*n 3"]:
-    """(xx, xy, yy) of points of the sensor's start, along the axes of the base's."""
-    s, c = elementary.sin_and_cos(mount[2])
-    xx, xy, yy = np.moveaxis(covariances, -1, 0)
-    return np.stack(
-        [
-            c * c * xx - 2.0 * c * s * xy + s * s * yy,
-            c * s * (xx - yy) + (c * c - s * s) * xy,
-            s * s * xx + 2.0 * c * s * xy + c * c * yy,
-        ],
-        axis=-1,
-    )
-
-
 def base_shifts(
     shifts: Float[np.ndarray, "*b n 3"], poses: Float[np.ndarray, "n 3"], mount: Pose
 ) -> Float[np.ndarray, "*b n 3"]:

@@ -9,6 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from platform import libc_ver, machine, platform, python_version
 
+from team import core
+
 ESTIMATION = Path(__file__).parents[1] / "estimation"
 _PACKAGES = ("teamslam", "numpy", "scipy", "numba", "llvmlite", "eclipse-zenoh", "msgpack", "mcap")
 
@@ -25,14 +27,17 @@ def provenance() -> dict[str, str]:
         "blas": blas,
         "cpu.name": cpu_name,
         "cpu.features": cpu_features,
+        "core": f"{core.digest[:16]} {core.level}",
         "kernels": kernel_fingerprint(),
         "git.commit": git_commit(),
     }
 
 
 def kernel_fingerprint() -> str:
-    """SHA-256 of all sources of `team.estimation`, in the order of their paths; 16 hex digits."""
-    digest = hashlib.sha256()
+    """SHA-256 of the core's build and of all sources of `team.estimation`, in the order of their
+    paths; 16 hex digits.
+    """
+    digest = hashlib.sha256(core.digest.encode())
     for source in sorted(ESTIMATION.rglob("*.py")):
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
         digest.update(source.read_bytes())

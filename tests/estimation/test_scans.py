@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from team.config import Bounds, Sensor
-from team.estimation.hybrid_slam import blocks
+from team.core import landmarks_along_paths
+from team.estimation.hybrid_slam.fastslam import noise_of
 from team.estimation.hybrid_slam.landmark_kernel import place
-from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
-from team.estimation.hybrid_slam.window import noise_of
 from team.estimation.models import landmark_jacobian, predicted
 from team.estimation.scans import (
     POINT,
@@ -42,12 +41,9 @@ def turn(angle: float) -> np.ndarray:
     return np.array([[c, -s], [s, c]])
 
 
-def seen_from_the_pose(scan) -> tuple[np.ndarray, np.ndarray]:
-    return one_landmark.at(POSE, scan.ranges, scan.bearings, SENSOR, scan.own)
-
-
 def updated(scan) -> tuple[np.ndarray, np.ndarray]:
-    return one_landmark.updated(MEAN, packed(SPREAD), *seen_from_the_pose(scan))[:2]
+    seen = scan.ranges, scan.bearings
+    return one_landmark.updated(MEAN, packed(SPREAD), POSE, seen, SENSOR, scan.own)[:2]
 
 
 def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane() -> None:
@@ -79,9 +75,8 @@ def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
     R = turn(POSE[2])
     np.testing.assert_allclose(mean, POSE[:2] + R @ [2.5, 1.5], atol=1e-12)
     np.testing.assert_allclose(full(P), R @ full(CLAIM) @ R.T, atol=1e-12)
-    block, row = seen_from_the_pose(scan)
-    blocks.place(block, row)
-    for one, other in zip(one_landmark.stored(block), (mean, P), strict=True):
+    placed = one_landmark.placed(POSE, (scan.ranges, scan.bearings), SENSOR, scan.own)
+    for one, other in zip(placed, (mean, P), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-14)
 
 
@@ -104,9 +99,8 @@ def test_points_near_with_much_noise_place_a_landmark_without_a_bias() -> None:
     for form in (POINT, POLAR):
         own = np.column_stack((scan.own[:, :3], np.full(count, form)))
         means, covariances = landmarks_along_paths(
-            truth.reshape(1, 1, 2).copy(), np.array([[[1.0, 0.0, 1.0]]]), np.zeros((1, 1, 3)),
-            np.array([0, count]), np.zeros(count, np.int64), polar, own=own,
-            noise=noise_of(Sensor()),
+            IDS, truth.reshape(1, 1, 2), np.array([[[1.0, 0.0, 1.0]]]), np.zeros((1, 1, 3)),
+            np.zeros(count, np.int64), IDS.repeat(count), polar, own, noise_of(Sensor()),
         )  # fmt: skip
         error = means[0, 0] - truth
         found[form] = error @ np.linalg.inv(full(covariances[0, 0])) @ error
@@ -126,8 +120,8 @@ def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None
     own = np.array([[*packed(each), POLAR] for each in R])
     noise = noise_of(Sensor(range_white=whites[0], bearing_white=whites[1]))
     means, covariances = landmarks_along_paths(
-        truth.reshape(1, 1, 2) + 0.02, np.array([[[1.0, 0.0, 1.0]]]), path[:, None, :],
-        np.array([0, 5]), np.arange(5), z, own=own, noise=noise,
+        IDS, truth.reshape(1, 1, 2) + 0.02, np.array([[[1.0, 0.0, 1.0]]]), path[:, None, :],
+        np.arange(5), IDS.repeat(5), z, own, noise,
     )  # fmt: skip
     share = np.sqrt(np.array(whites))
     W = np.zeros((10, 10))

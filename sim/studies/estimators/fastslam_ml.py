@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team.config import GATE, UNNAMED, Sensor
+from team.core import mean_direction
 from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam.moments import mean_direction
 from team.estimation.models import Increment
 
 

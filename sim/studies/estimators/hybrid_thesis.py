@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import Sensor
+from team.core import moments
 from team.estimation import elementary, elementwise
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment
 
 

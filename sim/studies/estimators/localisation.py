@@ -96,7 +96,7 @@ def filter_step(
         np.column_stack((ranges[mapped], bearings[mapped])),
         variances(sensor),
     )
-    log_weights, _ = fastslam.normalised(log_weights)
+    log_weights, _ = fastslam.normalise(log_weights)
     return replace(state, cloud=replace(cloud, log_weights=log_weights))
 
 

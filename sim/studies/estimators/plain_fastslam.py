@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from team.config import Sensor
+from team.core import moments
 from team.estimation import elementwise
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
-from team.estimation.hybrid_slam.moments import moments
 from team.estimation.models import Increment
 from team.estimation.scans import Own
 

@@ -10,6 +10,7 @@ from importlib import metadata
 from platform import python_version
 from typing import Any
 
+from team import core
 from team.sources import sources_of
 
 ROOTS = ("team", "central", "sim")
@@ -52,8 +53,8 @@ class Task:
 
 @lru_cache
 def program_of(module: str) -> str:
-    """Digest of the libraries' versions and of every source of ours that a module imports, directly
-    or not.
+    """Digest of the libraries' versions, of every source of ours that a module imports, directly or
+    not, and of the native core.
     """
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
@@ -61,6 +62,7 @@ def program_of(module: str) -> str:
         digest.update(f"{library} {_version(library)}\n".encode())
     for name, source in sorted(sources_of(module, ROOTS).items()):
         digest.update(f"{name}\n".encode() + source)
+    digest.update(core.digest.encode())
     return digest.hexdigest()
 
 

@@ -4,22 +4,39 @@ p(path, landmarks | z) = p(path | z) Π p(landmark | path, z): the first factor 
 particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
 """
 
-import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team import core
 from team.config import Sensor
+from team.core import effective_sample_size, normalise, systematic_parents
 from team.estimation import elementary
-from team.estimation.compiled import compiled
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam.blocks import measured
-from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor, slots_of, step
-from team.estimation.models import Increment, variances
+from team.estimation.models import Increment
 from team.estimation.scans import Own, unclaimed
+
+__all__ = [
+    "Noise",
+    "Particles",
+    "Proposal",
+    "StepInfo",
+    "at_poses",
+    "effective_sample_size",
+    "filter_step",
+    "noise_of",
+    "normalise",
+    "propagated",
+    "propagated_and_updated",
+    "refused_by_name",
+    "resampled",
+    "systematic_parents",
+]
 
 Proposal = Literal["fastslam2", "fastslam1"]
 Arrays = tuple[
@@ -30,8 +47,38 @@ Arrays = tuple[
     Float[np.ndarray, "M L 3"],
 ]
 """The fields of `Particles`, in their order."""
-Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
-"""Ids, ranges [m], bearings [rad] and claimed noises of measurements."""
+
+
+class Noise(NamedTuple):
+    """Variances of a measurement, and the share of each that is white: the rest is constant."""
+
+    range_variance: float
+    range_per_m2: float
+    range_white: float
+    bearing_variance: float
+    bearing_white: float
+
+
+def noise_of(sensor: Sensor) -> Noise:
+    """The variances of a sensor and their white shares, as the kernels take them."""
+    return Noise(
+        elementary.squared(sensor.range_sigma),
+        elementary.squared(sensor.range_sigma_per_m),
+        sensor.range_white,
+        elementary.squared(sensor.bearing_sigma),
+        sensor.bearing_white,
+    )
+
+
+@contextmanager
+def refused_by_name() -> Iterator[None]:
+    """Raise NotACovarianceError for what the core refuses."""
+    try:
+        yield
+    except core.MotionError as error:
+        raise NotACovarianceError("the motion", str(error)) from error
+    except core.NotFiniteError as error:
+        raise NotACovarianceError("the window", f"not finite: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -53,7 +100,7 @@ class Particles:
 
     @property
     def arrays(self) -> Arrays:
-        """The fields, as kernels take them."""
+        """The fields, as the core takes them."""
         return self.poses, self.log_weights, self.ids, self.means, self.covariances
 
 
@@ -82,71 +129,19 @@ def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
     )
 
 
-@compiled
-def effective_sample_size(log_weights: Float[np.ndarray, " M"]) -> float:
-    """1/Σ w² of normalised log weights."""
-    total = 0.0
-    for log_weight in log_weights:
-        total += elementary.exp(2.0 * log_weight)
-    return 1.0 / total
-
-
-@compiled
-def normalised(log_weights: Float[np.ndarray, " M"]) -> tuple[Float[np.ndarray, " M"], float]:
-    """(log w − log Σ w, log Σ w), with the largest weight factored out of the sum."""
-    largest = log_weights.max()
-    total = 0.0
-    for log_weight in log_weights:
-        total += elementary.exp(log_weight - largest)
-    log_sum = largest + elementary.log(total)
-    return log_weights - log_sum, log_sum
-
-
-@compiled
-def systematic_parents(
-    log_weights: Float[np.ndarray, " M"], uniform: float
-) -> Int64[np.ndarray, " M"]:
-    """Systematic resampling: particle i is copied ⌊M w_i⌋ or ⌈M w_i⌉ times, M w_i on average.
-
-    The M points (k + uniform)/M fall into the intervals of the cumulated weights; 0 ≤ uniform < 1.
-    Kitagawa 1996; Thrun et al. 2005, table 4.4.
-    """
-    count = len(log_weights)
-    parents = np.empty(count, np.int64)
-    parent = 0
-    cumulated = elementary.exp(log_weights[0])
-    for k in range(count):
-        while (k + uniform) / count >= cumulated and parent < count - 1:
-            parent += 1
-            cumulated += elementary.exp(log_weights[parent])
-        parents[k] = parent
-    return parents
-
-
-@compiled
-def copies_of(particles: Arrays, parents: Int64[np.ndarray, " M"]) -> Arrays:
-    """The fields of equal particles, each a copy of its parent."""
-    start, log_weights, ids, means, covariances = particles
-    poses, equal = np.empty_like(start), np.empty_like(log_weights)
-    placed, spread = np.empty_like(means), np.empty_like(covariances)
-    of_each = -elementary.log(float(len(parents)))
-    for i in range(len(parents)):
-        parent, equal[i] = parents[i], of_each
-        for j in range(3):
-            poses[i, j] = start[parent, j]
-        for k in range(means.shape[1]):
-            placed[i, k, 0], placed[i, k, 1] = means[parent, k, 0], means[parent, k, 1]
-            for j in range(3):
-                spread[i, k, j] = covariances[parent, k, j]
-    return poses, equal, ids, placed, spread
-
-
 def resampled(
     particles: Particles, generator: np.random.Generator
 ) -> tuple[Particles, Int64[np.ndarray, " M"]]:
     """Equal weights again, each particle a copy of its parent; draws one uniform number."""
     parents = systematic_parents(particles.log_weights, generator.random())
-    return Particles(*copies_of(particles.arrays, parents)), parents
+    copies = Particles(
+        poses=particles.poses[parents],
+        log_weights=np.full(len(parents), -elementary.log(float(len(parents)))),
+        ids=particles.ids,
+        means=particles.means[parents],
+        covariances=particles.covariances[parents],
+    )
+    return copies, parents
 
 
 def propagated_and_updated(
@@ -161,7 +156,7 @@ def propagated_and_updated(
     generator: np.random.Generator,
     own: Own | None = None,
 ) -> tuple[Particles, StepInfo]:
-    """One step: resamples if the particles are thin, moves, then takes the measurements (`step`).
+    """One step: resamples if the particles are thin, moves, then takes the measurements.
 
     Resampling comes first, when the effective sample size of the last step is below
     `resample_below`·M, so that the particles of a window's last step keep their weights. ranges [m]
@@ -193,62 +188,15 @@ def filter_step(
 ) -> tuple[Particles, float]:
     """As `propagated_and_updated` without resampling; returns also the log evidence."""
     noises = unclaimed(len(ids)) if own is None else own
-    moved, log_evidence = particles_after(
-        particles.arrays,
-        (increment.mean, increment.covariance),
-        generator.standard_normal((len(particles.poses), 3)),
-        (ids, ranges, bearings, noises),
-        variances(sensor),
-        proposal == "fastslam2",
-    )
-    return particles_of(moved), log_evidence
-
-
-def particles_of(arrays: Arrays) -> Particles:
-    """The particles that a kernel returned.
-
-    Raises NotACovarianceError where there are none, as of `particles_after`.
-    """
-    if not len(arrays[0]):
-        raise NotACovarianceError("the motion", "not positive semi-definite")
-    return Particles(*arrays)
-
-
-@compiled
-def particles_after(
-    particles: Arrays,
-    motion: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
-    normals: Float[np.ndarray, "M 3"],
-    seen: Seen,
-    sensor: tuple[float, float, float],
-    improved: bool,
-) -> tuple[Arrays, float]:
-    """The fields of the particles after a step, and its log evidence.
-
-    motion: mean and covariance. No poses, where the covariance is not positive semi-definite.
-    """
-    start, log_weights, known, means, covariances = particles
-    ids, ranges, bearings, own = seen
-    L = semidefinite_factor(motion[1])
-    if not np.isfinite(L).all():
-        return (start[:0], log_weights[:0], known, means[:0], covariances[:0]), math.nan
-    after, slots, first = slots_of(known, ids)
-    # The kernel writes into these.
-    poses, weights = np.empty_like(start), log_weights.copy()
-    placed = np.empty((len(start), len(after), 2))
-    spread = np.empty((len(start), len(after), 3))
-    for i in range(len(start)):
-        for k in range(len(known)):
-            placed[i, k, 0], placed[i, k, 1] = means[i, k, 0], means[i, k, 1]
-            for j in range(3):
-                spread[i, k, j] = covariances[i, k, j]
-    rows = measured(ranges, bearings, sensor, own)
-    step(
-        start, motion[0], L, normals, len(known), slots, first, rows, improved, poses, weights,
-        placed, spread,
-    )  # fmt: skip
-    weights, log_evidence = normalised(weights)
-    return (poses, weights, after, placed, spread), log_evidence
+    normals = generator.standard_normal((len(particles.poses), 3))
+    with refused_by_name():
+        window = core.Window.of_particles(
+            *particles.arrays, noise_of(sensor), proposal == "fastslam2"
+        )
+        log_evidence = window.step(
+            increment.mean, increment.covariance, ids, ranges, bearings, noises, normals
+        )
+    return Particles(*window.particles()), log_evidence
 
 
 def propagated(

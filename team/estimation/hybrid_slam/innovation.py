@@ -8,24 +8,25 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt32
+from jaxtyping import Bool, Float, Int64, UInt32
 
+from team import core
 from team.config import Sensor
 from team.estimation import dense
 from team.estimation.gaussian import cholesky_factor, whitened
 from team.estimation.geometry import compose, tangent, wrapped
-from team.estimation.hybrid_slam import innovation_kernel
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.fastslam_kernel import slots_of
+from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
 from team.estimation.models import (
     Increment,
     landmark_jacobian,
     noise,
     pose_jacobian,
     predicted,
-    variances,
 )
 from team.estimation.scans import Own, unclaimed
+
+Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
+"""Ids, ranges [m], bearings [rad] and claimed noises of measurements."""
 
 
 class Innovation(NamedTuple):
@@ -77,20 +78,16 @@ def innovation(
     calibration, own are the noises that they claim. R is white, as in the particles' weights.
     Raises NotACovarianceError if S is not positive definite.
     """
-    squared, error, S = innovation_kernel.predictive_of_known(
-        particles.poses,
-        particles.log_weights,
-        particles.means,
-        particles.covariances,
-        particles.ids,
-        increment.mean,
-        increment.covariance,
-        ids,
-        ranges,
-        bearings,
-        variances(sensor),
-        unclaimed(len(ids)) if own is None else own,
-    )
+    with refused_by_name():
+        window = core.Window.of_particles(*particles.arrays, noise_of(sensor))
+    noises = unclaimed(len(ids)) if own is None else own
+    return innovation_of(window, increment, (ids, ranges, bearings, noises))
+
+
+def innovation_of(window: core.Window, increment: Increment, seen: Seen) -> Innovation:
+    """Compute `innovation` of a keyframe's measurements by the particles of a window."""
+    with refused_by_name():
+        squared, error, S = window.innovation(increment.mean, increment.covariance, *seen)
     return _judged(squared, error, S) if len(error) else NOTHING
 
 
@@ -139,13 +136,25 @@ def joint_innovation(
         + dense.product(dense.product(H, increment.covariance), H.T)
         + np.diag(R)
     )
-    return _judged(innovation_kernel.normalised_square(error, S), error, S)
+    return _judged(core.normalised_square(error, S), error, S)
+
+
+def slots_of(
+    known: UInt32[np.ndarray, " L"], observed: UInt32[np.ndarray, " n"]
+) -> tuple[UInt32[np.ndarray, " K"], Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Find the ids after the measurements, the slot of each of them, and which are first sights."""
+    slot = {each: k for k, each in enumerate(known.tolist())}
+    slots, first = np.empty(len(observed), np.int64), np.zeros(len(observed), np.bool_)
+    for k, each in enumerate(observed.tolist()):
+        first[k] = each not in slot
+        slots[k] = slot.setdefault(each, len(slot))
+    return np.array(list(slot), np.uint32), slots, first
 
 
 def _judged(
     squared: float, error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]
 ) -> Innovation:
-    """The kernel's square, unless it found none: rank and finiteness are judged here."""
+    """The core's square, unless it found none: rank and finiteness are judged here."""
     if not math.isfinite(squared):
         white = whitened(cholesky_factor(S, "the prediction of measurements"), error)
         squared = float(dense.product(white, white))

@@ -110,7 +110,7 @@ class OpenWindow:
 
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks
-        bounded = nearest_landmarks(keyframe, self.particles.particles.ids, most)
+        bounded = nearest_landmarks(keyframe, self.particles.landmarks, most)
         self._keyframes.append(bounded)
         self._take(self._gate.admit(bounded) if self._gate.judges else bounded)
 

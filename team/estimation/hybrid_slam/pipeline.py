@@ -3,8 +3,8 @@
     a measurement comes in                        observe, sight, drive
     particles move and weigh                      drive (OpenWindow.advance)
     the window closes                             _is_full, _close
-    landmarks are solved again along the paths    _submap
-    moments are matched                           _submap
+    landmarks are solved again along the paths    window.gaussian
+    moments are matched                           window.gaussian
     a submap goes out                             _close
 
 A window begins at zero where the last one ended, so a submap depends on its own measurements, the
@@ -112,8 +112,7 @@ class HybridSlam:
 
         A window with half as many landmarks as a submap may hold closes at once.
         """
-        landmarks = self._open.particles.particles.ids
-        if 2 * len(landmarks) >= self._config.bounds.submap_landmarks:
+        if 2 * self.window.core.landmarks >= self._config.bounds.submap_landmarks:
             return True
         is_slow = self._driven_m < self._config.front_end.window_m
         stands = is_slow and lasting_ns < self._standing_ns
@@ -128,7 +127,7 @@ class HybridSlam:
             self._open.advance(keyframe)
         self._open.confirm()
         self._open.move(rest, self._segmenter.rest_forward)
-        submap = self._open.solve(_submap)
+        submap = self._open.solve(windows.gaussian)
         is_sensible = self._open.is_sensible(submap)
         scans, self._scans = self._scans - self._segmenter.uncovered, self._segmenter.uncovered
         closed = ClosedWindow(
@@ -196,9 +195,3 @@ class HybridSlam:
 def _running(window: Window) -> LocalMap:
     """The window's Gaussian so far."""
     return windows.gaussian(window, running=True)
-
-
-def _submap(window: Window) -> LocalMap:
-    """Solve the landmarks again along the paths, then match moments."""
-    landmarks = windows.landmarks_solved_again(window)
-    return windows.moments_matched(window, landmarks)

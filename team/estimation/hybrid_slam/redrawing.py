@@ -13,22 +13,20 @@ correct what is not Gaussian, and the paths have no ancestors in common.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team import core
 from team.estimation import dense, elementary, elementwise
 from team.estimation.association.scans import Scans, points_of
 from team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
 from team.estimation.geometry import adjoint, between, inverse
-from team.estimation.hybrid_slam.fastslam import effective_sample_size, normalised
+from team.estimation.hybrid_slam.fastslam import effective_sample_size, noise_of, normalise
 from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
-from team.estimation.hybrid_slam.moments import by_slot, mean_path
 from team.estimation.hybrid_slam.reduction import variances
-from team.estimation.hybrid_slam.window import Window, noise_of
+from team.estimation.hybrid_slam.window import Window
 from team.estimation.scans import POINT
 
 Paths = Float[np.ndarray, "K M 3"]
@@ -53,27 +51,22 @@ def redrawn(
     slots = _slots(window)
     scans = _scans(window, keyframes)
     landmarks = dense.product(weights, _rows(window.particles.means)).reshape(-1, 2)
-    poses = mean_path(np.ascontiguousarray(window.paths), weights)
+    poses = window.core.mean_path()
     try:
         now = smooth_window(scans, slots, poses, landmarks)
         paths, log_weights = _drawn(now, scans, len(weights), generator)
-    except np.linalg.LinAlgError:
+        means, covariances = _landmarks(window, paths, (scans, slots))
+    except (np.linalg.LinAlgError, core.NotFiniteError):
         return window
-    means, covariances = _landmarks(window, paths, (scans, slots))
     log_weights += _likelihood(window, paths, means, covariances, (scans, slots))
     if not np.isfinite(log_weights).all():
         return window
-    log_weights, _ = normalised(log_weights)
+    log_weights, _ = normalise(log_weights)
     if effective_sample_size(log_weights) <= left:
         return window
-    particles = replace(
-        window.particles,
-        poses=paths[-1].copy(),
-        log_weights=log_weights,
-        means=means,
-        covariances=covariances,
-    )
-    return msgspec.structs.replace(window, particles=particles, paths=paths)
+    after = window.core.copy()
+    after.replace(paths, log_weights, means, covariances)
+    return msgspec.structs.replace(window, core=after)
 
 
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
@@ -172,23 +165,20 @@ def _landmarks(
     """
     (scans, slots), particles = measured, window.particles
     points = np.broadcast_to(scans.points[:, None], (len(slots), paths.shape[1], 2))
-    order = np.argsort(particles.ids)
-    place = np.argsort(order)
-    starts = np.zeros((len(order), paths.shape[1], 2))
-    np.add.at(starts, place[slots], _placed(paths[scans.keyframes], points))
-    starts /= np.bincount(slots, minlength=len(order))[order, None, None]
-    seen, bounds = by_slot(particles.ids[order], window.ids)
-    means, covariances = landmarks_along_paths(
-        np.ascontiguousarray(starts.transpose(1, 0, 2)),
-        np.ascontiguousarray(particles.covariances[:, order]),
+    starts = np.zeros((len(particles.ids), paths.shape[1], 2))
+    np.add.at(starts, slots, _placed(paths[scans.keyframes], points))
+    starts /= np.bincount(slots, minlength=len(starts))[:, None, None]
+    return core.landmarks_along_paths(
+        particles.ids,
+        starts.transpose(1, 0, 2),
+        particles.covariances,
         paths,
-        bounds,
-        window.keyframes[seen],
-        window.measurements[seen],
-        own=window.own[seen],
-        noise=noise_of(window.sensor)._replace(range_white=1.0, bearing_white=1.0),
+        window.keyframes,
+        window.ids,
+        window.measurements,
+        window.own,
+        noise_of(window.sensor)._replace(range_white=1.0, bearing_white=1.0),
     )
-    return np.ascontiguousarray(means[:, place]), np.ascontiguousarray(covariances[:, place])
 
 
 def _likelihood(

@@ -16,10 +16,10 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.config import Bias
 from team.estimation.gaussian import FAULTS, NotACovarianceError
+from team.estimation.hybrid_slam.fastslam import Noise
 from team.estimation.hybrid_slam.sensitivity_kernel import (
     BIASES,
     SINGULAR,
-    Noise,
     columns_along,
     rows_of,
 )
@@ -53,28 +53,26 @@ class WindowSights(NamedTuple):
 
 
 def columns(
-    paths: tuple[Float[np.ndarray, "K M 3"], Float[np.ndarray, " M"]],
+    path: Float[np.ndarray, "K 3"],
     end: Float[np.ndarray, "3"],
     motions: WindowMotions,
     landmarks: tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]],
     seen: WindowSights,
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"]]:
-    """The mean path, and ∂/∂b of its poses (x, y, theta) and of the landmarks, in the window's
-    frame, by each of BIASES.
+    """The path to the window's end, and ∂/∂b of its poses (x, y, theta) and of the landmarks.
 
-    paths: the particles' poses at the keyframes, and their weights; end: the mean pose at the
-    window's end. The bias b is the error: a bearing reads b too much, a range b too much or (1 + b)
-    times itself, and the way driven is (1 + b) times the odometry's.
+    All are in the window's frame, ∂/∂b by each of BIASES. path: the particles' mean poses at the
+    keyframes; end: the mean pose at the window's end. The bias b is the error: a bearing reads b
+    too much, a range b too much or (1 + b) times itself, and the way driven is (1 + b) times the
+    odometry's.
     """
-    path, poses, points, fault = columns_along(
-        np.ascontiguousarray(paths[0]), paths[1], end, *motions, *landmarks, *seen, noise
-    )
+    whole, poses, points, fault = columns_along(path, end, *motions, *landmarks, *seen, noise)
     if fault == SINGULAR:
         raise np.linalg.LinAlgError("Singular matrix")
     if fault:
         raise NotACovarianceError("the smoother of a window", FAULTS[fault])
-    return path, poses, points
+    return whole, poses, points
 
 
 def rows(

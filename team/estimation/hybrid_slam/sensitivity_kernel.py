@@ -1,7 +1,7 @@
 """The kernels of `sensitivity`: a window's smoother, and how its landmarks answer the path's."""
 
 import math
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -12,7 +12,7 @@ from team.estimation.compiled import compiled
 from team.estimation.dense_kernel import solve_stack
 from team.estimation.geometry import adjoint, between
 from team.estimation.hybrid_slam.arrow_kernel import solve_arrow
-from team.estimation.hybrid_slam.moments import mean_path
+from team.estimation.hybrid_slam.fastslam import Noise
 from team.estimation.models import NEAREST_M
 from team.estimation.placing import put_block
 
@@ -23,16 +23,6 @@ MOTION_JITTER = (1e-7, 1e-7, 1e-9)
 """Added to each motion's variances [m², m², rad²]: noise of rank 2 has no information matrix."""
 SINGULAR = -1
 """The fault of a motion whose noise has no inverse; others are indices in `gaussian.FAULTS`."""
-
-
-class Noise(NamedTuple):
-    """Variances of a measurement, and the share of each that is white: the rest is constant."""
-
-    range_variance: float
-    range_per_m2: float
-    range_white: float
-    bearing_variance: float
-    bearing_white: float
 
 
 @compiled
@@ -48,8 +38,7 @@ def carried_on(
 
 @compiled
 def columns_along(
-    paths: Float[np.ndarray, "K M 3"],
-    weights: Float[np.ndarray, " M"],
+    keyframe_poses: Float[np.ndarray, "K 3"],
     end: Float[np.ndarray, "3"],
     covariances: Float[np.ndarray, "P 3 3"],
     shifts: Float[np.ndarray, "P 3"],
@@ -60,8 +49,8 @@ def columns_along(
     own: Float[np.ndarray, "N own"],
     noise: Noise,
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "B P 3"], Float[np.ndarray, "B L 2"], int]:
-    """`columns_of_all` about the particles' mean path, which is returned, too."""
-    path = np.concatenate((mean_path(paths, weights), end.reshape(1, 3)))[: len(shifts)].copy()
+    """`columns_of_all` about the path of the keyframes and the end, which is returned, too."""
+    path = np.concatenate((keyframe_poses, end.reshape(1, 3)))[: len(shifts)].copy()
     slots = np.searchsorted(ids, seen)
     poses, points, fault = columns_of_all(
         path, covariances, shifts, landmarks, keyframes, slots, own, noise

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team.core import POSE_JITTER, on_group, sample_factor
 from team.estimation import dense, elementwise
 from team.estimation.geometry import Pose, wrapped
-from team.estimation.hybrid_slam.moments import POSE_JITTER, on_group, sample_factor
 from team.estimation.hybrid_slam.window import Window
 
 

@@ -1,28 +1,34 @@
-"""One measurement of one landmark by the blocks of the step of FastSLAM."""
+"""One measurement of one landmark by the step of FastSLAM."""
 
 import numpy as np
 
-from team.estimation.hybrid_slam import blocks
+from team import core
+from team.estimation.hybrid_slam.fastslam import Noise
+
+STILL = np.zeros(3), np.zeros((3, 3))
+NO_MAP = np.empty(0, np.uint32), np.empty((1, 0, 2)), np.empty((1, 0, 3))
 
 
-def at(pose, ranges, bearings, sensor, own) -> tuple[np.ndarray, np.ndarray]:
-    """A block whose particles all stand there, and the row of the first measurement."""
-    block = np.zeros(blocks.OWN)
-    blocks.load_poses(block, np.array([pose]), 0)
-    blocks.drive(block, np.zeros(3))
-    return block, blocks.measured(ranges, bearings, sensor, own)[0]
+def placed(pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray]:
+    """A landmark at first sight by a particle at the pose: its mean, and (xx, xy, yy)."""
+    return _stepped(pose, NO_MAP, seen, sensor, own)[:2]
 
 
-def stored(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The landmark of the first particle: its mean, and (xx, xy, yy)."""
-    means, covariances = np.empty((1, 1, 2)), np.empty((1, 1, 3))
-    blocks.store_landmark(block, means, covariances, 0, 0)
-    return means[0, 0], covariances[0, 0]
+def updated(mean, packed, pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray, float]:
+    """A landmark after the measurement, and the log-likelihood of that.
+
+    seen: (ranges, bearings); only the first one is taken. sensor: (σ_range², σ_range_per_m²,
+    σ_bearing²).
+    """
+    known = np.array([7], np.uint32), mean[None, None], packed[None, None]
+    return _stepped(pose, known, seen, sensor, own)
 
 
-def updated(mean, packed, block, row) -> tuple[np.ndarray, np.ndarray, float]:
-    """A landmark after the measurement, and the log-likelihood of that."""
-    blocks.load_landmark(block, mean[None, None], packed[None, None], 0, 0)
-    blocks.predict(block, row)
-    blocks.condition_landmark(block)
-    return *stored(block), float(block[blocks.LOG_WEIGHT])
+def _stepped(pose, known, seen, sensor, own) -> tuple[np.ndarray, np.ndarray, float]:
+    noise = Noise(sensor[0], sensor[1], 1.0, sensor[2], 1.0)
+    at = np.array([pose], np.float64), np.zeros(1)
+    window = core.Window.of_particles(*at, *known, noise, improved=False)
+    ids, ranges, bearings = np.array([7], np.uint32), seen[0][:1], seen[1][:1]
+    log = window.step(*STILL, ids, ranges, bearings, own[:1], np.zeros((1, 3)))
+    _, _, _, means, covariances = window.particles()
+    return means[0, 0], covariances[0, 0], log

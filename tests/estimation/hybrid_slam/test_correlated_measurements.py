@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from team.estimation.hybrid_slam.landmarks_along_paths import landmarks_along_paths
-from team.estimation.hybrid_slam.sensitivity_kernel import Noise
+from team.core import landmarks_along_paths
+from team.estimation.hybrid_slam.fastslam import Noise
 from team.estimation.models import landmark_jacobian, predicted
 from team.estimation.scans import unclaimed
 
 PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])
 LANDMARK = np.array([4.0, 2.5])
+IDS = np.array([7], np.uint32)
 
 
 def measurements(rng: np.random.Generator) -> np.ndarray:
@@ -44,14 +45,15 @@ def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlat
     noise = Noise(0.0125, 0.0, range_white, 5e-4, bearing_white)
     seen = measurements(np.random.default_rng(3))
     means, covariances = landmarks_along_paths(
+        IDS,
         LANDMARK.reshape(1, 1, 2) + 0.05,
         np.array([[[1.0, 0.0, 1.0]]]),
         PATH[:, None, :],
-        np.array([0, 4]),
         np.arange(4),
+        IDS.repeat(4),
         seen,
-        own=unclaimed(4),
-        noise=noise,
+        unclaimed(4),
+        noise,
     )
     point, covariance = dense(noise, seen)
     np.testing.assert_allclose(means[0, 0], point, atol=1e-4)
@@ -63,14 +65,15 @@ def test_repeating_a_measurement_leaves_the_constant_part_of_its_error() -> None
     sizes = []
     for repeats in (1, 1000):
         _, covariances = landmarks_along_paths(
-            LANDMARK.reshape(1, 1, 2).copy(),
+            IDS,
+            LANDMARK.reshape(1, 1, 2),
             np.array([[[1.0, 0.0, 1.0]]]),
             PATH[:1, None, :],
-            np.array([0, repeats]),
             np.zeros(repeats, dtype=np.int64),
+            IDS.repeat(repeats),
             np.tile(predicted(PATH[0], LANDMARK), (repeats, 1)),
-            own=unclaimed(repeats),
-            noise=Noise(0.0125, 0.0, 0.2, 5e-4, 0.5),
+            unclaimed(repeats),
+            Noise(0.0125, 0.0, 0.2, 5e-4, 0.5),
         )
         xx, xy, yy = covariances[0, 0]
         sizes.append(xx * yy - xy * xy)

@@ -7,12 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from team import core
 from team.config import MotionModel, MotionNoise, Sensor
+from team.core import moments, semidefinite_factor
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam import fastslam, fastslam_kernel
-from team.estimation.hybrid_slam.blocks import measured
-from team.estimation.hybrid_slam.fastslam_kernel import semidefinite_factor
-from team.estimation.hybrid_slam.moments import moments
+from team.estimation.hybrid_slam import fastslam
 from team.estimation.models import Increment, increment_of
 from team.estimation.scans import unclaimed
 
@@ -237,7 +236,7 @@ def test_resampling_happens_before_the_motion_and_never_after_the_measurements()
 
 
 weights = st.lists(st.floats(-30.0, 0.0), min_size=1, max_size=12).map(
-    lambda values: fastslam.normalised(np.array(values))[0]
+    lambda values: fastslam.normalise(np.array(values))[0]
 )
 
 
@@ -258,7 +257,7 @@ def test_resampling_is_unbiased_and_never_off_by_one_copy(log_weights):
 @quick
 @given(weights, st.floats(-1e4, 1e4))
 def test_a_common_factor_of_the_weights_changes_nothing(log_weights, shift):
-    shifted, log_sum = fastslam.normalised(log_weights + shift)
+    shifted, log_sum = fastslam.normalise(log_weights + shift)
     np.testing.assert_allclose(shifted, log_weights, atol=1e-9)
     np.testing.assert_allclose(log_sum, shift, atol=1e-9)
     assert 1.0 - 1e-12 <= fastslam.effective_sample_size(shifted) <= len(shifted) + 1e-9
@@ -323,19 +322,20 @@ def test_a_particle_s_step_depends_neither_on_its_place_nor_on_the_others():
     starts, normals = rng.normal(0.0, 0.1, (37, 3)), rng.normal(0.0, 1.0, (37, 3))
     means = np.array([[4.0, 1.0], [2.0, -3.0]]) + rng.normal(0.0, 0.1, (37, 2, 2))
     spread = np.tile([0.05, 0.01, 0.04], (37, 2, 1))
-    slots, first = np.array([0, 1, 1], np.int64), np.array([False, True, False])
-    rows = measured(
-        np.array([4.1, 3.5, 3.6]), np.array([0.2, -1.0, -0.9]), (0.01, 0.0, 1e-3), unclaimed(3)
-    )
+    seen = np.array([4, 9, 9], np.uint32), np.array([4.1, 3.5, 3.6]), np.array([0.2, -1.0, -0.9])
+    noise = fastslam.Noise(0.01, 0.0, 1.0, 1e-3, 1.0)
 
     def stepped(order):
-        after = np.empty((len(order), 3)), np.zeros(len(order)), means[order], spread[order]
-        factor = semidefinite_factor(MOTION.covariance)
-        chosen = starts[order], MOTION.mean, factor, normals[order]
-        fastslam_kernel.step(*chosen, 1, slots, first, rows, True, *after)
-        return after
+        known = np.array([4], np.uint32), means[order, :1], spread[order, :1]
+        weights = np.full(len(order), -np.log(len(order)))
+        window = core.Window.of_particles(starts[order], weights, *known, noise)
+        log_sum = window.step(MOTION.mean, MOTION.covariance, *seen, unclaimed(3), normals[order])
+        poses, logs, _, placed, spread_after = window.particles()
+        return poses, placed, spread_after, logs + log_sum + np.log(len(order))
 
     whole = stepped(np.arange(37))
     for order in (rng.permutation(37), np.array([36]), np.arange(20, 37)):
-        for each, reference in zip(stepped(order), whole, strict=True):
+        *after, weights = stepped(order)
+        for each, reference in zip(after, whole[:-1], strict=True):
             np.testing.assert_array_equal(each, reference[order])
+        np.testing.assert_allclose(weights, whole[-1][order], rtol=0.0, atol=1e-12)

@@ -40,8 +40,10 @@ def kalman(e: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def updated(z: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    seen = one_landmark.at(POSE, z[:1], z[1:], SENSOR, own[None])
-    mean, packed, likelihood = one_landmark.updated(MEAN, COVARIANCE[[0, 0, 1], [0, 1, 1]], *seen)
+    packed = COVARIANCE[[0, 0, 1], [0, 1, 1]]
+    mean, packed, likelihood = one_landmark.updated(
+        MEAN, packed, POSE, (z[:1], z[1:]), SENSOR, own[None]
+    )
     return mean, packed[[[0, 1], [1, 2]]], likelihood
 
 

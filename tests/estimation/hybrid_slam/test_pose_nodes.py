@@ -3,8 +3,8 @@
 import numpy as np
 
 from team.config import FrontEnd, Sensor
+from team.core import POSE_JITTER
 from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.moments import POSE_JITTER
 from team.estimation.models import Increment
 from tests.estimation.submap_world import wrap
 

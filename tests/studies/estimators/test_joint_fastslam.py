@@ -69,7 +69,7 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
         for robot, *turn in turns:
             alone[robot] = plain_fastslam.filter_step(alone[robot], *turn[:-1], random)
     product = sum(state.particles.log_weights for state in alone.values())
-    np.testing.assert_allclose(joint.log_weights, fastslam.normalised(product)[0], atol=1e-9)
+    np.testing.assert_allclose(joint.log_weights, fastslam.normalise(product)[0], atol=1e-9)
     for index, state in enumerate(alone.values()):
         np.testing.assert_array_equal(joint.poses[index], state.particles.poses)
 

@@ -1,0 +1,98 @@
+"""The native core: the numerical state of a window, and functions with defined bits.
+
+The library is built at two levels, for any x86-64 processor of the last decade and for those with
+AVX2; the results have the same bits. The better one that the processor has is imported; the
+environment variable TEAMSLAM_CORE (base or avx2) overrides the choice. docs/core.md describes it.
+"""
+
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+
+
+def _levels() -> tuple[str, ...]:
+    """List the levels that this processor can run, the best first."""
+    if chosen := os.environ.get("TEAMSLAM_CORE"):
+        return (chosen,)
+    try:
+        with Path("/proc/cpuinfo").open(encoding="utf-8") as file:
+            flags = file.read(4096).partition("flags")[2].partition("\n")[0].split()
+    except OSError:
+        flags = []
+    return ("avx2", "base") if "avx2" in flags else ("base",)
+
+
+def _import_library() -> None:
+    """Import the library of the best level as `team.core._core`."""
+    for each in _levels():
+        try:
+            sys.modules[f"{__name__}._core"] = import_module(f"{__name__}._core_{each}")
+        except ModuleNotFoundError:
+            continue
+        return
+    raise ImportError(
+        "the native core of team is not built: run `make setup`, or"
+        " `python team/core/building/backend.py` in a source tree"
+    )
+
+
+_import_library()
+
+from team.core._core import (  # noqa: E402 - the level is chosen before
+    POSE_JITTER,
+    MotionError,
+    NotFiniteError,
+    Step,
+    Window,
+    atan2,
+    digest,
+    effective_sample_size,
+    exp,
+    expm1,
+    hypot,
+    landmarks_along_paths,
+    level,
+    log,
+    log1p,
+    mean_direction,
+    moments,
+    normal_below,
+    normalise,
+    normalised_square,
+    on_group,
+    sample_factor,
+    semidefinite_factor,
+    sin_and_cos,
+    systematic_parents,
+    width,
+)
+
+__all__ = [
+    "POSE_JITTER",
+    "MotionError",
+    "NotFiniteError",
+    "Step",
+    "Window",
+    "atan2",
+    "digest",
+    "effective_sample_size",
+    "exp",
+    "expm1",
+    "hypot",
+    "landmarks_along_paths",
+    "level",
+    "log",
+    "log1p",
+    "mean_direction",
+    "moments",
+    "normal_below",
+    "normalise",
+    "normalised_square",
+    "on_group",
+    "sample_factor",
+    "semidefinite_factor",
+    "sin_and_cos",
+    "systematic_parents",
+    "width",
+]

@@ -1,0 +1,243 @@
+"""
+The numerical core: the state of a window, and functions with defined bits.
+"""
+
+from collections.abc import Sequence
+
+import numpy
+from numpy.typing import NDArray
+
+
+level: str
+
+digest: str
+
+width: int
+
+POSE_JITTER: tuple[float, ...]
+
+class NotFiniteError(ValueError):
+    pass
+
+class MotionError(ValueError):
+    pass
+
+def sin_and_cos(angles: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """Sine and cosine of each angle [rad]; NaN of what is not finite."""
+
+def exp(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """E to the power of each x; 0 below -745.2, infinite above 709.8."""
+
+def log(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The natural logarithm of each x."""
+
+def log1p(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The logarithm of each 1 + x."""
+
+def expm1(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """E to the power of each x, less 1."""
+
+def normal_below(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    The probability that a standard normal variable stays below each x, to 1e-15.
+    """
+
+def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The direction of each (x, y) in [-pi, pi]."""
+
+def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The length of each (x, y)."""
+
+def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
+    """Compute 1/sum(w^2) of normalised log weights."""
+
+def normalise(log_weights: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], float]:
+    """
+    Return (log w - log sum(w), log sum(w)), with the largest weight factored out of the sum.
+    """
+
+def systematic_parents(log_weights: NDArray[numpy.float64], uniform: float) -> NDArray[numpy.int64]:
+    """
+    Resample systematically: particle i is the parent of floor(M w_i) or ceil(M w_i) particles.
+
+    The M points (k + uniform)/M fall into the intervals of the cumulated weights; 0 <= uniform < 1.
+    Kitagawa 1996; Thrun et al. 2005, table 4.4.
+    """
+
+def mean_direction(angles: NDArray[numpy.float64], weights: NDArray[numpy.float64]) -> float:
+    """Compute the direction of sum(w_i (cos a_i, sin a_i))."""
+
+def sample_factor(weights: NDArray[numpy.float64]) -> float:
+    """
+    Compute the factor N/(N - 5) for the scatter of N = 1/sum(w^2) particles, N at least 10.
+
+    With it the inverse of the scatter is right on average (Anderson 2003, section 7.7).
+    """
+
+def on_group(poses: NDArray[numpy.float64], weights: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute the mean pose on SE(2), and each pose's deviation from it in (x, y, theta).
+    """
+
+def moments(poses: NDArray[numpy.float64], weights: NDArray[numpy.float64], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64], between: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute mean and covariance of the mixture sum(w_i N(mu_i, blkdiag(0, S_1, ..., S_L))).
+
+    poses: (M, 3 k), k poses (x, y, theta) of each particle; headings on the circle. The scatter between
+    the particles is taken times `between`: 1 for the mixture itself.
+    """
+
+def landmarks_along_paths(ids: NDArray[numpy.uint32], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64], paths: NDArray[numpy.float64], keyframes: NDArray[numpy.int64], seen: NDArray[numpy.uint32], measurements: NDArray[numpy.float64], own: NDArray[numpy.float64], noise: Sequence[float]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Solve each landmark of each particle by Gauss-Newton over its measurements, given the particle's path.
+
+    ids: of the L landmarks, whose means and covariances are the starts. Of each of N measurements
+    keyframes is its place in the paths (K, M, 3), and seen its landmark. Returns means and covariances.
+    """
+
+def normalised_square(error: NDArray[numpy.float64], S: NDArray[numpy.float64]) -> float:
+    """
+    Compute e' inv(S) e by the Cholesky factor of S; NaN where a pivot is not above rounding.
+    """
+
+def semidefinite_factor(covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute lower L with L L' = covariance, of any rank; NaN where the matrix is indefinite.
+    """
+
+class Step:
+    """Statistics of one keyframe."""
+
+    @property
+    def effective(self) -> float:
+        """Number of effective particles, 1/sum(w^2)."""
+
+    @property
+    def log_evidence(self) -> float:
+        """log p(z | earlier z) by the particles."""
+
+    @property
+    def squared(self) -> float:
+        """
+        NIS of the measurements that were predicted; NaN where a pivot of S is not above rounding.
+        """
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of `squared`."""
+
+class Window:
+    """
+    Particles since a window's start, their paths, and the measurements that they have used.
+
+    Poses are the sensor's, in the frame of the window's start of the sensor; the Gaussians are of the
+    base, in the frame of its start. Brooks and Bailey 2009, HybridSLAM.
+    """
+
+    def __init__(self, particles: int, noise: Sequence[float], improved: bool = True, mount: Sequence[float] = [0.0, 0.0, 0.0]) -> None:
+        """
+        Open a window: every particle exactly at zero, without landmarks or measurements.
+
+        noise: (range_variance, range_per_m2, range_white, bearing_variance, bearing_white), as of
+        `fastslam.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base.
+        """
+
+    @staticmethod
+    def of_particles(poses: NDArray[numpy.float64], log_weights: NDArray[numpy.float64], ids: NDArray[numpy.uint32], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64], noise: Sequence[float], improved: bool = True) -> Window:
+        """Make a window whose particles are these, without a keyframe."""
+
+    def copy(self) -> Window:
+        """Copy the window."""
+
+    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64]) -> Step:
+        """
+        Take a keyframe: the motion since the last one, then its measurements (there may be none).
+
+        own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are
+        resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3).
+        Raises MotionError, and leaves the window as it was.
+        """
+
+    def step(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> float:
+        """
+        Take a keyframe as `advance` does, without resampling and innovation; returns the log evidence.
+
+        Raises MotionError, and leaves the window as it was.
+        """
+
+    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> None:
+        """
+        Move the particles without a keyframe; the weights stay. Raises MotionError.
+        """
+
+    def mark(self) -> None:
+        """Make the particles' poses at the last keyframe a pose node."""
+
+    def innovation(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> tuple[float, NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Predict the measurements of known landmarks; returns (v' inv(S) v, v, S), v = z - h. Raises MotionError.
+        """
+
+    def close(self) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], int]:
+        """
+        Match moments with the landmarks solved again along the paths: the submap of the window.
+
+        Returns ids, mean and covariance of (end pose, pose nodes, landmarks by ascending id), and the index in
+        `gaussian.FAULTS` of why they are no Gaussian.
+        """
+
+    def run(self) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], int]:
+        """
+        Match moments of (end pose, landmarks) so far, which are not fused; as `close` without pose nodes.
+
+        Where all errors of the sensor are white the landmarks are those that the particles hold.
+        """
+
+    def replace(self, paths: NDArray[numpy.float64], log_weights: NDArray[numpy.float64], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64]) -> None:
+        """
+        Replace the paths (K, M, 3), with the particles at their ends, the weights and the landmarks.
+        """
+
+    def of_base(self) -> Window:
+        """
+        Copy the window as one of the base: poses and landmarks in the frame of the base's start.
+        """
+
+    def particles(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Copy (poses (M, 3), log_weights (M,), ids (L,), means (M, L, 2), covariances (M, L, 3)).
+        """
+
+    def paths(self) -> NDArray[numpy.float64]:
+        """
+        Copy the pose (K, M, 3) of each particle's line of descent at each of the K keyframes.
+        """
+
+    def mean_path(self) -> NDArray[numpy.float64]:
+        """
+        Compute the weighted mean (K, 3) of the poses at each keyframe, headings on the circle.
+        """
+
+    def sights(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Copy the measurements: keyframes (N,), ids (N,), (range, bearing) (N, 2), and the covariances that they
+        bring (N, 4), or (N, 0) where they bring none.
+        """
+
+    def ids(self) -> NDArray[numpy.uint32]:
+        """Copy the landmarks' numbers in order of first sight."""
+
+    def nodes(self) -> NDArray[numpy.int64]:
+        """Copy the keyframe of each pose node."""
+
+    @property
+    def landmarks(self) -> int:
+        """Number of landmarks."""
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes."""
+
+    @property
+    def effective(self) -> float:
+        """Number of effective particles after the last keyframe."""

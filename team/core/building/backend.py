@@ -1,0 +1,173 @@
+"""Build the native core: the backend that pyproject.toml names, and the build of a source tree.
+
+    python team/core/building/backend.py             build into team/core
+    python team/core/building/backend.py --checked   with sanitizers (TEAMSLAM_CORE=checked)
+
+Wheels are scikit-build-core's. An editable install builds into the source tree and adds that tree
+to the path, nothing else: no import hook stands before a second checkout on PYTHONPATH.
+
+Without a C++ compiler on the machine the build takes the one of the `ziglang` wheel.
+"""
+
+import argparse
+import base64
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[3]
+SOURCES = ROOT / "team" / "core"
+MODULES = "_core_*"
+ZIG = "ziglang>=0.13"
+COMPILERS = ("c++", "g++", "clang++")
+Settings = dict[str, str | list[str]] | None
+
+
+def has_compiler() -> bool:
+    """Whether the machine has a C++ compiler, or names one by CXX."""
+    return bool(os.environ.get("CXX")) or any(map(shutil.which, COMPILERS))
+
+
+def compiler_options() -> list[str]:
+    """Options of CMake for the compiler; Zig's, under names that CMake can call, is used if needed.
+
+    Zig builds its C++ library anew for each target, so the options name one target for all levels
+    and for CMake's trials.
+    """
+    if has_compiler():
+        return []
+    print(
+        "No C++ compiler (c++, g++, clang++) is on the PATH: building with the one of the ziglang"
+        " wheel, which takes about four minutes, once.",
+        file=sys.stderr,
+        flush=True,
+    )
+    # At a lasting place: CMake begins anew where the compiler is another one.
+    folder = ROOT / "build" / "zig"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("c++", "ar", "ranlib"):
+        path = folder / f"zig-{name}"
+        path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {name} "$@"\n', "utf-8")
+        path.chmod(0o755)
+    target = "-O2 -mcpu=x86_64_v2" if platform.machine() in ("x86_64", "AMD64") else "-O2"
+    return [
+        f"-DCMAKE_CXX_COMPILER={folder}/zig-c++",
+        f"-DCMAKE_AR={folder}/zig-ar",
+        f"-DCMAKE_RANLIB={folder}/zig-ranlib",
+        f"-DCMAKE_CXX_FLAGS={target}",
+        "-DCMAKE_TRY_COMPILE_TARGET_TYPE=STATIC_LIBRARY",
+        "-DTEAMSLAM_ZIG=ON",
+    ]
+
+
+def build_in_place(*, checked: bool = False) -> None:
+    """Build the core of this source tree into team/core, or a checked one beside it."""
+    kind = "checked" if checked else "own" if has_compiler() else "zig"
+    folder = ROOT / "build" / f"core-{sys.version_info[1]}-{kind}"
+    _cmake(
+        *("-S", str(SOURCES), "-B", str(folder), "-G", "Ninja"),
+        f"-DPython_EXECUTABLE={sys.executable}",
+        f"-DTEAMSLAM_CHECKED={'ON' if checked else 'OFF'}",
+        *compiler_options(),
+    )
+    _cmake("--build", str(folder))
+    for built in sorted(folder.glob(f"{MODULES}.so")):
+        # Replaced, not rewritten: a process may have the old one in memory.
+        new = SOURCES / f"{built.name}.new"
+        shutil.copy2(built, new)
+        new.replace(SOURCES / built.name)
+
+
+def _cmake(*arguments: str) -> None:
+    command = shutil.which("cmake", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    if command is None:
+        sys.exit("building the core needs cmake and ninja: pip install cmake ninja")
+    # Ninja of the same environment comes before the machine's.
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run([command, *arguments], env={**os.environ, "PATH": path}, check=False)  # noqa: S603
+    if done.returncode:
+        sys.exit(f"building the core failed: cmake {' '.join(arguments)}")
+
+
+# The hooks of PEP 517 and PEP 660.
+
+
+def get_requires_for_build_sdist(config_settings: Settings = None) -> list[str]:
+    """Name what a source distribution needs beside the requirements of pyproject.toml."""
+    from scikit_build_core import build
+
+    return build.get_requires_for_build_sdist(config_settings)
+
+
+def build_sdist(directory: str, config_settings: Settings = None) -> str:
+    """Build the source distribution."""
+    from scikit_build_core import build
+
+    return build.build_sdist(directory, config_settings)
+
+
+def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
+    """Name what a wheel needs: cmake and ninja where they are missing, and a compiler."""
+    from scikit_build_core import build
+
+    needed = build.get_requires_for_build_wheel(config_settings)
+    return needed if has_compiler() else [*needed, ZIG]
+
+
+get_requires_for_build_editable = get_requires_for_build_wheel
+
+
+def build_wheel(
+    directory: str, config_settings: Settings = None, metadata_directory: str | None = None
+) -> str:
+    """Build the wheel."""
+    from scikit_build_core import build
+
+    settings = dict(config_settings or {})
+    for option in compiler_options():
+        name, _, value = option.removeprefix("-D").partition("=")
+        settings[f"cmake.define.{name}"] = value
+    return build.build_wheel(directory, settings, metadata_directory)
+
+
+def build_editable(
+    directory: str, config_settings: Settings = None, metadata_directory: str | None = None
+) -> str:
+    """Build the core in place; the wheel holds the path of the source tree and the metadata."""
+    from scikit_build_core import build
+
+    build_in_place()
+    with tempfile.TemporaryDirectory() as folder:
+        info = build.prepare_metadata_for_build_editable(folder, config_settings)
+        name = info.removesuffix(".dist-info")
+        files = {f"{name.partition('-')[0]}.pth": f"{ROOT}\n".encode()}
+        for path in sorted(Path(folder, info).rglob("*")):
+            if path.is_file() and path.name != "RECORD":
+                files[path.relative_to(folder).as_posix()] = path.read_bytes()
+    tag = "py3-none-any"
+    files[f"{info}/WHEEL"] = (
+        f"Wheel-Version: 1.0\nGenerator: teamslam\nRoot-Is-Purelib: true\nTag: {tag}\n".encode()
+    )
+    record = [f"{each},sha256={_digest(data)},{len(data)}" for each, data in files.items()]
+    files[f"{info}/RECORD"] = "\n".join([*record, f"{info}/RECORD,,", ""]).encode()
+    wheel = f"{name}-{tag}.whl"
+    with zipfile.ZipFile(Path(directory, wheel), "w", zipfile.ZIP_DEFLATED) as archive:
+        for each, data in files.items():
+            archive.writestr(each, data)
+    return wheel
+
+
+def _digest(data: bytes) -> str:
+    return base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Build the native core of this source tree.")
+    parser.add_argument("--checked", action="store_true", help="with sanitizers and bounds checks")
+    build_in_place(checked=parser.parse_args().checked)

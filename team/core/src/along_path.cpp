@@ -1,0 +1,195 @@
+#include "along_path.hpp"
+
+namespace teamslam::window {
+
+using elementary::INF;
+using pack::load, pack::Pack, pack::select, pack::store, pack::WIDTH;
+
+namespace {
+
+constexpr double SOLVED = 1e-6;  // a step of squared Mahalanobis length below it changes nothing
+constexpr int STEPS = 3;
+
+// Sums over the measurements of a landmark: cost, gradient and Hessian; what range and bearing share
+// with their constant errors; and the variances of the last measurement.
+template <class T>
+struct Sums {
+  T cost{}, gx{}, gy{}, xx{}, xy{}, yy{};
+  T rx{}, ry{}, bx{}, by{}, range_sum{}, bearing_sum{}, range_weight{}, bearing_weight{}, cross{};
+  T range_variance{}, bearing_variance{};
+};
+
+// A landmark seen from a path: its distance and direction, and the bearing's innovation.
+template <class T>
+struct Line {
+  T distance, ex, ey, off;
+};
+
+template <class T>
+Line<T> line_to(T at_x, T at_y, const se2::Pose<T>& pose, double bearing) {
+  const T dx = at_x - pose.x, dy = at_y - pose.y;
+  const T apart = pack::sqrt(T(dx * dx + dy * dy));
+  const T distance = select(apart > models::NEAREST_M, apart, pack::all<T>(models::NEAREST_M));
+  const auto is_apart = pack::max(pack::abs(dx), pack::abs(dy)) >= 1e-240;
+  const T direction = elementary::direction_near(pack::abs(dy), select(is_apart, dx, pack::copysign(pack::all<T>(1.0), dx)));
+  const T off = se2::wrapped(T(bearing + pose.heading - pack::copysign(direction, dy)));
+  return {distance, dx / distance, dy / distance, off};
+}
+
+// Adds a measurement's terms by its innovations and weights.
+template <class T>
+void add(Sums<T>& s, const Line<T>& at, T of_range, T of_bearing, T wr, T wb) {
+  const T distance = at.distance, ex = at.ex, ey = at.ey;
+  s.cost += wr * of_range * of_range + wb * of_bearing * of_bearing;
+  const T wr_r = wr * of_range, wb_b = wb * of_bearing / distance, wt = wb / (distance * distance);
+  s.gx += wr_r * ex - wb_b * ey;
+  s.gy += wr_r * ey + wb_b * ex;
+  s.xx += wr * ex * ex + wt * ey * ey;
+  s.xy += (wr - wt) * ex * ey;
+  s.yy += wr * ey * ey + wt * ex * ex;
+  s.rx += wr * ex;
+  s.ry += wr * ey;
+  s.bx -= wb * ey / distance;
+  s.by += wb * ex / distance;
+  s.range_sum += wr_r;
+  s.range_weight += wr;
+  s.bearing_sum += wb * of_bearing;
+  s.bearing_weight += wb;
+}
+
+// Adds a measurement's terms by the covariance that it brings, with those between range and bearing.
+template <class T>
+void add_claim(Sums<T>& s, const Line<T>& at, const Sight& z, const Noise& noise) {
+  const T distance = at.distance, ex = at.ex, ey = at.ey;
+  T of_range = z.range - distance, of_bearing = at.off;
+  T rr = pack::all<T>(z.claim.rr), rb = pack::all<T>(z.claim.rb), bb = pack::all<T>(z.claim.bb);
+  if (z.claim.is_of_point()) {
+    const double reach = pack::max(z.range, models::NEAREST_M);
+    const auto [si, co] = elementary::sin_cos_near(at.off);
+    const models::Turned<T> S = models::turned(z.claim.rr, z.claim.rb * reach, z.claim.bb * reach * reach, si, co);
+    rr = S.along;
+    rb = S.both / distance;
+    bb = S.across / (distance * distance);
+    of_range = reach * co - distance;
+    of_bearing = reach * si / distance;
+  }
+  const T between = rb * pack::sqrt(noise.range_white * noise.bearing_white);
+  const T r = noise.range_white * rr, b = noise.bearing_white * bb;
+  const T determinant = r * b - between * between, wr = b / determinant, w = -between / determinant, wb = r / determinant;
+  const T along = w * of_bearing, across = w * of_range;
+  s.cost += 2.0 * along * of_range;
+  s.gx += along * ex - across * ey / distance;
+  s.gy += along * ey + across * ex / distance;
+  s.xx -= 2.0 * w * ex * ey / distance;
+  s.xy += w * (ex * ex - ey * ey) / distance;
+  s.yy += 2.0 * w * ex * ey / distance;
+  s.rx -= w * ey / distance;
+  s.ry += w * ex / distance;
+  s.bx += w * ex;
+  s.by += w * ey;
+  s.range_sum += along;
+  s.bearing_sum += across;
+  s.cross += w;
+  s.range_variance = rr;
+  s.bearing_variance = bb;
+  add(s, at, of_range, of_bearing, wr, wb);
+}
+
+// Eliminates the constant errors of range and bearing, one after the other, by Schur's complement.
+template <class T>
+void eliminate_errors(Sums<T>& s, const Noise& noise) {
+  if (noise.range_white < 1.0) {
+    const T constant = (1.0 - noise.range_white) * s.range_variance, share = 1.0 / (s.range_weight + 1.0 / constant);
+    const T total = s.range_sum, rx = s.rx, ry = s.ry, cross = s.cross;
+    s.cost -= share * total * total;
+    s.gx -= share * total * rx;
+    s.gy -= share * total * ry;
+    s.xx -= share * rx * rx;
+    s.xy -= share * rx * ry;
+    s.yy -= share * ry * ry;
+    s.bearing_sum -= share * cross * total;
+    s.bx -= share * cross * rx;
+    s.by -= share * cross * ry;
+    s.bearing_weight -= share * cross * cross;
+  }
+  if (noise.bearing_white < 1.0) {
+    const T constant = (1.0 - noise.bearing_white) * s.bearing_variance, share = 1.0 / (s.bearing_weight + 1.0 / constant);
+    const T total = s.bearing_sum, bx = s.bx, by = s.by;
+    s.cost -= share * total * total;
+    s.gx -= share * total * bx;
+    s.gy -= share * total * by;
+    s.xx -= share * bx * bx;
+    s.xy -= share * bx * by;
+    s.yy -= share * by * by;
+  }
+}
+
+// Solves one landmark of some particles. pose_at: their poses at a keyframe; range_weights: as many
+// as there are measurements, of the range as the first evaluation predicts it.
+template <class T, class Path>
+Landmark<T> solve(const Landmark<T>& start, std::span<const Sight> sights, const Noise& noise, Path&& pose_at,
+                  std::span<T> range_weights) {
+  Landmark<T> best = start;
+  T at_x = start.x, at_y = start.y, least = pack::all<T>(INF);
+  auto goes_on = least == INF;
+  const T bearing_weight = pack::all<T>(1.0 / (noise.bearing_white * noise.bearing_variance));
+  for (int step = 0; step <= STEPS; step++) {
+    Sums<T> s;
+    s.bearing_variance = pack::all<T>(noise.bearing_variance);
+    for (std::size_t k = 0; k < sights.size(); k++) {
+      const Sight& z = sights[k];
+      const Line<T> line = line_to<T>(at_x, at_y, pose_at(z.keyframe), z.bearing);
+      if (z.claim.is_made()) {
+        add_claim(s, line, z, noise);
+        continue;
+      }
+      s.range_variance = noise.range_variance + noise.range_per_m2 * line.distance * line.distance;
+      s.bearing_variance = pack::all<T>(noise.bearing_variance);
+      if (step == 0) range_weights[k] = 1.0 / (noise.range_white * s.range_variance);
+      add(s, line, T(z.range - line.distance), line.off, range_weights[k], bearing_weight);
+    }
+    eliminate_errors(s, noise);
+    const T determinant = s.xx * s.yy - s.xy * s.xy;
+    const auto better = (s.cost < least) & (determinant > 0.0) & goes_on;
+    const T step_x = (s.yy * s.gx - s.xy * s.gy) / determinant, step_y = (s.xx * s.gy - s.xy * s.gx) / determinant;
+    least = select(better, s.cost, least);
+    best.x = select(better, at_x, best.x);
+    best.y = select(better, at_y, best.y);
+    best.xx = select(better, T(s.yy / determinant), best.xx);
+    best.xy = select(better, T(-s.xy / determinant), best.xy);
+    best.yy = select(better, T(s.xx / determinant), best.yy);
+    goes_on = better & pack::negation(step_x * s.gx + step_y * s.gy < SOLVED);
+    at_x = select(goes_on, T(at_x + step_x), at_x);
+    at_y = select(goes_on, T(at_y + step_y), at_y);
+    if (!pack::any(goes_on)) break;
+  }
+  return best;
+}
+
+}  // namespace
+
+Rows landmarks_along_paths(std::span<const std::uint32_t> ids, const Rows& starts, const Rows& path,
+                           std::span<const Sight> sights, const Noise& noise) {
+  Rows solved(starts.count(), starts.rows());
+  std::vector<Sight> of_one;
+  std::vector<Pack> range_weights(sights.size());
+  for (std::size_t slot = 0; slot < ids.size(); slot++) {
+    of_one.clear();
+    for (const Sight& each : sights)
+      if (each.id == ids[slot]) of_one.push_back(each);
+    for (std::size_t at = 0; at < starts.stride(); at += WIDTH) {
+      const auto row = [&](std::size_t k) { return load(starts[5 * slot + k] + at); };
+      const auto pose_at = [&](std::size_t keyframe) {
+        return se2::Pose<Pack>{load(path[3 * keyframe] + at), load(path[3 * keyframe + 1] + at),
+                               load(path[3 * keyframe + 2] + at)};
+      };
+      const Landmark<Pack> found =
+          solve<Pack>({row(0), row(1), row(2), row(3), row(4)}, of_one, noise, pose_at, range_weights);
+      std::size_t k = 5 * slot;
+      for (const Pack& each : {found.x, found.y, found.xx, found.xy, found.yy}) store(solved[k++] + at, each);
+    }
+  }
+  return solved;
+}
+
+}  // namespace teamslam::window

@@ -1,0 +1,144 @@
+#include "window.hpp"
+
+namespace teamslam::window {
+
+namespace {
+
+Lower3 factor_of(const Increment& increment) {
+  const auto& [mean, covariance] = increment;
+  const Lower3 L = linalg::semidefinite_factor(covariance);
+  if (!L.is_finite()) throw MotionError("not positive semi-definite");
+  if (!std::isfinite(mean.forward) || !std::isfinite(mean.left) || !std::isfinite(mean.turn))
+    throw MotionError("not finite");
+  return L;
+}
+
+// Poses of the sensor become those of the base, in place; three rows each.
+void move_poses(const se2::Mount& mount, Rows& poses) {
+  for (std::size_t j = 0; j < poses.rows(); j += 3)
+    for (std::size_t i = 0; i < poses.stride(); i++) {
+      const auto [x, y, heading] = mount.base_pose({poses[j][i], poses[j + 1][i], poses[j + 2][i]});
+      poses[j][i] = x;
+      poses[j + 1][i] = y;
+      poses[j + 2][i] = heading;
+    }
+}
+
+// Landmarks from the sensor's start become those from the base's, in place; five rows each.
+void move_landmarks(const se2::Mount& mount, Rows& map) {
+  for (std::size_t j = 0; j < map.rows(); j += 5)
+    for (std::size_t i = 0; i < map.stride(); i++) {
+      const auto [x, y] = mount.base_point({map[j][i], map[j + 1][i]});
+      const auto [xx, xy, yy] = mount.base_spread({map[j + 2][i], map[j + 3][i], map[j + 4][i]});
+      map[j][i] = x;
+      map[j + 1][i] = y;
+      map[j + 2][i] = xx;
+      map[j + 3][i] = xy;
+      map[j + 4][i] = yy;
+    }
+}
+
+}  // namespace
+
+Window::Window(const Settings& settings)
+    : settings_(settings),
+      particles_(settings.particles),
+      path_(settings.particles),
+      effective_(effective_sample_size({particles_.log_weights.data(), settings.particles})) {}
+
+std::vector<Reading> Window::readings_of(const Scan& scan) const {
+  std::vector<Reading> readings;
+  readings.reserve(scan.ids.size());
+  for (std::size_t k = 0; k < scan.ids.size(); k++)
+    readings.push_back(models::reading_of(scan.ranges[k], scan.bearings[k], settings_.noise, scan.claim(k)));
+  return readings;
+}
+
+std::vector<std::size_t> Window::slots_of(const Scan& scan) const {
+  std::vector<std::size_t> slots;
+  slots.reserve(scan.ids.size());
+  for (const std::uint32_t id : scan.ids) slots.push_back(particles_.slot_of(id));
+  return slots;
+}
+
+Innovation Window::innovation(const Increment& increment, const Scan& scan) const {
+  const Lower3 L = factor_of(increment);
+  return innovation_of(particles_, increment.mean, L, slots_of(scan), readings_of(scan));
+}
+
+Step Window::advance(const Increment& increment, const Scan& scan, double uniform, std::span<const double> normals) {
+  const Lower3 L = factor_of(increment);
+  const std::vector<Reading> readings = readings_of(scan);
+  const Innovation innovation = innovation_of(particles_, increment.mean, L, slots_of(scan), readings);
+  if (uniform >= 0.0) particles_.resample(uniform, path_);
+  const double log_evidence = take(increment.mean, L, scan, readings, normals);
+  return {effective_, log_evidence, innovation.squared, innovation.error.size()};
+}
+
+double Window::step(const Increment& increment, const Scan& scan, std::span<const double> normals) {
+  return take(increment.mean, factor_of(increment), scan, readings_of(scan), normals);
+}
+
+double Window::take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
+                    std::span<const double> normals) {
+  particles_.step(motion, L, settings_.is_improved, particles_.find(scan.ids, readings), normals);
+  const std::span<double> log_weights(particles_.log_weights.data(), particles_.count());
+  const double log_evidence = normalise(log_weights);
+  effective_ = effective_sample_size(log_weights);
+  for (std::size_t k = 0; k < scan.ids.size(); k++)
+    sights_.push_back({scan.ids[k], keyframes(), scan.ranges[k], scan.bearings[k], scan.claim(k)});
+  path_.append(particles_.pose);
+  return log_evidence;
+}
+
+void Window::move(const Increment& increment, std::span<const double> normals) {
+  const Lower3 L = factor_of(increment);
+  const std::vector<double> log_weights = particles_.log_weights;
+  particles_.step(increment.mean, L, false, {}, normals);
+  particles_.log_weights = log_weights;
+}
+
+void Window::mark() {
+  if (!keyframes()) throw std::out_of_range("a pose node needs a keyframe");
+  nodes_.push_back(keyframes() - 1);
+}
+
+void Window::replace(Particles particles, Rows path) {
+  particles_ = std::move(particles);
+  path_ = std::move(path);
+  effective_ = effective_sample_size({particles_.log_weights.data(), particles_.count()});
+}
+
+Window Window::of_base() const {
+  Window based = *this;
+  if (settings_.mount.is_mounted()) {
+    move_poses(settings_.mount, based.particles_.pose);
+    move_poses(settings_.mount, based.path_);
+    move_landmarks(settings_.mount, based.particles_.map);
+    based.settings_.mount = {};
+  }
+  return based;
+}
+
+Rows Window::solved_landmarks() const {
+  return landmarks_along_paths(particles_.ids, particles_.map, path_, sights_, settings_.noise);
+}
+
+Gaussian Window::run() const { return gaussian(false, settings_.noise.is_white() ? particles_.map : solved_landmarks()); }
+
+Gaussian Window::gaussian(bool with_nodes, Rows landmarks) const {
+  Rows poses = particles_.pose;
+  if (with_nodes)
+    for (const std::size_t keyframe : nodes_) {
+      Rows node(poses.count(), 3);
+      for (std::size_t k = 0; k < 3; k++) node.set(k, path_[3 * keyframe + k], 1);
+      poses.append(node);
+    }
+  if (settings_.mount.is_mounted()) {
+    move_poses(settings_.mount, poses);
+    move_landmarks(settings_.mount, landmarks);
+  }
+  return submap_moments(poses, {particles_.log_weights.data(), particles_.count()}, particles_.ids, landmarks);
+}
+
+}  // namespace teamslam::window

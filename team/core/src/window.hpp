@@ -1,0 +1,112 @@
+// One window of Hybrid-SLAM: particles that start at zero, and the one Gaussian they become.
+//
+// Poses are the sensor's, in the frame of the window's start of the sensor; a Gaussian is that of
+// the base, in the frame of its start. Brooks and Bailey 2009, HybridSLAM.
+#pragma once
+
+#include <stdexcept>
+
+#include "along_path.hpp"
+#include "innovation.hpp"
+#include "moments.hpp"
+
+namespace teamslam::window {
+
+struct Settings {
+  std::size_t particles;
+  bool is_improved;  // the proposal of FastSLAM 2.0
+  Noise noise;
+  se2::Mount mount;
+};
+
+// The motion since the last keyframe, its covariance in the tangent space of its end.
+struct Increment {
+  Motion mean;
+  std::span<const double, 9> covariance;
+};
+
+// Measurements of landmarks, corrected by the calibration; an id may occur twice. claims: the
+// covariances that they bring, none where empty.
+struct Scan {
+  std::span<const std::uint32_t> ids;
+  std::span<const double> ranges, bearings;
+  std::span<const Claim> claims;
+
+  Claim claim(std::size_t k) const { return claims.empty() ? models::OF_SENSOR : claims[k]; }
+};
+
+// effective: number of effective particles after the step; log_evidence: log p(z | earlier z) by the
+// particles; squared, dof: of the innovation, as of `Innovation`.
+struct Step {
+  double effective, log_evidence, squared;
+  std::size_t dof;
+};
+
+// A motion whose mean or covariance is not finite, or whose covariance is indefinite.
+struct MotionError : std::domain_error {
+  using std::domain_error::domain_error;
+};
+
+inline constexpr double NO_RESAMPLING = -1.0;
+
+class Window {
+ public:
+  explicit Window(const Settings& settings);
+
+  // One keyframe: the innovation of its measurements, resampling where uniform is not NO_RESAMPLING,
+  // and the step of the particles. Throws MotionError, and is then as it was.
+  Step advance(const Increment& increment, const Scan& scan, double uniform, std::span<const double> normals);
+
+  // A keyframe without resampling, whose innovation is not asked for; returns its log evidence.
+  double step(const Increment& increment, const Scan& scan, std::span<const double> normals);
+
+  // Moves the particles without a keyframe; the weights stay. Throws MotionError.
+  void move(const Increment& increment, std::span<const double> normals);
+
+  // Makes the poses at the last keyframe a pose node.
+  void mark();
+
+  Innovation innovation(const Increment& increment, const Scan& scan) const;
+
+  // The Gaussian of (end pose, pose nodes, landmarks by ascending id), landmarks solved again along
+  // the paths.
+  Gaussian close() const { return gaussian(true, solved_landmarks()); }
+
+  // The Gaussian of (end pose, landmarks) so far, which is not fused. Where all of the sensor's
+  // errors are white the landmarks are those that the particles hold: solving them at every keyframe
+  // moves that pose by a hundredth and costs a third of the time.
+  Gaussian run() const;
+
+  // The landmarks of each particle solved over all measurements, rows in order of first sight.
+  Rows solved_landmarks() const;
+
+  // The window as one of the base: poses and landmarks in the frame of the base's start.
+  Window of_base() const;
+
+  // Replaces the paths of the particles, and what follows from them.
+  void replace(Particles particles, Rows path);
+
+  const Settings& settings() const { return settings_; }
+  const Particles& particles() const { return particles_; }
+  const Rows& path() const { return path_; }
+  std::size_t keyframes() const { return path_.rows() / 3; }
+  std::span<const Sight> sights() const { return sights_; }
+  std::span<const std::size_t> nodes() const { return nodes_; }
+  double effective() const { return effective_; }
+
+ private:
+  Gaussian gaussian(bool with_nodes, Rows landmarks) const;
+  double take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
+              std::span<const double> normals);
+  std::vector<Reading> readings_of(const Scan& scan) const;
+  std::vector<std::size_t> slots_of(const Scan& scan) const;
+
+  Settings settings_;
+  Particles particles_;
+  Rows path_;  // x, y, heading of each keyframe, along each particle's line of descent
+  std::vector<Sight> sights_;
+  std::vector<std::size_t> nodes_;  // the keyframe of each pose node
+  double effective_;
+};
+
+}  // namespace teamslam::window

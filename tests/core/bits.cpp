@@ -1,0 +1,94 @@
+// Hash of all results of made-up windows: one number for every compiler and processor.
+//
+// Built by tests/core/test_bits.py together with the sources of team/core. Its inputs come from a
+// generator of its own, since those of the standard library differ between libraries.
+#include <cstdint>
+#include <cstdio>
+
+#include "window.hpp"
+
+using namespace teamslam;
+using window::Rows;
+
+namespace {
+
+std::uint64_t state = 20210917, hash = 1469598103934665603u;
+
+double uniform() {  // Knuth's MMIX generator
+  state = state * 6364136223846793005u + 1442695040888963407u;
+  return double(state >> 11) * 0x1p-53;
+}
+
+double normal() {
+  double sum = -6.0;
+  for (int k = 0; k < 12; k++) sum += uniform();
+  return sum;
+}
+
+void add(double x) {  // FNV-1a
+  std::uint64_t bits = __builtin_bit_cast(std::uint64_t, x);
+  for (int k = 0; k < 8; k++, bits >>= 8) hash = (hash ^ (bits & 255)) * 1099511628211u;
+}
+
+void add(std::span<const double> numbers) {
+  for (const double x : numbers) add(x);
+}
+
+void add(const Rows& rows) {
+  for (std::size_t k = 0; k < rows.rows(); k++) add(rows.numbers(k));
+}
+
+void add(const window::Gaussian& g) {
+  add(g.mean);
+  add(g.covariance);
+  add(double(int(g.fault)));
+}
+
+void run_window(int number) {
+  const std::size_t particles = 1 + std::size_t(130 * uniform());
+  const bool is_mounted = number % 4 == 1;
+  const models::Noise noise = {number % 2 ? 4.0 : 0.01, number % 3 ? 0.0 : 0.002, number % 5 ? 1.0 : 0.6, 0.03,
+                               number % 7 ? 1.0 : 0.7};
+  window::Window run({particles, number % 3 != 2, noise, is_mounted ? se2::Mount(0.3, -0.2, 0.5) : se2::Mount()});
+  for (int k = 0; k < 12; k++) {
+    double A[3][3], covariance[9];
+    for (auto& row : A)
+      for (double& each : row) each = 0.05 * normal();
+    for (int i = 0; i < 3; i++)
+      for (int j = 0; j < 3; j++)
+        covariance[3 * i + j] = A[i][0] * A[j][0] + A[i][1] * A[j][1] + (k % 2 ? A[i][2] * A[j][2] : 0.0);
+    std::vector<std::uint32_t> ids;
+    std::vector<double> ranges, bearings, normals;
+    std::vector<models::Claim> claims;
+    for (int n = int(5 * uniform()); n > 0; n--) {
+      ids.push_back(std::uint32_t(9 * uniform()));
+      ranges.push_back(0.0005 + 20.0 * uniform());
+      bearings.push_back(elementary::PI * (2.0 * uniform() - 1.0));
+      claims.push_back({0.3, 0.001, 0.02, double(int(3.0 * uniform()) - 1)});
+    }
+    if (number % 2) claims.clear();
+    for (std::size_t i = 0; i < 3 * particles; i++) normals.push_back(normal());
+    const window::Increment increment = {{1.0 + 0.2 * normal(), 0.1 * normal(), 0.3 * normal()},
+                                         std::span<const double, 9>(covariance)};
+    const double draw = uniform();
+    const window::Step step =
+        run.advance(increment, {ids, ranges, bearings, claims}, k % 3 == 2 ? draw : window::NO_RESAMPLING, normals);
+    add(step.effective);
+    add(step.log_evidence);
+    if (step.squared == step.squared) add(step.squared);  // the bits of NaN are the processor's
+    add(run.particles().pose);
+    add(run.particles().map);
+    add({run.particles().log_weights.data(), particles});
+    if (k % 5 == 4) run.mark();
+    add(run.run());
+  }
+  add(run.close());
+  add(run.of_base().path());
+}
+
+}  // namespace
+
+int main() {
+  for (int number = 0; number < 40; number++) run_window(number);
+  std::printf("%016llx\n", static_cast<unsigned long long>(hash));
+}

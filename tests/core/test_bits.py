@@ -1,0 +1,109 @@
+"""The core has the same bits whatever compiles it, and no build of it contracts arithmetic."""
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from team import core
+from tests.support import ROOT
+
+FOLDER = ROOT / "team" / "core"
+HASH = "8c51871c169fc457"
+"""Of all results of tests/core/bits.cpp; equal to the bits of the Numba kernels before them."""
+SOURCES = ("window", "particles", "innovation", "along_path", "moments")
+EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
+FUSED = re.compile(r"\s(?:vfn?m(?:add|sub)\w*|fn?m(?:add|sub)|fml[as])\s.*")
+
+
+def hash_of(tmp_path: Path, *command: str) -> str:
+    program = tmp_path / "bits"
+    sources = [FOLDER / "src" / f"{name}.cpp" for name in SOURCES]
+    words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / "tests/core/bits.cpp"]
+    subprocess.run([*words, "-o", program], check=True, capture_output=True, timeout=900)
+    return subprocess.run([program], check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
+def test_gcc_gives_the_same_bits_at_every_level(flags: tuple[str, ...], tmp_path: Path) -> None:
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is not on the path")
+    if "-mavx2" in flags and "avx2" not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("this processor has no AVX2")
+    assert hash_of(tmp_path, "g++", *flags) == HASH
+
+
+def test_clang_gives_the_bits_of_gcc(tmp_path: Path) -> None:
+    """clang comes from the ziglang wheel."""
+    if find_spec("ziglang") is None:
+        pytest.skip("ziglang is not installed: pip install --no-deps -r hashes-zig.txt")
+    assert (
+        hash_of(tmp_path, sys.executable, "-m", "ziglang", "c++", "-O3", "-mcpu=x86_64_v2") == HASH
+    )
+
+
+def test_no_library_holds_a_fused_multiply_add() -> None:
+    if shutil.which("objdump") is None:
+        pytest.skip("objdump is not on the path")
+    built = sorted(FOLDER.glob("_core_*.so"))
+    assert built
+    for library in built:
+        code = subprocess.run(
+            ["objdump", "-d", "--no-show-raw-insn", library],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        assert FUSED.search(code.stdout) is None, library
+
+
+def test_the_search_for_fused_instructions_finds_one(tmp_path: Path) -> None:
+    if shutil.which("g++") is None or shutil.which("objdump") is None:
+        pytest.skip("g++ or objdump is not on the path")
+    source, made = tmp_path / "fused.cpp", tmp_path / "fused.o"
+    source.write_text("double f(double a, double b, double c) { return __builtin_fma(a, b, c); }\n")
+    subprocess.run(["g++", "-O2", "-mfma", "-c", source, "-o", made], check=True)
+    code = subprocess.run(["objdump", "-d", made], check=True, capture_output=True, text=True)
+    assert FUSED.search(code.stdout)
+
+
+def test_the_library_is_built_from_the_sources_that_are_here() -> None:
+    """Else the tests look at another core: `make core` builds it."""
+    sources = [*(FOLDER / "src").glob("*.[ch]pp"), FOLDER / "CMakeLists.txt"]
+    names = sorted(sources, key=lambda path: path.relative_to(FOLDER).as_posix())
+    digests = "".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in names)
+    assert core.digest == hashlib.sha256(digests.encode()).hexdigest()
+
+
+def test_the_type_stub_is_that_of_the_library() -> None:
+    if find_spec("nanobind") is None:
+        pytest.skip("nanobind is not installed")
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import stub; print(stub.made_stub(), end='')"
+    )
+    made = subprocess.run(
+        [sys.executable, "-c", script, FOLDER / "building"],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert made.stdout == (FOLDER / "_core.pyi").read_text()
+
+
+def test_the_level_can_be_chosen() -> None:
+    command = [sys.executable, "-c", "from team import core; print(core.level)"]
+    levels = {}
+    for level in ("base", "absent"):
+        ended = subprocess.run(
+            command, env={**os.environ, "TEAMSLAM_CORE": level}, capture_output=True, text=True,
+            check=False,
+        )  # fmt: skip
+        levels[level] = ended.returncode, ended.stdout.strip(), ended.stderr
+    assert levels["base"][0] == 0
+    assert "avx2" not in levels["base"][1]
+    assert levels["absent"][0] == 1
+    assert "is not built" in levels["absent"][2]

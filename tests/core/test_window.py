@@ -1,0 +1,224 @@
+"""The boundary of the core: what crosses is checked, and what is refused changes nothing.
+
+The results of a window are tested in tests/estimation/hybrid_slam.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from team import core
+
+NOISE = (0.04, 0.001, 1.0, 0.003, 1.0)
+CONSTANT = (0.04, 0.001, 0.5, 0.003, 0.7)
+MOTION, COVARIANCE = np.array([1.0, 0.0, 0.1]), np.diag([0.01, 1e-4, 1e-3])
+M = 20
+RNG = np.random.default_rng(7)
+NORMALS = RNG.standard_normal((M, 3))
+IDS, RANGES, BEARINGS = np.array([3, 1], np.uint32), np.array([5.0, 9.0]), np.array([0.3, -1.0])
+UNCLAIMED = np.empty((2, 0))
+KEYFRAME = (MOTION, COVARIANCE, IDS, RANGES, BEARINGS, UNCLAIMED, None, NORMALS)
+
+
+def opened(keyframes: int = 2, noise: tuple[float, ...] = NOISE) -> core.Window:
+    window = core.Window(M, noise)
+    for _ in range(keyframes):
+        window.advance(*KEYFRAME)
+    return window
+
+
+def bytes_of(window: core.Window) -> list[bytes]:
+    arrays = (
+        *window.particles(),
+        window.paths(),
+        *window.sights(),
+        window.nodes(),
+        *window.close()[:3],
+    )
+    return [array.tobytes() for array in arrays]
+
+
+def changed(place: int, value: object) -> tuple[object, ...]:
+    return *KEYFRAME[:place], value, *KEYFRAME[place + 1 :]
+
+
+WRONG = {
+    "a motion of two numbers": (0, MOTION[:2]),
+    "a covariance of a row": (1, COVARIANCE[:1]),
+    "ids that are signed": (2, np.array([-3, 1])),
+    "an id too few": (2, IDS[:1]),
+    "a range too many": (3, np.ones(3)),
+    "a bearing too few": (4, BEARINGS[:1]),
+    "claims of three columns": (5, np.ones((2, 3))),
+    "a claim too few": (5, np.ones((1, 4))),
+    "a uniform number of one": (6, 1.0),
+    "normal numbers of other particles": (7, NORMALS[:-1]),
+    "normal numbers of two columns": (7, NORMALS[:, :2]),
+    "text": (3, "ranges"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_an_array_of_another_shape_or_type_is_refused(name: str) -> None:
+    window = opened()
+    kept = bytes_of(window)
+    with pytest.raises((ValueError, TypeError)):
+        window.advance(*changed(*WRONG[name]))  # type: ignore[arg-type]
+    assert bytes_of(window) == kept
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [(0, core.MotionError), (1, core.MotionError), (3, core.NotFiniteError),
+     (4, core.NotFiniteError), (7, core.NotFiniteError)],
+)  # fmt: skip
+def test_a_number_that_is_not_finite_is_refused(
+    place: int, error: type[ValueError], bad: float
+) -> None:
+    window = opened()
+    kept = bytes_of(window)
+    array = np.array(KEYFRAME[place])
+    array[-1] = bad
+    with pytest.raises(error):
+        window.advance(*changed(place, array))  # type: ignore[arg-type]
+    assert bytes_of(window) == kept
+
+
+def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one() -> None:
+    window, indefinite = opened(), np.diag([1.0, -1.0, 1.0])
+    kept = bytes_of(window)
+    seen = IDS, RANGES, BEARINGS, UNCLAIMED
+    for refused in (
+        lambda: window.advance(MOTION, indefinite, *seen, None, NORMALS),
+        lambda: window.step(MOTION, indefinite, *seen, NORMALS),
+        lambda: window.move(MOTION, indefinite, NORMALS),
+        lambda: window.innovation(MOTION, indefinite, *seen),
+    ):
+        with pytest.raises(core.MotionError, match="not positive semi-definite"):
+            refused()
+    assert bytes_of(window) == kept
+
+
+def test_a_copy_is_a_window_of_its_own() -> None:
+    window = opened()
+    kept, copied = bytes_of(window), window.copy()
+    copied.advance(*KEYFRAME)
+    copied.mark()
+    copied.move(MOTION, COVARIANCE, NORMALS)
+    assert bytes_of(window) == kept != bytes_of(copied)
+    arrays = window.particles()
+    arrays[0][:] = 0.0
+    assert bytes_of(window) == kept
+
+
+def test_arrays_may_lie_otherwise_and_be_read_only() -> None:
+    window, other = opened(), opened()
+    wide = np.zeros((2, 2))
+    wide[:, 0] = RANGES
+    frozen = NORMALS.copy()
+    frozen.flags.writeable = False
+    window.advance(*changed(3, wide[:, 0])[:-1], frozen)  # type: ignore[arg-type]
+    other.advance(*KEYFRAME)
+    assert bytes_of(window) == bytes_of(other)
+
+
+def test_the_innovation_of_a_keyframe_is_that_which_advance_returns() -> None:
+    window = opened()
+    squared, error, S = window.innovation(*KEYFRAME[:6])
+    step = window.advance(*KEYFRAME)
+    assert (step.squared, step.dof) == (squared, len(error)) == (squared, len(S))
+    assert core.normalised_square(error, S) == squared
+
+
+def test_a_window_of_particles_goes_on_as_the_one_they_come_from() -> None:
+    window = opened()
+    again = core.Window.of_particles(*window.particles(), NOISE)
+    log = again.step(*KEYFRAME[:6], NORMALS)
+    assert window.advance(*KEYFRAME).log_evidence == log
+    for one, other in zip(window.particles(), again.particles(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_replacing_paths_by_themselves_changes_nothing() -> None:
+    window = opened(3, CONSTANT)
+    kept = bytes_of(window)
+    _, log_weights, _, means, covariances = window.particles()
+    window.replace(window.paths(), log_weights, means, covariances)
+    assert bytes_of(window) == kept
+    with pytest.raises(ValueError, match="paths must be"):
+        window.replace(window.paths()[:1], log_weights, means, covariances)
+
+
+def test_particles_that_do_not_fit_each_other_are_refused() -> None:
+    poses, logs, ids, means, covariances = opened().particles()
+    fitting = poses, logs, ids, means, covariances
+    for place, wrong in enumerate(
+        (poses[:-1], logs[:-1], ids[:-1], means[:, :1], covariances[:-1])
+    ):
+        with pytest.raises(ValueError, match="must be"):
+            core.Window.of_particles(*fitting[:place], wrong, *fitting[place + 1 :], NOISE)
+    with pytest.raises(ValueError, match="ids must differ"):
+        core.Window.of_particles(poses, logs, np.full(2, 3, np.uint32), means, covariances, NOISE)
+    with pytest.raises(ValueError, match="M > 0"):
+        core.Window.of_particles(
+            *(each[:0] for each in (poses, logs)), ids[:0], means[:0], covariances[:0], NOISE
+        )
+    with pytest.raises(core.NotFiniteError):
+        core.Window.of_particles(poses, logs + np.inf, ids, means, covariances, NOISE)
+
+
+def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path() -> None:
+    with pytest.raises(IndexError):
+        core.Window(M, NOISE).mark()
+    window = opened()
+    keyframes, seen, measurements, own = window.sights()
+    _, _, ids, means, covariances = window.particles()
+    solved = (ids, means, covariances, window.paths())
+    core.landmarks_along_paths(*solved, keyframes, seen, measurements, own, NOISE)
+    for wrong in (keyframes + 1, keyframes - 1):
+        with pytest.raises(ValueError, match="not in the paths"):
+            core.landmarks_along_paths(*solved, wrong, seen, measurements, own, NOISE)
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 127, 128, 129, 1000, 4099])
+def test_the_sum_of_squares_in_the_sample_factor_has_the_order_of_numpy(count: int) -> None:
+    weights = RNG.dirichlet(np.ones(count))
+    squares = float(np.add.reduce(weights * weights))
+    assert core.sample_factor(weights) == 1.0 / (1.0 - 5.0 * min(squares, 0.1))
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.integers(1, 40), st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([NOISE, CONSTANT])
+)
+def test_windows_of_any_size_run_and_close(
+    count: int, seed: int, improved: bool, noise: tuple[float, ...]
+) -> None:
+    """Sizes, ids and claims at random, for a build with sanitizers to find reads beyond an end."""
+    rng = np.random.default_rng(seed)
+    window = core.Window(count, noise, improved, (0.1, 0.2, 0.3) if seed % 2 else (0.0, 0.0, 0.0))
+    for k in range(int(rng.integers(0, 5))):
+        n = int(rng.integers(0, 6))
+        own = np.column_stack((np.tile([0.1, 0.001, 0.02], (n, 1)), rng.integers(-1, 2, n)))
+        uniform = float(rng.random()) if rng.random() < 0.5 else None
+        window.advance(
+            MOTION, COVARIANCE, rng.integers(0, 5, n).astype(np.uint32), rng.uniform(0.0, 20.0, n),
+            rng.uniform(-3.0, 3.0, n), own if seed % 3 else own[:, :0], uniform,
+            rng.standard_normal((count, 3)),
+        )  # fmt: skip
+        if k % 2:
+            window.mark()
+        window.run()
+    ids, mean, covariance, _ = window.close()
+    assert (np.diff(ids.astype(np.int64)) > 0).all()
+    assert covariance.shape == (len(mean), len(mean))
+    assert (
+        len(mean)
+        == 3 + 3 * len(window.nodes()) + 2 * len(ids)
+        == 3 + 3 * len(window.nodes()) + 2 * window.landmarks
+    )
+    based, weights = window.of_base(), np.exp(window.particles()[1])
+    assert len(based.paths()) == window.keyframes == len(window.mean_path())
+    assert np.isclose(weights.sum(), 1.0)
