@@ -1,5 +1,5 @@
-"""Conversion of associations of landmarks without names, and of an operator's verdicts, to messages
-and back.
+"""Conversion of associations of unnamed landmarks, and of an operator's verdicts, to and from
+messages.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ SHOWN = 1 + LAST
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
     """Tabulate the unnamed landmarks: member, identity, step.
 
-    every: all members of each landmark, or its first and its last ones only.
+    every: all members of each landmark, else its first and last ones.
     """
     entries = sorted(_all_members(landmarks) if every else _summarised_members(landmarks))
     table = []
@@ -53,7 +53,7 @@ def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membersh
 
 
 Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
-"""A member, its identity, the index in STEPS of its step, and the figures of that."""
+"""A member, its identity, the index of its step in STEPS, and the figures of that step."""
 
 
 def _summarised_members(landmarks: Landmarks) -> Iterator[Entry]:
