@@ -239,8 +239,6 @@ class TeamAttendance:
         return False
 
     def _possible_ends(self) -> Iterator[m.End]:
-        """The announced ends whose streams are each confirmed or excused."""
-
         def is_open(stream: m.StreamEnd) -> bool:
             return self._confirmed(stream) is None and not self._is_excused(stream.robot)
 
@@ -251,7 +249,6 @@ class TeamAttendance:
                 yield end
 
     def _is_excused(self, name: str) -> bool:
-        """Whether the robot was given up, or was withdrawn and is offline."""
         robot = self.robots[name]
         return robot.given_up or (name in self.withdrawn and not robot.alive)
 

@@ -185,7 +185,6 @@ def _block_diagonal(blocks: Float[np.ndarray, "n 2 2"]) -> Matrix:
 def _from_start(
     local: LocalMap, covariance: Matrix, own: Int64[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "k k"]]:
-    """Express landmarks of a submap, with covariance, in the frame of its start pose."""
     at = _numbers(local, own)
     return local.landmarks[own], covariance[np.ix_(at, at)]
 
@@ -212,7 +211,6 @@ def _from_end(
 
 
 def _numbers(local: LocalMap, own: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
-    """Return the indices of landmarks in a submap's mean."""
     first = len(local.mean) - 2 * len(local.ids)
     return (first + 2 * own[:, None] + np.arange(2)).ravel()
 

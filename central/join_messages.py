@@ -111,7 +111,6 @@ def team_map(
 def _landmarks(
     fold: Fold, shown: Sequence[int], *, joint: bool
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"], bytes]:
-    """Return identities, positions [m] and the packed covariance of landmarks."""
     if not fold.contributions:
         return np.empty(0, np.uint32), np.empty((0, 2)), b""
     if joint:
@@ -187,7 +186,6 @@ def reasons(
 
 
 def _lost(shown: Shown) -> Iterator[str]:
-    """Describe where robots were lost for a while."""
     for stream, sigma in sorted(shown.headings.items()):
         yield (
             f"{named(stream)} was lost: its heading is known to {np.degrees(sigma):.0f}° at worst; "
@@ -196,7 +194,6 @@ def _lost(shown: Shown) -> Iterator[str]:
 
 
 def _misfitting(fold: Fold) -> Iterator[str]:
-    """Name the landmark that the submaps place most differently."""
     found = worst_landmark(fold.main) if fold.contributions else None
     if found is not None:
         yield (
@@ -221,7 +218,6 @@ def _repeated(shown: Shown) -> Iterator[str]:
 
 
 def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...]:
-    """Describe the landmarks left out of the map."""
     if not fold.contributions:
         return ()
     known = landmark_view.known(fold.main)
@@ -283,7 +279,6 @@ def in_main_island(fold: Fold, stream: Stream) -> bool:
 
 
 def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
-    """Make the message that voids a stream's priors from before this map."""
     return m.Prior(
         stamp_ns=fused.stamp_ns,
         robot=stream[0],
@@ -366,6 +361,5 @@ def _best_attempt(fold: Fold, key: Stream) -> str | None:
 
 
 def _worded(words: Sequence[str]) -> tuple[str, ...]:
-    """Number the items, and count the rest."""
     more = len(words) - NAMED
     return (*words[:NAMED], *([f"{more} more refusals"] if more > 0 else []))

@@ -146,7 +146,6 @@ class CentralShell:
         return [node for node, since in self._since.items() if now - since >= for_s]
 
     def _give_up(self) -> None:
-        """Give up robots that have been lost for longer than patience_s."""
         for node in [] if self._patience_s is None else self._away(self._patience_s):
             del self._since[node]
             why = f"lost for {self._patience_s:g} s, the centre's --patience"

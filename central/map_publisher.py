@@ -108,7 +108,6 @@ class MapPublisher:
     def _publish(
         self, tail: Tail, closed_ns: float, now_ns: int, *, ahead: bool = True
     ) -> list[Outgoing]:
-        """Make a map and its accompanying messages, after the withdrawals that it causes."""
         out = self.fold.make_map(tail, closed_ns, ahead=ahead)
         self._published_ns = self._quiet_ns = now_ns
         for each in out:
@@ -132,7 +131,6 @@ class MapPublisher:
         return {stream: last for stream, last in lasts if last >= 0}
 
     def _has_news(self, until_ns: float) -> bool:
-        """Whether the last map lacks a submap that ends up to this time."""
         left_out = self._left_out
         for stream, chain in self.store.chains.items():
             following = self._published.get(stream, -1) + 1
@@ -144,7 +142,6 @@ class MapPublisher:
 
     @property
     def _left_out(self) -> Collection[str]:
-        """Withdrawn and suspended robots, which maps leave out."""
         return {*self.store.withdrawals, *self._announced, *self.fold.suspended}
 
     # Withdrawals.
@@ -180,7 +177,6 @@ class MapPublisher:
 
 
 def _lacks(members: Mapping[Stream, int], of: Mapping[Stream, int]) -> bool:
-    """Whether the first version vector lacks a submap of the second."""
     return any(members.get(stream, -1) < last for stream, last in of.items())
 
 

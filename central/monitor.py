@@ -156,7 +156,6 @@ def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
 
 
 def _misscale(scale: Scale, limit: float) -> str:
-    """Word the warning about a scale beyond the limit and beyond chance; empty without one."""
     value = scale.value
     if value <= 0.0:
         return ""
@@ -179,7 +178,6 @@ def _level(chi2: float, dof: float) -> str | None:
 
 
 def _worst(agreement: Agreement) -> list[str]:
-    """Name the submaps that the rest of the map contradicts beyond chance."""
     quantile = 1.0 - (1.0 - QUANTILE) / max(len(agreement.submaps), 1)
     wrong = [
         (each.chi2 / each.dof, each)

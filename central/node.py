@@ -152,7 +152,6 @@ class CentralNode:
         return out + (self._conclude_anyway(why) if self._concluding else self._conclude())
 
     def _take_final(self, final: m.FusedMap) -> list[Outgoing]:
-        """Adopt the final map that an earlier process of this centre has published."""
         if final.final and not self.finished:
             self.finished, self.final = True, final
         return []
@@ -267,7 +266,6 @@ class CentralNode:
 
     @property
     def _is_over(self) -> bool:
-        """Whether the streams have ended and no part of them is awaited."""
         return self.attendance.is_concluded() and self.has_all_measurements
 
     def _conclude(self) -> list[Outgoing]:

@@ -120,7 +120,6 @@ class SentPriors:
 
 
 def _newest_encounters(fold: Fold) -> dict[str, int]:
-    """Return the team time [ns] of the newest inter-robot measurement of or by each robot."""
     newest: dict[str, int] = {}
     for encounter in fold.main.graph.sightings:
         seen = encounter.sighting

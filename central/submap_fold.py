@@ -161,7 +161,6 @@ class SubmapFold:
     def _messages(
         self, ticks: TickFold, fold: Fold, tail: Tail, recorded: RecordedFields | None
     ) -> list[Outgoing]:
-        """Make the messages of a fold: the map, with priors or, at the end, the whole paths."""
         final = tail == "final"
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None

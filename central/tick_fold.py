@@ -109,7 +109,6 @@ class TickFold:
         self._restart(Conviction())
 
     def _restart(self, conviction: Conviction) -> None:
-        """Drop all folded ticks, under another conviction."""
         self._conviction = conviction
         self._retried = 0.0
         self.checkpoints = Checkpoints()
@@ -197,7 +196,6 @@ class TickFold:
 
     @property
     def _until_ns(self) -> float:
-        """The end of the last folded tick."""
         return (self.checkpoints.tick + 1) * self._inputs.tick_ns
 
     def fold_until(self, watermark_ns: float) -> bool:
@@ -256,7 +254,6 @@ class TickFold:
         return self._agreed[1]
 
     def _due_for_retrial(self, tick: int) -> str | None:
-        """Return a suspended robot due for another test at a tick, or None."""
         suspended = self._conviction.suspended
         if not suspended:
             return None
@@ -264,7 +261,6 @@ class TickFold:
         return next((r for r in sorted(suspended) if size >= suspended[r].retried), None)
 
     def _size_until(self, tick: float) -> int:
-        """Count the submaps up to a tick, those of suspended robots included."""
         gone = self._gone.difference(self._conviction.suspended)
         ticks = self._inputs.ticks_after(-math.inf, gone)
         return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
@@ -372,7 +368,6 @@ class TickFold:
                 return fold
 
     def _fold_raw(self) -> Fold:
-        """Return the fold over all ticks with nothing condensed."""
         fold = self.fold
         if self._limits is None or fold.size <= self._limits.begin:
             return fold

@@ -57,14 +57,12 @@ Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
 
 
 def _summarised_members(landmarks: Landmarks) -> Iterator[Entry]:
-    """Iterate over the first and the last members of each landmark."""
     for id_, members in landmarks.present.items():
         for member in (members.first, *members.last):
             yield _make_entry(member, id_)
 
 
 def _all_members(landmarks: Landmarks) -> Iterator[Entry]:
-    """Iterate over all members of all landmarks."""
     identities = landmarks.identities()
     for stream, sequence, rows in landmarks.log.all_rows():
         for row in rows.tolist():
@@ -72,7 +70,6 @@ def _all_members(landmarks: Landmarks) -> Iterator[Entry]:
 
 
 def _make_entry(member: MemberRecord, id_: int) -> Entry:
-    """Make the entry of a member of the landmark with this identity."""
     name, tie = member
     if tie is None:
         return name, id_, 0, (0.0, 0.0, 0.0)

@@ -210,7 +210,6 @@ def _largest(found: Mapping[str, float]) -> float:
 
 
 def _words_of(opposed: tuple[str, ...], found: Mapping[str, float]) -> str:
-    """Name robots that contradict each other; empty where there are none."""
     if len(opposed) < 2:
         return ""
     return (

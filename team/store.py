@@ -265,12 +265,10 @@ class SubmapStore:
 
 
 def _nearest(submaps: Mapping[int, m.Submap], sequence: int) -> tuple[int | None, int | None]:
-    """Return the stored sequences next below and above this one."""
     below = max((s for s in submaps if s < sequence), default=None)
     return below, min((s for s in submaps if s > sequence), default=None)
 
 
 def _in_order(judgement: m.Judgement) -> m.Judgement:
-    """Order the landmarks of a judgement, the smaller one first."""
     first, second = sorted((judgement.first, judgement.second), key=msgspec.structs.astuple)
     return m.Judgement(first=first, second=second, same=judgement.same)

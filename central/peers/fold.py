@@ -134,7 +134,6 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Whether all members up to an announced end are in the set."""
         return any(self._is_here(end) for end in self.centre.attendance.ends)
 
     def _is_here(self, end: m.End) -> bool:

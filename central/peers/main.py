@@ -147,7 +147,6 @@ class PeerShell(RobotShell):
             tap([member.as_sample(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
-        """Whether no other peer needs this one: all have concluded, or the world has left."""
         if self._alone.since(now, alone=self._peer.is_left_alone):
             return True
         if self._peer.final is None:

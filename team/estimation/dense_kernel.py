@@ -195,7 +195,6 @@ def _add_terms(
 
 @compiled
 def _take(rows: Panel, i: int, factor: float, k: int, begin: int) -> None:
-    """Subtract `factor` times row k from row i, from column `begin` on."""
     for j in range(begin, rows.shape[1]):
         rows[i, j] -= factor * rows[k, j]
 
@@ -305,7 +304,6 @@ def solve_lower(L: Matrix, right: Panel) -> None:
 
 @compiled
 def _solve_lower_one(L: Matrix, right: Panel) -> None:
-    """Solve one column of `solve_lower`, four rows at once."""
     n = len(L)
     whole = n - n % 4
     for k in range(0, whole, 4):

@@ -195,7 +195,6 @@ def find_closure(
 
 
 def _compare_with_rivals(closure: Closure, others: Sequence[Placement]) -> Closure:
-    """Update the closure's rival by the best of `others`, if that is better."""
     best = max(others, key=lambda each: each.as_rival, default=None)
     if best is None or best.as_rival <= closure.rival_llr:
         return closure
@@ -203,7 +202,6 @@ def _compare_with_rivals(closure: Closure, others: Sequence[Placement]) -> Closu
 
 
 def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: AssociationProfile) -> float:
-    """Estimate the evidence for an alignment from the positions as voted."""
     local = patch.points.mean - patch.points.mean.mean(axis=0)
     sides = (apply_motion(vote.motion, local), vote.first), (target.points.mean, vote.second)
     absent, _ = _count_missing(*sides, (patch.views, target.views), profile)

@@ -197,7 +197,6 @@ def _drop_uncertain(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> Int64[np.ndarray, " N"]:
-    """Leave out unnamed detections whose association is uncertain (`certain`)."""
     sure = association_probabilities(scans, landmark_of, window, settings) >= settings.certain
     return np.where(sure | (scans.names != UNASSIGNED), landmark_of, UNASSIGNED)
 
@@ -207,7 +206,6 @@ def _mark_confirmed(
     names: Int64[np.ndarray, " L"],
     settings: AssociationSettings,
 ) -> Bool[np.ndarray, " L"]:
-    """Mark the accepted landmarks: named, or detected often enough."""
     counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
     return np.asarray((counts >= settings.least_seen) | (names != UNASSIGNED))
 
@@ -247,7 +245,6 @@ def _mark_clutter(
 
 
 def _is_rare(seen: int, looks: int, settings: AssociationSettings) -> bool:
-    """Whether P(at most `seen` of `looks` detections) < RARE with the detection probability."""
     p = settings.detection_probability
     term, total = math.prod([1.0 - p] * looks), 0.0
     for c in range(seen + 1):

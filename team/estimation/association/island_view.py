@@ -184,7 +184,6 @@ class IslandView:
             self.sees[:, pair.first] = False
 
     def _resolve(self, places: Indices) -> Indices:
-        """Replace merged landmarks by those that they are merged into."""
         return np.unique(self._merged_into[places])
 
     def apply_verdicts(self) -> None:

@@ -81,7 +81,6 @@ def condition_on_pair(joint: Joint, first: int, second: int, profile: Associatio
 
 
 def _inherit(relation: Bool[np.ndarray, "n n"], first: int, second: int) -> Bool[np.ndarray, "n n"]:
-    """Give the second the entries of both in a symmetric relation."""
     out = relation.copy()
     out[second] = out[:, second] = relation[first] | relation[second]
     return out
@@ -169,7 +168,6 @@ def _find_rivals(
 
 
 def _list_common(landmarks: Indices) -> tuple[Indices, Indices]:
-    """List every two pairs that have a landmark in common, in both orders."""
     order = np.argsort(landmarks, kind="stable")
     ordered = landmarks[order]
     begin = np.searchsorted(ordered, ordered, side="left")

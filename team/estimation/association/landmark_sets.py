@@ -193,7 +193,6 @@ def add_landmarks(
 
 
 def _choose_numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[int]:
-    """Choose the numbers of new members, none given before."""
     numbers = [number_of(each) for each in members]
     if len(set(numbers)) == len(numbers) and not log.mark_given(np.array(numbers, np.uint32)).any():
         return numbers

@@ -303,7 +303,6 @@ def _is_match_missed(
     points: Float[np.ndarray, "n 2"],
     reach: float,
 ) -> bool:
-    """Whether an unmatched detection and an unmatched landmark lie within reach of each other."""
     seen, _ = tracker.predict_landmarks()
     free = np.ones(len(seen), np.bool_)
     free[found[found != UNASSIGNED]] = False

@@ -130,7 +130,6 @@ def _propose_motions(
 def _list_baselines(
     points: Float[np.ndarray, "n 2"], shortest: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """List the pairs of points with a distance in this interval, and their distances."""
     i, j = np.triu_indices(len(points), 1)
     length = elementwise.hypot(*(points[i] - points[j]).T)
     chosen = (length >= shortest) & (length <= longest)

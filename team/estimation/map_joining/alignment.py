@@ -100,7 +100,6 @@ def aligned(
 
 
 def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
-    """Align points that all lie at one place: they determine the translation and no heading."""
     unknown = np.full((3, 3), np.inf)
     return Alignment(np.array([*shift, 0.0]), unknown, np.inf, 2 * n - 3, np.inf)
 

@@ -47,7 +47,6 @@ def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings)
 
 
 def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSettings) -> Fold:
-    """Fold the ticks since a closure again, without the closure."""
     opened = audit.opened
     words = f"share {share:.2f} < {settings.association.undone_below:g} after {len(audit.ticks)}"
     stamp_ns = max((each.end_ns for each in after.contributions[-1:]), default=0)

@@ -261,7 +261,6 @@ def _iterated(
 
 @compiled
 def _moved(state: Values, offset: Indices, step: Float[np.ndarray, "n 1"], share: float) -> Values:
-    """Add a share of a step, headings wrapped."""
     moved = state.copy()
     for i in range(len(state)):
         moved[i] += share * step[i, 0]

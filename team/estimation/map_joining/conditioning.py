@@ -219,7 +219,6 @@ def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> SolvedChain:
 
 
 def _starts(parts: Sequence[np.ndarray]) -> Int64[np.ndarray, " _"]:
-    """Return the offset of each row in their concatenation, and its length."""
     return np.cumsum([0, *map(len, parts)], dtype=np.int64)
 
 
@@ -238,7 +237,6 @@ def is_majority(refused: int, known: int) -> bool:
 
 
 def _most(dof: int) -> float:
-    """χ² quantile of CONTRADICTED, above which a map and submaps contradict each other."""
     return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
 
 
@@ -251,7 +249,6 @@ def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings
 
 
 def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
-    """Mark the landmarks of each submap that lie beyond the gate, by their own covariance."""
     factors = island.graph.factors
     beyond = landmark_chi2(island.state, island.graph.offset, factors, 1.0) > GATE
     return np.split(beyond, factors.block_start[1:-1])[1:]

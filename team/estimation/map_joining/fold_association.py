@@ -99,7 +99,6 @@ class _IslandViews:
 
 
 def _track_island(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
-    """Track, compare and sweep the landmarks of the new submaps of one island."""
     view = view_island(fold.islands[key], fold.landmarks)
     order = {each.observation[:2]: k for k, each in enumerate(view.submaps)}
     present = [
@@ -129,7 +128,6 @@ def _apply_merges(fold: Fold, key: Stream, view: IslandView) -> Fold:
 
 
 def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> Fold:
-    """Close a loop of the stream's last submaps inside their island, if there is one."""
     key = fold.home[stream]
     view = views.view(fold, key)
     found = search_island(view, stream, last)
@@ -154,7 +152,6 @@ def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> F
 def _join_island(
     fold: Fold, stream: Stream, last: int, other_key: Stream, views: _IslandViews
 ) -> Fold:
-    """Merge the stream's island with another one in which its last submaps are found."""
     key = fold.home[stream]
     mine, theirs = views.view(fold, key), views.view(fold, other_key)
     found = search_other_island(mine, theirs, stream, last)

@@ -134,7 +134,6 @@ class Island:
 
     @cached_property
     def _submaps(self) -> kernel.SubmapFactors:
-        """The submaps, with their noise at this state."""
         factors = self.graph.factors
         if not self.settings.joined_ranges:
             return factors
@@ -142,7 +141,6 @@ class Island:
 
     @cached_property
     def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
-        """χ² of each landmark of each submap by itself, and its gate."""
         factors, settings = self._submaps, self.settings
         if settings.robust_c is None:
             return np.zeros(len(factors.block)), np.ones(len(factors.block))
@@ -304,7 +302,6 @@ class Island:
         )
 
     def _prior_cost(self, chosen: Bool[np.ndarray, " priors"]) -> float:
-        """Cauchy's loss of the biases' priors, χ² of the others."""
         c2 = 1.0 if self.settings.robust_c is None else elementary.squared(self.settings.robust_c)
         of_bias = (self.prior_weight < 1.0) & chosen
         robust = float((c2 * elementwise.log1p(self.prior_chi2[of_bias] / c2)).sum())

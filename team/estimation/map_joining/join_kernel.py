@@ -129,7 +129,6 @@ def _in_order(
     covariance: Float[np.ndarray, "p p"],
     order: Int64[np.ndarray, " L"],
 ) -> Joined:
-    """The map with its landmarks in this order, its covariance exactly symmetric."""
     place, n = coordinates(order, 3, 3), len(mean)
     sorted_mean, P = np.empty(n), np.empty((n, n))
     for i in range(n):

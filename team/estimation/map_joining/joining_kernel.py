@@ -131,7 +131,6 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
 
 @compiled
 def _turn_and_stretch(values: Values, i: int, j: int, c: float, s: float, stretch: float) -> None:
-    """Rotate the point stored at indices i and j, and scale it by `stretch`, in place."""
     x, y = values[i], values[j]
     values[i], values[j] = stretch * (c * x - s * y), stretch * (s * x + c * y)
 

@@ -107,7 +107,6 @@ def _biases_in(island: Island) -> list[BiasEstimate]:
 
 
 def _found_biases(island: Island) -> list[BiasEstimate]:
-    """Estimate an island's biases from one joint covariance with the common ones."""
     common = island.graph.common
     own = sorted(island.graph.biases.items())
     joined = [(node, common[bias]) for (_, bias), node in own if bias in common]
@@ -216,7 +215,6 @@ def main_priors(
 def _priors_in(
     island: Island, landmarks_of: Mapping[Stream, Sequence[int]]
 ) -> dict[Stream, RobotPrior]:
-    """Make a prior of each stream with the given landmarks, ascending, by one solve."""
     streams = island.graph.streams
     found = joints(island, [([streams[of][-1]], ids) for of, ids in landmarks_of.items()])
     biases = _biases_in(island)
@@ -248,7 +246,6 @@ def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
 
 
 def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
-    """Covariance between two poses that one submap connects."""
     if island.graph.fixed[row] or island.graph.fixed[column]:
         return np.zeros((3, 3))
     return island.graph.pattern.block(island.selected_covariance, row, column)

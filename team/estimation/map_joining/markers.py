@@ -72,7 +72,6 @@ def _find_unmarked(island: Island) -> dict[int, int]:
 
 
 def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
-    """List the numbers of a submap's landmarks with a new marker, in its order."""
     if "range_scale" not in submap.contribution.local.biases:
         return []
     return [number[node] for node in submap.landmarks.tolist() if node in number]

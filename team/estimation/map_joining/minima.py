@@ -132,7 +132,6 @@ def searched(starts: Sequence[Island]) -> Search:
 
 
 def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
-    """Iterate over the minima of the starts that have a solution."""
     for start in starts:
         found = None
         with suppress(*UNSOLVABLE), np.errstate(all="ignore"):
@@ -305,7 +304,6 @@ def warnings(search: Search) -> list[str]:
 
 
 def _heading_sigmas(island: Island) -> dict[Stream, float]:
-    """Return the standard deviation [rad] of each stream's best known heading."""
     return {
         stream: min(heading_sigma(island, node) for node in nodes)
         for stream, nodes in island.graph.streams.items()

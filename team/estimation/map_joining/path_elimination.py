@@ -138,7 +138,6 @@ def without_paths(
 
 
 def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]]:
-    """Split the marked submaps of each stream into runs."""
     streams: dict[Stream, list[int]] = defaultdict(list)
     for f in np.flatnonzero(leaving).tolist():
         streams[island.graph.submaps[f].contribution.stream].append(f)
@@ -150,7 +149,6 @@ def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]
 def _of_run(
     island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: MarkedFactors
 ) -> MarkedFactors:
-    """Mark a run's submaps and the other factors of its eliminated poses."""
     graph = island.graph
     submaps = np.zeros(len(graph.submaps), np.bool_)
     submaps[run] = True

@@ -76,7 +76,6 @@ def _in_reach(
 
 
 def _of_members(sightings: Iterable[InterRobotFactor], fold: Fold) -> list[InterRobotFactor]:
-    """Select the inter-robot measurements whose submaps are not refused."""
     gone = {key[1:] for key in fold.refused}
     return [each for each in sightings if (*each.stream, each.sequence) not in gone]
 
@@ -88,7 +87,6 @@ def _attempt(
     sightings: Sequence[InterRobotFactor],
     settings: JoinSettings,
 ) -> Fold | None:
-    """Fold one tick with these members; None where it has no solution."""
     for start in starts:
         fold = started(fold, start)
     try:

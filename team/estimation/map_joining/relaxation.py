@@ -139,7 +139,6 @@ def _points(
     places: Float[np.ndarray, "n 2"],
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
-    """Equations of points with these coordinates in the frame of a start pose."""
     n = len(points)
     numbers = np.empty((2 * n, 4), dtype=np.int64)
     numbers[0::2, 0], numbers[1::2, 0] = points, points + 1
@@ -158,7 +157,6 @@ def _turns(
     angles: Float[np.ndarray, " n"],
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
-    """Equations of headings of these poses relative to a start pose's."""
     n = len(poses)
     s, c = elementwise.sin_and_cos(angles)
     numbers = np.empty((2 * n, 3), dtype=np.int64)

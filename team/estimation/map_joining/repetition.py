@@ -92,7 +92,6 @@ def _find_in_stream(
     points: Float[np.ndarray, "n 2"],
     ids: list[int],
 ) -> Repetition | None:
-    """Find the repetition of a stream with the smallest shared part; None if there is none."""
     rows = np.flatnonzero(own)
     elsewhere = sees[~own].any(axis=0)
     candidates = []
@@ -134,7 +133,6 @@ def _find_in_stream(
 def _align_beyond_chance(
     own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
 ) -> Vote | None:
-    """Find the motion that matches most points with others; None where chance explains it."""
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
@@ -164,5 +162,4 @@ def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius
 
 
 def _log_choose(n: int, k: int) -> float:
-    """Compute ln of the binomial coefficient."""
     return elementary.log(float(math.comb(n, k)))

@@ -135,7 +135,6 @@ def agreed(
 def _shared(
     one: UInt32[np.ndarray, " L"], other: UInt32[np.ndarray, " K"]
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-    """Return the indices of the numbers that two ascending rows share."""
     first, second = np.empty(len(other), np.int64), np.empty(len(other), np.int64)
     i, k = 0, 0
     for j in range(len(other)):
@@ -169,7 +168,6 @@ def _part(
     covariance: Float[np.ndarray, "n n"],
     entries: Int64[np.ndarray, " m"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
-    """Return the marginal over these entries."""
     m = len(entries)
     of_mean, of_covariance = np.empty(m), np.empty((m, m))
     for i in range(m):
@@ -268,7 +266,6 @@ def of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[n
 def _multiply(
     A: Float[np.ndarray, "q m"], x: Float[np.ndarray, " m"], out: Float[np.ndarray, " q"]
 ) -> None:
-    """Write A x into `out`."""
     for row in range(len(A)):
         total = 0.0
         for column in range(len(x)):

@@ -88,7 +88,6 @@ def _parts(whole: WholeMap, local: LocalMap) -> Maps:
 
 
 def _refuse(fault: int) -> None:
-    """Raise NotACovarianceError where there is a fault."""
     if fault == INDEFINITE:
         raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
     if fault == SINGULAR:
@@ -135,12 +134,10 @@ def _sights(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray
 
 
 def _entries(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Indices of the pose's numbers and of the landmarks with these indices."""
     return np.concatenate([np.arange(3), 3 + _points(index)])
 
 
 def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Indices of the coordinates of points."""
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 

@@ -45,7 +45,6 @@ def minimum_degree(sizes: Indices, column_start: Indices, rows: Indices) -> Elim
 
 @compiled
 def _tie(adjacent: Bits, degree: Indices, sizes: Indices, i: int, j: int) -> None:
-    """Make i ≠ j neighbours; `degree` counts the unknowns of the neighbours."""
     bit = np.uint64(1) << np.uint64(j & 63)
     if not adjacent[i, j >> 6] & bit:
         adjacent[i, j >> 6] |= bit
@@ -88,7 +87,6 @@ def _neighbours(adjacent: Bits, vertex: int, found: Indices) -> int:
 
 @compiled
 def _least(degree: Indices, eliminated: Bool[np.ndarray, " n"]) -> int:
-    """Return the remaining vertex of least degree, the first among equals."""
     least = -1
     for i in range(len(degree)):
         if not eliminated[i] and (least < 0 or degree[i] < degree[least]):

@@ -47,9 +47,6 @@ def _places(requested: Indices, present: Indices, place: Indices) -> None:
 
 @compiled
 def _factorise_panel(panel: Float[np.ndarray, "w m"], least: Values) -> int:
-    """Factorise a panel (dense Cholesky) in place; return the first column whose pivot is ≤ least,
-    or −1.
-    """
     width, m = panel.shape
     if products.is_big(width, m):
         return products.factorise_by_blocks(panel, least)
