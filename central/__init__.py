@@ -1,1 +1,1 @@
-"""The central computer: fusion rules, the node that keeps the set of submaps, and its shell."""
+"""The central computer: the node that stores and folds the set of submaps, and its process."""

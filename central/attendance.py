@@ -1,4 +1,4 @@
-"""The attendance of a team: which robots are present, how far each is, and which are awaited."""
+"""Track which robots are present, how far each is, and which the final map awaits."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -11,18 +11,16 @@ _OfAnEnd = tuple[m.End, Awaited[m.StreamEnd]]
 HasReceived = Callable[[m.Done], bool]
 """Whether all messages announced in a robot's `Done` have been processed."""
 Processed = Callable[[tuple[str, int]], int]
-"""Number of submaps of a stream that have been processed."""
+"""Number of processed submaps of a stream."""
 
 
 @dataclass
 class TeamAttendance:
-    """The progress and presence of each robot of the team.
+    """Progress and presence of each robot of the team.
 
-    has_received, processed: the progress of the node itself. now_ns: the newest team time in any
-    message. withdrawn: the robots that were withdrawn; the map waits for them only while they are
-    present. world_end: the last counters that the world has announced. ends: all announced ends,
-    refused ones included; one that the robots' `Done` messages confirm becomes world_end. ordered:
-    an operator has ordered the live team to end.
+    now_ns: the newest team time in any message. world_end: the last counters that the world
+    announced. ends: all announced ends, refused ones included; one that the robots' `Done` messages
+    confirm becomes world_end. ordered: an operator has ordered the live team to end.
     """
 
     robots: dict[str, Attendance]
@@ -46,7 +44,7 @@ class TeamAttendance:
     def of(
         cls, robots: Sequence[str], has_received: HasReceived, processed: Processed
     ) -> "TeamAttendance":
-        """The attendance of a team at its start."""
+        """Create the attendance of a team at its start."""
         return cls({robot: Attendance() for robot in sorted(robots)}, has_received, processed)
 
     def admit(self, robot: str) -> None:
@@ -55,14 +53,14 @@ class TeamAttendance:
         self._changed.add(robot)
 
     def forget_members(self) -> None:
-        """Forget the members of a set that will be taken again: `Done` and `GivenUp` messages."""
+        """Forget `Done` and `GivenUp`, members of a set that is filed again."""
         for robot in self.robots.values():
             robot.done, robot.given_up = None, False
             robot.dones.clear()
         self._changed.update(self.robots)
 
     def take(self, message: m.Message) -> None:
-        """Take a message's information on its sender; messages of strangers are ignored."""
+        """Update the attendance from a message; messages of strangers are ignored."""
         self.note_change(message)
         match message:
             case m.Submap() | m.MapEstimate():
@@ -120,9 +118,7 @@ class TeamAttendance:
 
     @property
     def is_live(self) -> bool:
-        """True where drivers, each with its own end, publish the measurements, and no world
-        does.
-        """
+        """Whether drivers, each with its own end, publish the measurements, instead of a world."""
         return self.ordered or self._has_head
 
     @property
@@ -130,7 +126,7 @@ class TeamAttendance:
         """The last counters of all streams, from a world or from every driver; None while one is
         open.
 
-        Where a live team was ordered to end, a robot whose driver is absent ends where it is done.
+        In a live team that was ordered to end, a robot without a driver ends where it is done.
         """
         if self.world_end is not None or not self.is_live:
             return self.world_end
@@ -149,7 +145,7 @@ class TeamAttendance:
         return m.End(stamp_ns=self.now_ns, streams=tuple(streams))
 
     def _never_measured(self, name: str) -> bool:
-        """True where a live team was ordered to end before this robot had begun."""
+        """Whether a live team was ordered to end before this robot had begun."""
         return self.ordered and not self.robots[name].began
 
     def is_complete(self, name: str) -> bool:
@@ -162,7 +158,7 @@ class TeamAttendance:
         )
 
     def contradicts(self, end: m.End) -> str | None:
-        """Why this can not be the end of the team's streams, in words."""
+        """Give the reason why this cannot be the end of the team's streams; None if it can."""
         ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
@@ -178,20 +174,20 @@ class TeamAttendance:
         return None
 
     def is_settled(self, name: str) -> bool:
-        """Whether the final map need not wait for this robot: it is complete, or it was given up,
-        or it was withdrawn and is offline.
+        """Whether the final map need not wait for this robot: all its submaps arrived, it was given
+        up, or it was withdrawn and is offline.
 
-        The map waits for a lost robot: it may come back, and the map must not depend on when.
+        The map waits for a lost robot: it may return, and the map must not depend on when.
         """
         return self._is_excused(name) or self._never_measured(name) or self.is_complete(name)
 
     @property
     def given_up(self) -> list[str]:
-        """The robots that are given up by an order."""
+        """The robots given up by an order."""
         return [robot for robot, attendance in self.robots.items() if attendance.given_up]
 
     def missing(self) -> list[str]:
-        """The robots of the team whose streams are not complete.
+        """List the robots whose streams are not complete.
 
         In a live team that was ordered to end, also those whose drivers may have measured more.
         """
@@ -228,8 +224,8 @@ class TeamAttendance:
     def _accept_confirmed_end(self) -> bool:
         """Accept an announced end and the robots' `Done` messages that confirm each other.
 
-        Without keys, a stranger can announce ends and `Done` messages beyond the last measurement;
-        those of the world and of its robots name the same counters all the same.
+        Without keys, a stranger can announce an end and a `Done` beyond the last measurement; those
+        of the world and of its robots still name the same counters.
         """
         for end in self._possible_ends():
             found = {s.robot: self._confirmed(s) for s in end.streams}
@@ -243,8 +239,6 @@ class TeamAttendance:
         return False
 
     def _possible_ends(self) -> Iterator[m.End]:
-        """The announced ends whose streams are each confirmed or excused."""
-
         def is_open(stream: m.StreamEnd) -> bool:
             return self._confirmed(stream) is None and not self._is_excused(stream.robot)
 
@@ -255,19 +249,20 @@ class TeamAttendance:
                 yield end
 
     def _is_excused(self, name: str) -> bool:
-        """Whether the robot was given up, or was withdrawn and is offline."""
         robot = self.robots[name]
         return robot.given_up or (name in self.withdrawn and not robot.alive)
 
     def _confirmed(self, end: m.StreamEnd) -> m.Done | None:
-        """The robot's `Done` that confirms this end of its stream, if all of it was processed."""
+        """Return the robot's `Done` that confirms this end of its stream, if all of it was
+        processed.
+        """
         robot = self.robots[end.robot]
         counts = end.incarnation, end.measurements
         same = (d for d in robot.dones if (d.incarnation, d.measurements) == counts)
         return next(filter(self.has_received, same), None)
 
     def takes_part(self, name: str) -> bool:
-        """Whether the robot may still send a map; a lost one may come back."""
+        """Whether the robot may still send a map; a lost one may return."""
         robot = self.robots[name]
         return robot.done is None and not robot.given_up
 
@@ -275,7 +270,7 @@ class TeamAttendance:
     def watermark_ns(self) -> float:
         """The least progress of the live robots: every submap that ends before it has arrived.
 
-        Only robots of which a message came since the last call are looked at again.
+        Only robots with a message since the last call are evaluated again.
         """
         of_all = (self.end, self.withdrawn, self.ordered, self._has_head)
         if of_all != self._of_all:
@@ -287,8 +282,8 @@ class TeamAttendance:
         return self._least.value
 
     def _until_ns(self, name: str) -> float:
-        """The progress of one robot, if all its submaps until then have arrived; infinite where
-        the map does not wait for the robot.
+        """Progress of one robot if all its submaps until then have arrived; infinite where the map
+        does not wait for it.
         """
         robot = self.robots[name]
         if robot.lost or self._is_away(robot) or self.is_settled(name):
@@ -299,10 +294,8 @@ class TeamAttendance:
         return progress.stamp_ns
 
     def _is_away(self, robot: Attendance) -> bool:
-        """In a live team: True for a robot that has not begun or whose driver is absent; nothing
-        waits for it.
-
-        What it sends later rolls the fold back.
+        """Whether a robot of a live team has not begun or has no driver; its later messages roll
+        the fold back.
         """
         if not self.is_live:
             return False

@@ -1,12 +1,12 @@
-"""Finds where a withdrawn robot was carried off, or slipped, and by how much.
+"""Find where a withdrawn robot was carried off, or slipped, and by how much.
 
-Each submap of the robot that has enough named landmarks of the map without it is aligned to that
-map twice: in the frame of its start pose, and in that of its end pose. The end of one submap and
-the start of the next are one pose: a seam. A robot that was carried off contradicts the map at
-exactly one seam; before and after it every submap fits the map and every seam is closed. A sensor
-or an odometry that is wrong deforms the submaps, or opens many seams: then nothing is found.
+Each submap of the robot that shares enough named landmarks with the map of the others is aligned to
+that map twice: in the frame of its start pose, and in that of its end pose. The end of one submap
+and the start of the next are one pose: a seam. A robot that was carried off contradicts the map at
+exactly one seam; before and after it every submap fits the map and every seam is closed. A wrong
+sensor or odometry deforms the submaps, or opens many seams: then nothing is found.
 
-A submap takes up a small motion shortly before its end: the seam behind it then shows only a part.
+A submap absorbs a small motion shortly before its end: the seam after it shows only a part.
 """
 
 import math
@@ -30,13 +30,13 @@ from team.estimation.map_joining.marginals import landmark_blocks
 from team.estimation.submap import LocalMap
 
 LEAST_SHARED = 3
-"""Least number of a submap's landmarks that the map has: two fit their mirror image, too."""
+"""Least number of landmarks that a submap shares with the map: two also fit their mirror image."""
 LEAST_SIDE = 2
-"""Least number of submaps before the open seam, and after it, that fit the map."""
+"""Least number of submaps that fit the map on each side of the open seam."""
 SEAM_DOF = 3.0
 """Degrees of freedom of a seam."""
 MOST_SHARED = 40
-"""Most landmarks of a submap that are aligned: those with the smallest ids."""
+"""Most landmarks of a submap that are aligned, by smallest id."""
 MOST_SUBMAPS = 2000
 """Longer streams are not examined: it would take seconds."""
 
@@ -49,9 +49,9 @@ class CarriedOff(NamedTuple):
     """A motion of a robot that its odometry did not measure.
 
     before, after: numbers of the last submap before it and of the first one after it. begin_ns,
-    end_ns: the end of the one and the beginning of the other, equal where none is between them.
-    by: the motion, in the map's frame (x [m], y [m], turn [rad]); in_all: the robot's own way from
-    the one to the other is part of it, since the submap between them is spoilt.
+    end_ns: their end and beginning, equal where no submap is between. by: the motion in the map's
+    frame (x [m], y [m], turn [rad]). in_all: `by` includes the robot's own motion between the two,
+    since the submap between them is spoilt.
     """
 
     robot: str
@@ -63,7 +63,7 @@ class CarriedOff(NamedTuple):
     in_all: bool
 
     def __str__(self) -> str:
-        """The motion in words."""
+        """Describe the motion."""
         dx, dy, turn = self.by
         begin, end = moment(self.begin_ns), moment(self.end_ns)
         when = f"at t = {begin}" if begin == end else f"between t = {begin} and {end}"
@@ -76,7 +76,7 @@ class CarriedOff(NamedTuple):
 
 
 class _Placed(NamedTuple):
-    """A submap that fits the map: its place in the chain, and where it starts and ends."""
+    """A submap that fits the map: its place in the chain, its start and end pose."""
 
     at: int
     start: Alignment
@@ -84,10 +84,10 @@ class _Placed(NamedTuple):
 
 
 class _Seam(NamedTuple):
-    """Two submaps that follow each other, by their places in the chain.
+    """Two consecutive submaps, by their places in the chain.
 
-    gap: the motion from the end of the one to the start of the other that is not the robot's own,
-    in the map's frame; chi2: its χ².
+    gap: the motion, in the map's frame, from the end of the one to the start of the other, less the
+    robot's own; chi2: its χ².
     """
 
     before: int
@@ -97,13 +97,14 @@ class _Seam(NamedTuple):
 
 
 def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> CarriedOff | None:
-    """Find the seam at which a robot was carried off; None where its submaps do not show just that.
+    """Find the seam at which a robot was carried off; None where its submaps do not show exactly
+    that.
 
-    rest: the team without the robot. chain: the submaps of one of its streams, in order. limit: the
-    cost per degree of freedom above which a seam is open, where chance does not explain it. The
-    other seams agree if theirs, all in all, is at most the share AGREEING of it or within chance,
-    and less than that of the open one. A submap in which the robot was carried off may fit nothing,
-    or leave both its seams open.
+    rest: the team without the robot. chain: the submaps of one of its streams, in order. limit:
+    cost per degree of freedom above which a seam is open, unless chance explains it. The other
+    seams agree if their total is at most the share AGREEING of it or within chance, and less than
+    that of the open one. A submap in which the robot was carried off may fit nothing, or leave both
+    its seams open.
     """
     if not rest.home or len(chain) > MOST_SUBMAPS:
         return None
@@ -147,11 +148,10 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
 def _placed(
     rest: Fold, chain: Sequence[Contribution], limit: float
 ) -> tuple[list[_Placed], list[int]]:
-    """The submaps that fit the map, and the places in the chain of those that do not.
+    """Return the submaps that fit the map, and the places in the chain of those that do not.
 
-    limit: the cost per degree of freedom above which one does not, where chance does not explain
-    it. Submaps that share too few landmarks with the map are neither. The map's landmarks count as
-    independent: an error that they share moves both sides of a seam alike.
+    Submaps that share too few landmarks are neither. The map's landmarks count as independent: an
+    error that they share moves both sides of a seam alike.
     """
     ids, points, blocks = landmark_blocks(rest, [i for i in known(rest.main) if i < UNNAMED])
     placed, misfits = [], []
@@ -185,7 +185,6 @@ def _block_diagonal(blocks: Float[np.ndarray, "n 2 2"]) -> Matrix:
 def _from_start(
     local: LocalMap, covariance: Matrix, own: Int64[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "k k"]]:
-    """Some landmarks of a submap in the frame of its start pose, and their covariance."""
     at = _numbers(local, own)
     return local.landmarks[own], covariance[np.ix_(at, at)]
 
@@ -193,7 +192,7 @@ def _from_start(
 def _from_end(
     local: LocalMap, covariance: Matrix, own: Int64[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "k k"]]:
-    """Some landmarks of a submap in the frame of its end pose e: Rᵀ(l − e), and their covariance.
+    """Express landmarks of a submap, with covariance, in the frame of its end pose e: Rᵀ(l − e).
 
     ∂/∂l = Rᵀ, ∂/∂e = −Rᵀ, and ∂/∂θ = (y, −x) of the result.
     """
@@ -212,15 +211,12 @@ def _from_end(
 
 
 def _numbers(local: LocalMap, own: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
-    """The places of some landmarks' numbers in a submap's mean."""
     first = len(local.mean) - 2 * len(local.ids)
     return (first + 2 * own[:, None] + np.arange(2)).ravel()
 
 
 def _seam(chain: Sequence[Contribution], one: _Placed, two: _Placed) -> _Seam:
-    """The seam between two submaps; the motion of those between them is added to the first one's
-    end.
-    """
+    """Evaluate the seam between two submaps, with the motion of those between them."""
     pose, covariance = one.end.a_from_b, one.end.covariance
     for each in chain[one.at + 1 : two.at]:
         step = each.local.end_pose

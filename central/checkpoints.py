@@ -1,4 +1,4 @@
-"""The folds after single ticks: few enough to keep, near enough to go back to."""
+"""Checkpoints of the fold after single ticks, thinned by age."""
 
 import math
 from dataclasses import dataclass, replace
@@ -7,19 +7,18 @@ from team.estimation.map_joining.condensing import Limits, condense_submaps
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
 
 NEWEST = 4
-"""Number of newest ticks whose checkpoints are all kept; of older ones as many for each doubling
-of the age."""
+"""Number of newest ticks whose checkpoints are all kept; of older ones as many per doubling of
+age."""
 NEAR = 4
-"""Number of newest checkpoints that keep what their next tick is added to."""
+"""Number of newest checkpoints that keep their condensed fold."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
     """The fold after a tick.
 
-    tested: its number of submaps when suspects were last tested. number: of the ticks that were
-    folded, this one included. ahead: the same fold condensed, once it was asked for: if more of the
-    next tick arrives, that tick is folded again from the same.
+    tested: number of submaps when suspects were last tested. number: count of folded ticks, this
+    one included. ahead: the same fold condensed, cached for the next tick.
     """
 
     tick: int
@@ -30,10 +29,7 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """A stack of checkpoints by tick: a tick is pushed, a late input pops those that lack it.
-
-    kept: the checkpoints, in the order of their ticks.
-    """
+    """A stack of checkpoints by tick: a tick is pushed, a late input pops those that lack it."""
 
     def __init__(self) -> None:
         self.kept: tuple[Checkpoint, ...] = ()
@@ -45,16 +41,16 @@ class Checkpoints:
 
     @property
     def tick(self) -> float:
-        """The last tick that was folded; minus infinity if none was."""
+        """The last folded tick; minus infinity if none."""
         return self.kept[-1].tick if self.kept else -math.inf
 
     @property
     def tested(self) -> int:
-        """Number of submaps in the fold when suspects were last tested; 0 if they never were."""
+        """Number of submaps in the fold when suspects were last tested; 0 if never."""
         return self.kept[-1].tested if self.kept else 0
 
     def push(self, tick: int, fold: Fold) -> None:
-        """Add the fold after one more tick; older ones are compacted, and thinned by their age."""
+        """Push the fold after one more tick; compact older ones and thin them by age."""
         *before, last = self.kept or (None,)
         number = 1 if last is None else last.number + 1
         older = () if last is None else (*before, _compacted(last))
@@ -74,7 +70,7 @@ class Checkpoints:
         return ahead
 
     def note_tested(self, size: int) -> None:
-        """Note that suspects were tested in the last fold, which has this number of submaps."""
+        """Note that suspects were tested in the last fold, with this number of submaps."""
         self.kept = (*self.kept[:-1], replace(self.kept[-1], tested=size))
 
     def roll_back(self, tick: float) -> None:
@@ -88,10 +84,10 @@ def _compacted(checkpoint: Checkpoint) -> Checkpoint:
 
 
 def thinned(kept: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
-    """Return the checkpoints to keep: the newest, then ever fewer.
+    """Select the checkpoints to keep, ever fewer with age.
 
-    Of those that are n to 2n ticks old two to four are kept: a late submap is folded from a
-    checkpoint that is at most twice as old as it, and there are about twenty in all.
+    Two to four of those that are n to 2n ticks old are kept: a late submap is folded from a
+    checkpoint at most twice as old as itself, and there are about twenty in all.
     """
     last = kept[-1].number
     return tuple(each for each in kept if each.number % _spacing(last - each.number) == 0)

@@ -10,7 +10,7 @@ from team.config import Bounds, FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prior standard deviations of the errors that all submaps of a robot share.
+    """Prior standard deviations of the errors shared by all submaps of a robot.
 
     bearing [rad]; range_offset [m]; range_scale, forward_scale: shares of the range and of the
     distance driven.
@@ -23,12 +23,11 @@ class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prior standard deviations of the errors that all robots share, beside each robot's own; 0:
+    """Prior standard deviations of the errors shared by all robots, beside each robot's own; 0:
     none.
 
-    An error of a common calibration is the same for all robots of a kind. marker: a share of the
-    range by which a landmark's marker appears too far to every robot, since it hangs higher or
-    differs in size.
+    marker: share of the range by which a landmark's marker appears too far to every robot, since it
+    hangs higher or differs in size.
     """
 
     bearing: NonNegative = 0.0
@@ -41,29 +40,27 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fusion rule and its parameters.
 
-    fusion: `join` keeps a set of submaps and joins them by least squares; `team.pairs` says what
-    the others consume. Under rules with feedback the robots absorb the map again: their covariance
-    counts measurements more than once, save that of `covariance-intersection`. tick_s: the fold
-    takes the submaps of this much team time at once. broadcast_s: at least this much team time lies
-    between two broadcasts of the fused map. robust_c: scale of the Cauchy loss on sqrt(chi2/dim) of
-    each submap, under `batch` on sqrt(chi2) of each measurement (a range and a bearing); absent:
-    plain squares. landmark_submaps: a landmark enters the map once so many consistent submaps have
-    it; above 1 where outliers are expected. covariance_factor: the submaps' covariances are
-    multiplied by it; 1 for a sensor whose errors are independent from measurement to measurement.
-    normal_scale: the monitor's covariance scale where the covariances are right. 1 where the errors
-    of windows are independent; less where part of them lasts longer than a window, since a common
-    error of two windows does not show in their difference. particles: of `joint-fastslam`.
-    bias_sigma: of the errors that robots send their submaps' sensitivities for. common_bias_sigma:
-    of the part of these errors that all robots share, in addition. joined_ranges: for errors
-    proportional to the range, a submap's landmarks are weighted by the range in the joined map:
-    weighted by the measured range, short measurements weigh more and the map shrinks.
-    landmark_sigma [m]: standard deviation, in each direction, of the point that all robots measure
-    of a landmark about the landmark's own place (the front of a cylinder, a marker that hangs
-    beside its post): added to the covariance of each landmark of the map.
-    withdraw_above: a robot is withdrawn if the cost of the team's submaps per degree of freedom is
-    above this with it, and the rest of the team agrees without it and without no other robot;
-    absent: by an operator only. least_sigma: least standard deviations [m, rad] of what one submap
-    measures; one that claims less has its covariance raised by these, and is named; 0: none.
+    fusion: `join` joins submaps by least squares; `team.pairs` lists the inputs of the others.
+    Under rules with feedback the robots absorb the map again: their covariance counts measurements
+    more than once, save that of `covariance-intersection`. tick_s: span of team time that is folded
+    at once. broadcast_s: least team time between two broadcasts of the map. robust_c: scale of the
+    Cauchy loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2) of each measurement (a
+    range and a bearing); absent: plain squares. landmark_submaps: number of consistent submaps that
+    a landmark needs to enter the map; above 1 where outliers are expected. covariance_factor:
+    scales the submaps' covariances; 1 for errors independent from measurement to measurement.
+    normal_scale: the monitor's covariance scale where the covariances are right: 1 where the errors
+    of windows are independent; less where part of them outlasts a window, since a common error of
+    two windows does not show in their difference. particles: of `joint-fastslam`. bias_sigma: of
+    the errors whose sensitivities robots send. common_bias_sigma: of the part of them that all
+    robots share, in addition. joined_ranges: for errors proportional to the range, weight a
+    submap's landmarks by the range in the joined map: weighted by the measured range, short
+    measurements weigh more and the map shrinks. landmark_sigma [m]: standard deviation, per
+    direction, of the measured point of a landmark, the same for all robots, about the landmark's
+    own place (the front of a cylinder, a marker beside its post); added to the covariance of each
+    landmark of the map. withdraw_above: a robot is withdrawn if the cost of the team's submaps per
+    degree of freedom is above this with it, and the rest of the team agrees without it and without
+    no other robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of
+    one submap's estimate; one below them has its covariance raised by them, and is named; 0: none.
     bounds: submaps, inter-robot measurements and initial poses beyond them are refused.
     association: thresholds for merging landmarks without identities: a profile for each kind of
     sensor.

@@ -1,7 +1,7 @@
 """The inputs of a fold by ticks of team time: submaps, initial poses and verdicts.
 
-They only grow, except for verdicts, which an operator may withdraw. Nothing here is computed from a
-fold: `tick` returns what one tick brings, and a fold without some robots reads the same inputs.
+They only grow, except for verdicts, which an operator may withdraw. None depends on a fold, so a
+fold without some robots reads the same inputs.
 """
 
 import math
@@ -34,16 +34,16 @@ class FoldInputs:
         self._starts[(start.robot, start.incarnation)] = start
 
     def add_submap(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """Add a submap with the inter-robot measurements from it, all of which `digest` names;
-        return its tick.
+        """Add a submap with the inter-robot measurements from it, all named by `digest`; return its
+        tick.
         """
         tick = self._members.add(submap, digest, sightings)
         self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
         return tick
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> float:
-        """Replace the verdicts; return the first tick that has both landmarks of a changed one,
-        infinity if there is none.
+        """Replace the verdicts; return the first tick with both landmarks of a changed one, else
+        infinity.
         """
         changed = self._verdicts.symmetric_difference(verdicts)
         self._verdicts = set(verdicts)
@@ -59,8 +59,8 @@ class FoldInputs:
         return max(known) if len(known) == len(ticks) else None
 
     def first_tick_of(self, robot: str) -> float:
-        """Return the first tick with a submap of a robot or an inter-robot measurement of it;
-        infinity if there is none.
+        """Return the first tick with a submap of a robot or an inter-robot measurement of it, else
+        infinity.
         """
         ticks = self._members.behind(-math.inf)
         return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
@@ -71,7 +71,7 @@ class FoldInputs:
         return [tick for tick in ticks if self._members.has(tick, without)]
 
     def size(self, tick: int, without: Collection[str]) -> int:
-        """Count the submaps of a tick, those of some robots left out."""
+        """Count the submaps of a tick without some robots."""
         return len(self._members.keys(tick, without))
 
     def chains(self, robot: str) -> Mapping[Stream, Sequence[Contribution]]:
@@ -92,8 +92,8 @@ class FoldInputs:
     def tick(self, tick: int, without: Collection[str]) -> Tick:
         """Return the members of a tick without some robots' submaps and measurements of these.
 
-        Submaps beyond the bounds are named as such; inter-robot measurements and initial poses
-        beyond them are set aside in words.
+        Submaps, inter-robot measurements and initial poses beyond the bounds are refused, with the
+        reason.
         """
         order = self._members.keys(tick, without)
         submaps = [self._members.contribution(key) for key in order]
@@ -138,8 +138,8 @@ class FoldInputs:
     def digest(
         self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]
     ) -> bytes:
-        """Name a fold's set: `more`, the robots left out, initial poses and verdicts, then
-        the submaps in canonical order. closed: the last tick whose digest is worth caching.
+        """Digest a fold's set: `more`, the robots left out, initial poses and verdicts, then the
+        submaps in canonical order. closed: the last tick whose digest is worth caching.
         """
         starts = [
             digest_of(

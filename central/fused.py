@@ -29,10 +29,11 @@ def fused_message(
     cost: tuple[float, int] = (0.0, 0),
     reasons: tuple[str, ...] = (),
 ) -> m.FusedMap:
-    """A map with its members and the name of its inputs; with landmarks' own covariances only
-    unless `joint`. exchange: of the lockstep round, if there are rounds. cost: (χ², dof).
+    """Make the message of a map with its members; without `joint`, with each landmark's own
+    covariance.
 
-    What no receiver would take is left out (`receivable`).
+    exchange: number of the lockstep round, if there are rounds. cost: (χ², dof). Landmarks that no
+    receiver accepts are left out (`receivable`).
     """
     joint = joint and len(value.ids) <= JOINT_LANDMARKS
     fused = m.FusedMap(
@@ -57,15 +58,15 @@ def fused_message(
 
 
 def version_entry(stream: tuple[str, int], sequence: int) -> m.VersionEntry:
-    """The entry of a version vector for all submaps of (robot, incarnation) up to `sequence`."""
+    """Make the entry of a version vector for all submaps of (robot, incarnation) up to
+    `sequence`.
+    """
     robot, incarnation = stream
     return m.VersionEntry(robot=robot, incarnation=incarnation, sequence=sequence)
 
 
 def receivable(fused: m.FusedMap) -> m.FusedMap:
-    """The map as every receiver accepts it; the reasons for what is left out are added to
-    `reasons`.
-    """
+    """Reduce a map to what every receiver accepts; `reasons` gains the reasons for omissions."""
     if unsound(fused) is None:
         return fused
     refusals = []

@@ -1,4 +1,4 @@
-"""Makes the messages of a map from a fold: the map, priors for robots, their paths."""
+"""Make the messages of a map from a fold: the map, priors for robots, their paths."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -40,11 +40,12 @@ PRIOR_LANDMARKS = 30
 """Most landmarks in a robot's prior: the nearest ones."""
 CONFIRMED_BY = 2
 """Least number of submaps of a landmark without identity in the final map: a few false detections
-in a row look like a landmark in a single window. Running maps show tentative ones, too."""
+in a row look like a landmark in one window. Running maps show tentative ones, too.
+"""
 NAMED = 10
-"""Most landmarks left out of the map, refusals, and robots of an island that are named."""
+"""Most names in a list of omitted landmarks, refusals, or robots of an island."""
 FEW = 3
-"""Most pairs of landmarks without names that are named."""
+"""Most pairs of landmarks without names in such a list."""
 NONE_SHARED = f"not joined: {SharedPoints(0)}, "
 
 
@@ -63,8 +64,9 @@ def team_map(
     biases: Sequence[BiasEstimate],
     reasons: tuple[str, ...],
 ) -> m.FusedMap:
-    """The map of a fold with the landmarks `shown`; cost: (χ², dof). The covariance is the joint
-    one of a final map of no more than JOINT_LANDMARKS, else each landmark's own.
+    """Make the map of a fold with the landmarks `shown`; cost: (χ², dof).
+
+    The covariance is joint in a final map of at most JOINT_LANDMARKS, else each landmark's own.
     """
     joint = tail == "final" and len(shown) <= JOINT_LANDMARKS and bool(fold.contributions)
     ids, means, covariance = _landmarks(fold, shown, joint=joint)
@@ -109,7 +111,6 @@ def team_map(
 def _landmarks(
     fold: Fold, shown: Sequence[int], *, joint: bool
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"], bytes]:
-    """Identities, positions [m] and the packed covariance of these landmarks."""
     if not fold.contributions:
         return np.empty(0, np.uint32), np.empty((0, 2)), b""
     if joint:
@@ -122,11 +123,11 @@ def _landmarks(
 class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
-    undecided: landmarks that are left out since each may be one with another, which is shown.
-    weak: landmarks that are left out since only submaps of a poorly known heading have them.
-    missed: landmarks that are left out since nearly all submaps that look there miss them.
-    headings: of the streams that were lost, the standard deviation [rad] of their least known one.
-    repeated: parts of the map that repeat others; their landmarks are left out.
+    undecided: left out, since each may be the same as a landmark that is shown. weak: left out,
+    since only submaps of a poorly known heading observed them. missed: left out, since nearly all
+    submaps that look there miss them. headings: largest heading standard deviation [rad] of each
+    stream that was lost. repeated: parts of the map that repeat others; their landmarks are left
+    out.
     """
 
     ids: Sequence[int] = ()
@@ -138,8 +139,10 @@ class Shown(NamedTuple):
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
-    """The landmarks of the map; the final one has only those that are known to be different, and of
-    those without names only what a known heading has placed and not most have missed.
+    """Select the landmarks of the map.
+
+    The final map has only those known to be different; unnamed ones must be placed from a known
+    heading and not be missed by most submaps.
     """
     if not fold.contributions:
         return Shown()
@@ -169,7 +172,7 @@ def reasons(
     *,
     final: bool,
 ) -> tuple[str, ...]:
-    """Why robots and landmarks are not in the map, and warnings about it, in words."""
+    """List the reasons why robots and landmarks are not in the map, and warnings about it."""
     return (
         *_apart(fold),
         *_worded(refusals(fold)),
@@ -183,7 +186,6 @@ def reasons(
 
 
 def _lost(shown: Shown) -> Iterator[str]:
-    """Where robots were lost for a while, in words."""
     for stream, sigma in sorted(shown.headings.items()):
         yield (
             f"{named(stream)} was lost: its heading is known to {np.degrees(sigma):.0f}° at worst; "
@@ -192,7 +194,6 @@ def _lost(shown: Shown) -> Iterator[str]:
 
 
 def _misfitting(fold: Fold) -> Iterator[str]:
-    """The landmark that the submaps place most differently, in words."""
     found = worst_landmark(fold.main) if fold.contributions else None
     if found is not None:
         yield (
@@ -202,7 +203,7 @@ def _misfitting(fold: Fold) -> Iterator[str]:
 
 
 def _repeated(shown: Shown) -> Iterator[str]:
-    """Where the map repeats itself, in words: two causes that the set does not tell apart."""
+    """Describe where the map repeats itself, with two causes that the set cannot tell apart."""
     for each in shown.repeated:
         x, y = each.place
         dx, dy, turn = each.displacement
@@ -217,7 +218,6 @@ def _repeated(shown: Shown) -> Iterator[str]:
 
 
 def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...]:
-    """Landmarks left out of the map, in words."""
     if not fold.contributions:
         return ()
     known = landmark_view.known(fold.main)
@@ -239,17 +239,17 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
 
 
 def _listed(names: Sequence[str], most: int) -> str:
-    """The first names in brackets; landmarks without a name have none."""
+    """List the first names in brackets; landmarks without a name have none."""
     return f" ({', '.join(names[:most])}{', …' * (len(names) > most)})" if names else ""
 
 
 def priors(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: Collection[Stream]
 ) -> list[Outgoing]:
-    """The priors of these streams with a map: of those in the team's map their estimate in its
-    frame, of the others a message that withdraws the priors before it.
+    """Make the priors of these streams: in the team's map their estimate in its frame, else a
+    message that withdraws earlier priors.
 
-    With the final map robots need no estimate any more: those named are withdrawn.
+    After the final map robots need no estimate: those named are withdrawn.
     """
     given = [] if fused.final else [s for s in sorted(requested) if in_main_island(fold, s)]
     found = marginals.main_priors(fold, given, PRIOR_LANDMARKS, shown) if given else {}
@@ -279,7 +279,6 @@ def in_main_island(fold: Fold, stream: Stream) -> bool:
 
 
 def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
-    """The message that the priors of a stream that came before this map are void."""
     return m.Prior(
         stamp_ns=fused.stamp_ns,
         robot=stream[0],
@@ -300,7 +299,7 @@ def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
 def trajectories(
     fold: Fold, digest: bytes, submaps: Mapping[Stream, Sequence[m.Submap]]
 ) -> list[Outgoing]:
-    """The path of every stream in the team's frame: the end poses of its submaps."""
+    """Make the path of every stream in the team's frame: the end poses of its submaps."""
     paths = []
     for robot, incarnation in sorted(fold.home):
         if fold.home[(robot, incarnation)] != fold.main_key:
@@ -322,10 +321,10 @@ def trajectories(
 
 
 def _apart(fold: Fold) -> Iterator[str]:
-    """Why robots are not in the team's map, for each island beside it.
+    """Give, for each island beside the team's map, the reason why its robots are not joined.
 
-    Where landmarks have no names it is the test that the island's best attempt has failed, of those
-    with islands that are still there.
+    Where landmarks have no names, it is the test that the island's best attempt failed, among
+    islands that still exist.
     """
     frames = {min(fold.islands[key].graph.streams): key for key in fold.islands}
     for frame in sorted(frames):
@@ -346,8 +345,8 @@ def _apart(fold: Fold) -> Iterator[str]:
 
 
 def _best_attempt(fold: Fold, key: Stream) -> str | None:
-    """The island with which an island has the most pairs, and the test that failed; None where none
-    was tried.
+    """Return the island with the most pairs and the test that failed; None if no attempt was
+    made.
     """
     attempts = []
     for (stream, other), decision in sorted(fold.landmarks.waits.items()):
@@ -362,6 +361,5 @@ def _best_attempt(fold: Fold, key: Stream) -> str | None:
 
 
 def _worded(words: Sequence[str]) -> tuple[str, ...]:
-    """So many of them, and how many more there are."""
     more = len(words) - NAMED
     return (*words[:NAMED], *([f"{more} more refusals"] if more > 0 else []))

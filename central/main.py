@@ -1,4 +1,4 @@
-"""The central process: the node's shell, which delays the message that a robot is lost."""
+"""The central process: the node's shell, which delays the loss of a robot."""
 
 import logging
 import threading
@@ -19,13 +19,12 @@ from team.wire.codec import WireError
 from team.wire.patience import Patience
 
 LOST_S = 3.0
-"""Time [s] after which a lost robot delays no broadcast any more; the final map still waits for
-it."""
+"""Time [s] after which a lost robot delays no broadcast; the final map still waits for it."""
 FRESH_SHARE = 1.0 / 3.0
-"""Share of the time for maps that are not due, so that a due map waits for two solutions at
-most."""
+"""Share of the time for maps that are not due, so that a due map waits for at most two
+solutions."""
 FAREWELL_S = 10.0
-"""The centre leaves after the others, at most this long [s] after its final map."""
+"""Longest delay [s] of the centre's exit after its final map: it leaves after the others."""
 ORDERS_S = 30.0
 """Time [s] between two queries to the router for an operator's orders."""
 _ORDERS = m.KeptRequest(
@@ -37,9 +36,9 @@ _LOG = logging.getLogger("teamslam")
 class CentralShell:
     """The centre's process: it subscribes, answers requests for its set, runs, and leaves last.
 
-    patience_s: a robot that is lost for this long is given up; None: only by an order. admit:
-    robots that the scenario does not name may join. store: the file of the set, from which a centre
-    that is started again continues.
+    patience_s: a robot lost for this long is given up; None: only by an order. admit: accept robots
+    that the scenario does not name. store: file of the set, from which a restarted centre
+    continues.
     """
 
     def __init__(
@@ -105,7 +104,9 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Take the set that an earlier process has stored: robots need not send it again."""
+        """Restore the set that an earlier process has stored, so that robots need not send it
+        again.
+        """
         if self._stored is None or not self._shell.going:
             return
         stored = self._stored.samples()
@@ -114,7 +115,7 @@ class CentralShell:
             _LOG.info("%d members of the set are stored in %s", len(stored), self._stored.path)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples without the tokens of lost robots that may still come back within LOST_S."""
+        """Drop the tokens of lost robots that may return within LOST_S."""
         now = time.monotonic()
         passed = []
         for sample in samples:
@@ -145,7 +146,6 @@ class CentralShell:
         return [node for node, since in self._since.items() if now - since >= for_s]
 
     def _give_up(self) -> None:
-        """Give up robots that have been lost for longer than patience_s."""
         for node in [] if self._patience_s is None else self._away(self._patience_s):
             del self._since[node]
             why = f"lost for {self._patience_s:g} s, the centre's --patience"
@@ -174,10 +174,9 @@ class CentralShell:
         return tuple(warnings)
 
     def _request_orders(self) -> None:
-        """Ask the router now and then for the operator's orders.
+        """Query the router for the operator's orders at intervals.
 
-        The operator's command ends at once, and this process may have been cut off when it gave the
-        order.
+        The operator's command exits at once, and this process may have been offline then.
         """
         now = time.monotonic()
         if now >= self._orders_due:
@@ -188,7 +187,7 @@ class CentralShell:
         """Request submaps that robots have sent and the centre lacks; from robots that appear, all
         of them.
 
-        What a resumed robot took over from an earlier process is in no publisher's cache.
+        Submaps that a resumed robot took over from an earlier process are in no publisher's cache.
         """
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
         for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
@@ -206,7 +205,7 @@ class CentralShell:
 
     def _leave_last(self) -> None:
         """Wait until robots and world have left at the final map, since one that missed it may
-        ask for it.
+        request it.
         """
         deadline = time.monotonic() + FAREWELL_S
         while not self._stop.is_set() and time.monotonic() < deadline:

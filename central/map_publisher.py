@@ -1,4 +1,4 @@
-"""When the centre publishes a map, and which robots it announces as withdrawn.
+"""Decide when the centre publishes a map, and announce withdrawn robots.
 
 Team time is cut into ticks, whose submaps are folded together, and into broadcasts. A running map
 is *closed* where every submap up to its time has arrived, else *provisional*; the *final* one comes
@@ -18,11 +18,12 @@ from team.wire.bus import Outgoing
 
 PATIENCE = 3.0
 """Number of broadcasts, or of ticks where these are longer, after which a provisional map is
-published although a robot has stalled."""
+published despite a stalled robot.
+"""
 
 
 class MapPublisher:
-    """Folds what is closed and publishes the maps that are due.
+    """Folds the closed ticks and publishes the maps that are due.
 
     warnings: failures, refusals and withdrawals in words, the newest last.
     """
@@ -66,8 +67,7 @@ class MapPublisher:
     def publish_newest(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
         """Publish a map of the whole set at once, if the last one lacks a submap.
 
-        The map waits for no tick's end and no teammate; submaps ahead of the watermark make it
-        provisional.
+        Submaps ahead of the watermark make it provisional.
         """
         if not self._has_news(math.inf):
             return []
@@ -75,7 +75,7 @@ class MapPublisher:
         return self._publish_whole(closed_ns, now_ns)
 
     def publish_final(self, now_ns: int) -> list[Outgoing]:
-        """The last messages, the final map after all others."""
+        """Make the last messages, with the final map after all others."""
         return self._publish("final", math.inf, now_ns)
 
     def _is_due(self, closed_ns: float, now_ns: int) -> bool:
@@ -85,11 +85,11 @@ class MapPublisher:
         return self._has_news(closed_ns)
 
     def _publish_closed(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish the map of the closed ticks, or of the whole set if that is more.
+        """Publish the map of the closed ticks, or of the whole set if that has more submaps.
 
-        A teammate's new submap is worth most to robots that measure the same landmarks, so it does
-        not wait for the end of its tick. And no map has less than the one before it: submaps ahead
-        of the watermark are in a provisional map and not yet in a closed one.
+        A teammate's new submap helps most the robots that measure the same landmarks, so it need
+        not wait for the end of its tick. No map has less than the one before it: submaps ahead of
+        the watermark are in a provisional map but not yet in a closed one.
         """
         ticks_end_ns = closed_ns
         if math.isfinite(closed_ns):  # a tick has the submaps that end in (a, b]
@@ -101,14 +101,13 @@ class MapPublisher:
         return self._publish("closed", closed_ns, now_ns, ahead=False)
 
     def _publish_whole(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish the map of the whole set, closed if nothing of it is ahead of the watermark."""
+        """Publish the map of the whole set, closed if no submap is ahead of the watermark."""
         is_ahead = _lacks(self._members(closed_ns), self._members(math.inf))
         return self._publish("provisional" if is_ahead else "closed", closed_ns, now_ns)
 
     def _publish(
         self, tail: Tail, closed_ns: float, now_ns: int, *, ahead: bool = True
     ) -> list[Outgoing]:
-        """A map and its accompanying messages, after the withdrawals that it causes."""
         out = self.fold.make_map(tail, closed_ns, ahead=ahead)
         self._published_ns = self._quiet_ns = now_ns
         for each in out:
@@ -120,7 +119,9 @@ class MapPublisher:
     # Version vectors.
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
-        """The last submap of each stream that ends up to a time, without the robots left out."""
+        """Return the last submap of each stream that ends up to a time, without the robots left
+        out.
+        """
         left_out = self._left_out
         lasts = (
             (stream, bisect_right(chain, until_ns, key=_end_ns) - 1)
@@ -130,7 +131,6 @@ class MapPublisher:
         return {stream: last for stream, last in lasts if last >= 0}
 
     def _has_news(self, until_ns: float) -> bool:
-        """Whether a submap that ends up to this time is missing in the last map."""
         left_out = self._left_out
         for stream, chain in self.store.chains.items():
             following = self._published.get(stream, -1) + 1
@@ -142,15 +142,14 @@ class MapPublisher:
 
     @property
     def _left_out(self) -> Collection[str]:
-        """The robots that maps are without: withdrawn and suspended ones."""
         return {*self.store.withdrawals, *self._announced, *self.fold.suspended}
 
     # Withdrawals.
 
     def withdraw(self, order: m.Withdrawal) -> bool:
-        """Withdraw a robot by an order; False if it was withdrawn before.
+        """Withdraw a robot by an order; return False if it was withdrawn before.
 
-        Its submaps are still stored, since others may request them.
+        Its submaps stay stored, since others may request them.
         """
         is_new = order.robot not in self.withdrawn
         self.store.add(order)
@@ -178,7 +177,6 @@ class MapPublisher:
 
 
 def _lacks(members: Mapping[Stream, int], of: Mapping[Stream, int]) -> bool:
-    """Whether the first version vector lacks a submap of the other."""
     return any(members.get(stream, -1) < last for stream, last in of.items())
 
 

@@ -1,7 +1,7 @@
 """The members of a fold by ticks of team time: encoded messages, decoded on demand.
 
-A contribution (a submap as the join takes it) is several times as large as its message and can be
-made again from it; it is kept as long as some fold has it.
+A contribution (a decoded submap) is several times as large as its message; it is cached while some
+fold has it.
 """
 
 import math
@@ -40,7 +40,7 @@ class Members:
         self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
 
     def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """File a submap; `digest` names it and the `sightings` from it. Returns its tick."""
+        """File a submap, named by `digest`, with the `sightings` from it; return its tick."""
         key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
         tick = self.tick_of(submap.stamp_ns)
         if tick not in self._ticks:
@@ -56,11 +56,11 @@ class Members:
         return tick
 
     def tick_of(self, end_ns: int) -> int:
-        """The tick of a submap that ends at this time."""
+        """Return the tick of a submap that ends at this time."""
         return (end_ns - 1) // self.tick_ns
 
     def behind(self, after: float, last: float = math.inf) -> list[int]:
-        """The ticks with members after this one, up to the last, ascending."""
+        """List the ticks with members after this one, up to the last, ascending."""
         found = []
         for tick in reversed(self._order):
             if tick <= after:
@@ -74,11 +74,11 @@ class Members:
         return any(key[1] not in gone for key in self._ticks[tick])
 
     def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
-        """The submaps of a tick in canonical order, without those of withdrawn robots."""
+        """List the submaps of a tick in canonical order, without those of withdrawn robots."""
         return sorted(key for key in self._ticks[tick] if key[1] not in gone)
 
     def contribution(self, key: Key) -> Contribution:
-        """A submap as the join takes it, with the least covariance that one may have."""
+        """Decode a submap, with its covariance raised to the least one."""
         found = self._made.get(key)
         if found is None:
             claimed = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
@@ -90,12 +90,12 @@ class Members:
         return found
 
     def raised(self, gone: Collection[str]) -> Mapping[str, int]:
-        """By robot, how many submaps that were asked for claimed less than the least covariance."""
+        """Count, by robot, the decoded submaps whose covariance was below the least one."""
         robots = sorted(key[1] for key in self._raised if key[1] not in gone)
         return Counter(robots)
 
     def sightings(self, key: Key) -> tuple[InterRobotFactor, ...]:
-        """The inter-robot measurements from a submap."""
+        """Return the inter-robot measurements from a submap."""
         return self._sightings.get(key, ())
 
     def concerns(self, tick: int, robot: str) -> bool:
@@ -108,9 +108,9 @@ class Members:
     def digest(
         self, before: tuple[bytes, ...], closed: float, last: float, gone: Collection[str]
     ) -> bytes:
-        """The digest of these parts and of the members up to a tick, in canonical order.
+        """Digest these parts and the members up to a tick, in canonical order.
 
-        The digest of the ticks up to `closed` is cached, by the parts in front of them.
+        The digest of the ticks up to `closed` is cached, by the parts before them.
         """
         until, digest = self._named.pop(before, (math.inf, Digest()))
         if until > closed:

@@ -1,11 +1,11 @@
 """The consistency monitor: tests the robots' covariances by their submaps, without the truth.
 
-Two figures, both 1 where every covariance is right. The joint cost per degree of freedom is what is
-minimised; it is sharp (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but a
-robust loss bounds it, since it down-weights large terms as outliers. The covariance scale is the
-median of the submaps' unweighted χ² relative to its expectation: no loss bounds it, a minority of
-outliers does not change it, and it also shows covariances that are too large. docs/decisions/22
-has how it is distributed. With few degrees of freedom both scatter, so a warning needs a level that
+Two figures, both 1 where every covariance is right. The joint cost per degree of freedom is the
+minimised quantity; it is sharp (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2),
+but a robust loss bounds it, since it down-weights large terms as outliers. The covariance scale is
+the median of the submaps' unweighted χ² relative to its expectation: no loss bounds it, a minority
+of outliers does not change it, and it also shows covariances that are too large. docs/decisions/22
+has its distribution. With few degrees of freedom both scatter, so a warning needs a level that
 chance alone reaches less than once in a thousand.
 """
 
@@ -25,12 +25,13 @@ from team.estimation.map_joining.marginals import Agreement, BiasEstimate
 WARN = 1.1
 FAIL = 1.3
 SCALE_WARN = math.sqrt(2.0)
-"""The team's covariance scale is reported beyond this, and below its inverse."""
+"""Bound of the team's covariance scale; its inverse is the lower one."""
 ROBOT_WARN = 1.5
-"""… and a robot's: one of five sound ones of the real sets reads 1.4."""
+"""Bound of a robot's covariance scale: one of five sound robots of the real data sets reaches
+1.4."""
 QUANTILE = 0.999
 MISCALIBRATED = 0.015
-"""A mean of the robots' scales beyond this is an error of the models, not of single robots."""
+"""Bound of the mean of the robots' scale biases, beyond which the models are wrong."""
 SIGMAS = 3.0
 SCALE_SIGMAS = 3.3
 NAMED = 3
@@ -47,7 +48,7 @@ class Finding:
     warnings: tuple[str, ...]
 
     def with_biases(self, biases: Sequence[BiasEstimate]) -> "Finding":
-        """The finding with each bias and its sigma among the figures, by robot and name."""
+        """Add each bias and its sigma to the figures, by robot and name."""
         figures = {}
         for (robot, _), bias, value, sigma in biases:
             figures[f"bias.{robot}.{bias}"] = value
@@ -59,12 +60,12 @@ NOTHING = Finding({}, ())
 
 
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
-    """Where the team's data contradict the models of all robots together, in words.
+    """Describe where the team's data contradict the models of all robots together.
 
-    The size of a map comes from the odometry and from the ranges. Where they contradict each other
-    the robots' range scales, each of which is held near its model's, move in the same direction:
-    the joint cost hardly shows it, their mean does. At speeds that the models were not learnt at
-    the odometry's scale is free instead; then nothing is wrong, but it is told.
+    Odometry and ranges both determine the size of a map. Where they contradict each other, the
+    robots' range scales, each held near its model's, move in the same direction: the joint cost
+    hardly shows it, their mean does. At speeds outside the calibration the odometry's scale is free
+    instead; that is no error, but is reported.
     """
     found = []
     ranges = _mean_of(biases, "range_scale")
@@ -83,9 +84,7 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
 
 
 def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
-    """The mean of one bias over the robots, where it is too large to be an error of single
-    robots.
-    """
+    """Mean of one bias over the robots, if too large for errors of single robots."""
     known = np.array([(value, sigma) for _, bias, value, sigma in biases if bias == name])
     if not len(known):
         return None
@@ -96,11 +95,11 @@ def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
 
 
 def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) -> Finding:
-    """The team's and every robot's figures, and who is out of bounds.
+    """Compute the team's and every robot's figures, with warnings about those out of bounds.
 
-    normal: the covariance scale where the covariances are right; the scale is given relative to it.
-    final: of the final map. Before it covariances that are too large are no warning: the submaps of
-    a robot that has not closed a loop yet hardly contradict each other.
+    normal: the covariance scale where the covariances are right; the reported scale is relative to
+    it. final: of the final map. Before it, covariances that are too large are no warning: the
+    submaps of a robot that has not closed a loop yet hardly contradict each other.
     """
     figures = {}
     warnings = []
@@ -121,7 +120,9 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
-    """The covariance scale of the team (the empty name) and of each robot, where there is one."""
+    """Compute the covariance scale of the team (the empty name) and of each robot, where
+    defined.
+    """
     streams = [each[0] for each in submaps]
     chi2, dof = (np.array([each[k] for each in submaps], np.float64) for k in (2, 3))
     places: dict[str, list[int]] = {"": list(range(len(submaps)))}
@@ -140,8 +141,8 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
 
 
 def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
-    """Warnings about the team, or single robots, whose covariances are far too small; if `small`
-    scales count, also about those that are too large.
+    """Warn of a team or robots with covariances far too small; with `small`, also of too large
+    ones.
     """
     judged = {who: each for who, each in scales.items() if small or each.value > 1.0}
     words_of = {
@@ -155,7 +156,6 @@ def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
 
 
 def _misscale(scale: Scale, limit: float) -> str:
-    """The warning about a scale beyond the limit and beyond chance; empty without one."""
     value = scale.value
     if value <= 0.0:
         return ""
@@ -178,7 +178,6 @@ def _level(chi2: float, dof: float) -> str | None:
 
 
 def _worst(agreement: Agreement) -> list[str]:
-    """The submaps that the rest of the map contradicts, beyond what chance explains."""
     quantile = 1.0 - (1.0 - QUANTILE) / max(len(agreement.submaps), 1)
     wrong = [
         (each.chi2 / each.dof, each)

@@ -5,9 +5,8 @@
             ──> fold         the ticks behind the watermark
             ──> maps         map, priors, withdrawals; at the end the final map
 
-The node subscribes to submaps, to progress and liveliness, and to nothing that contains the fused
-map. A centre of a comparison method (`sim.studies.rules`) is a subclass that files other inputs
-and makes other maps.
+The node subscribes to submaps, progress and liveliness, and to nothing that contains the fused map.
+The centre of a comparison method (`sim.studies.rules`) is a subclass with other inputs and maps.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -38,10 +37,9 @@ MOST_ROBOTS = 100
 class CentralNode:
     """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
-    inputs: the channels of the set. fold_class: makes its maps. announcement: the configuration,
-    which maps name by its digest. admit: a robot that the scenario does not name joins the team
-    when it, or its driver, appears. store: the set. warnings: failures in words, the newest last.
-    final: the final map.
+    inputs: the channels of the set. fold_class: class of its fold. announcement: the configuration,
+    whose digest maps carry. admit: a robot that the scenario does not name joins the team when it,
+    or its driver, appears. warnings: failures in words, the newest last.
     """
 
     inputs: ClassVar[tuple[ch.Channel, ...]] = (
@@ -79,7 +77,7 @@ class CentralNode:
         self.final: m.FusedMap | None = None
 
     def restart(self) -> None:
-        """Begin with an empty set, whose members are handed in again; the attendance stays."""
+        """Begin with an empty set, whose members are filed again; the attendance stays."""
         self._begin_set()
         self.attendance.forget_members()
 
@@ -92,13 +90,15 @@ class CentralNode:
         return tuple(dict.fromkeys((*self.inputs, *own, *others)))
 
     def begin(self) -> list[Outgoing]:
-        """The first messages of the node: its configuration."""
+        """Make the first message of the node: its configuration."""
         return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement)]
 
     # Receive.
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true of this team: its robots, counters, stamps, or its end."""
+        """Give the reason why a message cannot be true of this team: its robots, counters, stamps
+        or end.
+        """
         self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
@@ -122,7 +122,9 @@ class CentralNode:
             self._admitted.append(robot)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
+        """Process one message; `now_ns`, the team time of its arrival, is unused: stamps are
+        time.
+        """
         if isinstance(message, m.FusedMap):
             return self._take_final(message)
         self._credit = None
@@ -135,11 +137,11 @@ class CentralNode:
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Continue behind a message whose handling raised an exception: its sender gets the credit.
+        """Continue after an exception in the handling of a message, and give its sender the credit.
 
-        A member that could not be filed counts as refused. A running map that raises takes nothing
-        from the final one; where that can not be computed, the newest map that could is the final
-        one, provisional and with the reason.
+        A member that could not be filed counts as refused. If a running map raises, the final one
+        is unaffected; if the final one raises, the newest computable map replaces it, provisional
+        and with the reason.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)
@@ -150,7 +152,6 @@ class CentralNode:
         return out + (self._conclude_anyway(why) if self._concluding else self._conclude())
 
     def _take_final(self, final: m.FusedMap) -> list[Outgoing]:
-        """Take the final map that an earlier process of this centre has published."""
         if final.final and not self.finished:
             self.finished, self.final = True, final
         return []
@@ -158,7 +159,7 @@ class CentralNode:
     # File.
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """File a member of the set; returns the credit of its sender, or the order to repeat."""
+        """File a member of the set; return the credit of its sender, or the order to repeat."""
         match message:
             case m.Submap():
                 return self._file_submap(message)
@@ -171,7 +172,7 @@ class CentralNode:
                 return []
 
     def _file_submap(self, submap: m.Submap) -> list[Outgoing]:
-        """File a submap; each one is acknowledged, a refused one too."""
+        """File a submap and acknowledge it, refused or not."""
         self._warn_of_refusal(self.store.add_submap(submap))
         return self._credit_of(submap, self.store.acknowledged(_stream_of(submap)))
 
@@ -185,7 +186,7 @@ class CentralNode:
 
     def _refuse(self, message: m.Message, why: str) -> list[Outgoing]:
         """Mark a submap as refused if its handling, or that of an inter-robot measurement from it,
-        has raised, so that nothing waits for it.
+        raised, so that it holds up nothing.
         """
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
@@ -198,7 +199,7 @@ class CentralNode:
             self.warnings.append(f"refused: {reason}")
 
     def _credit_of(self, member: m.Submap | m.SightingFactor, count: int) -> list[Outgoing]:
-        """The message that so many submaps of a member's stream need not be sent again."""
+        """Make the message that this many submaps of a member's stream need not be sent again."""
         progress = m.Progress(
             stamp_ns=self.attendance.now_ns,
             node="central",
@@ -210,8 +211,8 @@ class CentralNode:
         return [Outgoing(ch.CENTRAL_PROGRESS, member.robot, progress)]
 
     def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
-        """Follow an order, and repeat it for robots that join later, since the operator's command
-        has ended.
+        """Follow an order, and repeat it for robots that join later: the operator's command has
+        exited.
 
         An order that this centre itself gave in an earlier process is found again by its fold.
         """
@@ -229,15 +230,17 @@ class CentralNode:
         return out + self._conclude() if self._is_over else out
 
     def publish_due(self) -> list[Outgoing]:
-        """Fold what the least progress of the live robots has closed; the maps that are due."""
+        """Fold the ticks closed by the least progress of the live robots; make the maps that are
+        due.
+        """
         return self.maps.publish_due(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_newest(self) -> list[Outgoing]:
-        """A map of the whole set, if the last one lacks a member."""
+        """Make a map of the whole set, if the last one lacks a member."""
         return self.maps.publish_newest(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_final(self) -> list[Outgoing]:
-        """The last messages, the final map after all others."""
+        """Make the last messages, with the final map after all others."""
         return self.maps.publish_final(self.attendance.now_ns)
 
     def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
@@ -247,7 +250,7 @@ class CentralNode:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of the whole set, if the last one lacks a member; for when there is time."""
+        """Make a map of the whole set, if the last one lacks a member, when there is time."""
         return [] if self.finished else self._counted(self.publish_newest())
 
     # Conclude.
@@ -258,12 +261,11 @@ class CentralNode:
 
     @property
     def has_all_measurements(self) -> bool:
-        """Whether all raw measurements that the centre consumes have arrived: it consumes none."""
+        """Whether all raw measurements for the centre have arrived: it consumes none."""
         return True
 
     @property
     def _is_over(self) -> bool:
-        """Whether the streams have ended and nothing of them is waited for."""
         return self.attendance.is_concluded() and self.has_all_measurements
 
     def _conclude(self) -> list[Outgoing]:
@@ -307,15 +309,15 @@ class CentralNode:
 
     @property
     def ends(self) -> bool:
-        """Whether all streams have ended, as the world or their drivers have announced."""
+        """Whether all streams have ended, as announced by the world or the drivers."""
         return self.attendance.end is not None
 
     def requests(self) -> list[m.MeasurementsRequest]:
-        """Requests for missing raw measurements, for their source: the centre consumes none."""
+        """Requests for missing raw measurements: the centre consumes none."""
         return []
 
     def lacking(self) -> list[m.SubmapsRequest]:
-        """Requests for submaps that robots have announced and that no map can have yet."""
+        """Request the submaps that robots have announced and no map can have yet."""
         if self.finished:
             return []
         sent: dict[Stream, int] = {}
@@ -333,7 +335,7 @@ class CentralNode:
         ]
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
-        """The answer to `SubmapsRequest`: a robot's members, its latest incarnation first."""
+        """Answer a `SubmapsRequest` with a robot's members, its latest incarnation first."""
         robot = decoded(request, m.SubmapsRequest).robot
         return [encoded(message) for message in self.store.messages_of(robot)]
 
@@ -355,7 +357,7 @@ class CentralNode:
         return self.maps.fold.findings
 
     def status(self) -> m.Status:
-        """The centre's status, for people."""
+        """Report the centre's status, for people."""
         now_ns = self.attendance.now_ns
         figures = {
             "broadcasts": float(self._broadcasts),
@@ -387,7 +389,7 @@ def _stream_of(member: m.Submap | m.SightingFactor) -> Stream:
 
 
 def node_class(config: CentralConfig) -> type[CentralNode]:
-    """The node of the fusion rule that the configuration names; raises NotInstalledError."""
+    """Return the node class of the configured fusion rule; raises NotInstalledError."""
     found: type[CentralNode] = loaded(
         RULES[config.fusion].made_by, f"the fusion rule {config.fusion}"
     )
@@ -397,5 +399,5 @@ def node_class(config: CentralConfig) -> type[CentralNode]:
 def make_centre(
     config: CentralConfig, robots: Sequence[str], *, admit: bool = False
 ) -> CentralNode:
-    """Make the node of the fusion rule that the configuration names; raises NotInstalledError."""
+    """Make the node of the configured fusion rule; raises NotInstalledError."""
     return node_class(config)(config, robots, admit=admit)

@@ -15,7 +15,7 @@ MOST_NOTED = 1_000
 class Attendance:
     """The progress and presence of one robot at the centre.
 
-    done: the accepted one of the `Done` messages; dones: all that have arrived. began: the latest
+    done: the accepted one of the `Done` messages; dones: all that arrived. began: the latest
     incarnation that has begun; 0: none. head: the newest head of its driver, in a live team.
     driver: whether its driver is present; None: unknown.
     """
@@ -32,12 +32,12 @@ class Attendance:
 
     @property
     def lost(self) -> bool:
-        """True once the robot was present and is not any more."""
+        """Whether the robot was present and is absent now."""
         return self.seen and not self.alive
 
     @property
     def stream_end(self) -> m.StreamEnd | None:
-        """Where its driver has ended the stream, unless a later incarnation has begun."""
+        """The end announced by its driver, unless a later incarnation has begun."""
         head = self.head
         if head is None or head.state != "ended" or head.incarnation < self.began:
             return None
@@ -47,8 +47,8 @@ class Attendance:
 
     @property
     def has_all(self) -> bool:
-        """True once the robot has consumed all that its driver has numbered and the stream is
-        not open.
+        """Whether the robot has consumed all that its driver numbered, and the stream is not
+        open.
         """
         head, done = self.head, self.done
         if head is None or done is None or head.state == "open":
@@ -60,13 +60,13 @@ S = TypeVar("S")
 
 
 class Awaited(Generic[S]):
-    """Whether any of many is waited for: asks again the one that was, and all when none is left."""
+    """Tests whether any of many is awaited: the last awaited one first, then all."""
 
     def __init__(self) -> None:
         self._left: list[S] = []
 
     def is_none(self, everyone: Iterable[S], waits_for: Callable[[S], bool]) -> bool:
-        """True if no one is waited for."""
+        """Whether none is awaited."""
         while self._left:
             if waits_for(self._left[-1]):
                 return False
@@ -76,7 +76,7 @@ class Awaited(Generic[S]):
 
 
 class Least:
-    """The least of the values of many names, which change one by one; infinite without any."""
+    """The least of many named values that change one by one; infinite without any."""
 
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
@@ -100,7 +100,7 @@ T = TypeVar("T", m.Done, m.End)
 
 
 def note(message: T, noted: list[T]) -> None:
-    """Append a message that is not there yet; the newest MOST_NOTED stay."""
+    """Append a new message; the newest MOST_NOTED stay."""
     if message not in noted:
         noted.append(message)
         del noted[:-MOST_NOTED]

@@ -1,12 +1,12 @@
-"""Decides which priors a robot needs: those with information that it can not have by itself.
-
-A robot that leaves the team's map, or was never in it, gets one message that withdraws its earlier
-priors; a restarted centre, which has sent none, sends it, too.
+"""Select the robots that need a prior: those it gives information that they cannot have themselves.
 
 A robot joins its last prior with its own later submaps, so a new prior is worth its bytes only for
-information from teammates (landmarks that have moved, inter-robot measurements), or for landmarks
-that it comes near to. Priors are most of the centre's traffic; in a map that does not change, most
-of them contain nothing new.
+information from teammates (moved landmarks, inter-robot measurements), or for landmarks that it
+comes near to. Priors are most of the centre's traffic; in a map that does not change, most of them
+contain nothing new.
+
+A robot outside the team's map gets one message that withdraws its earlier priors; a restarted
+centre, which has sent none, sends it, too.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,16 +21,17 @@ from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import LandmarkBlocks, landmark_blocks, last_pose
 
 EVERY = 8
-"""One of so many broadcasts brings a prior at least, which bounds the robot's own submaps to
-join and the wait of a robot that has missed one."""
+"""Most broadcasts between two priors, which bounds the robot's own submaps to join and the delay of
+a robot that missed one.
+"""
 NEEDED = 12
 """Number of landmarks nearest to a robot, which it will see next."""
 MOVED = 0.1
 """Least root mean square of the landmarks' movements for a new prior, in standard deviations."""
 SURER = 0.8
-"""… or their variance has fallen to this share."""
+"""Share to which a landmark's variance must have fallen for a new prior."""
 NEVER = -1
-"""Before all team time: there is no inter-robot measurement."""
+"""Stamp of no inter-robot measurement, before all team time."""
 NOWHERE: Stream = ("", 0)
 """The island of a stream without submaps."""
 
@@ -39,7 +40,7 @@ NOWHERE: Stream = ("", 0)
 class _Sent:
     """The map of a robot's last prior and the landmarks in it.
 
-    encounter_ns: team time of the newest inter-robot measurement of the robot or by it. since: the
+    encounter_ns: team time of the newest inter-robot measurement of the robot or by it. since:
     number of broadcasts since. frame: the team's, at that time.
     """
 
@@ -51,7 +52,7 @@ class _Sent:
 
 
 class SentPriors:
-    """The last prior of each stream; a function of the broadcasts before, not of the set."""
+    """The last prior of each stream; depends on the broadcasts before, not on the set alone."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -59,9 +60,9 @@ class SentPriors:
         """None: the stream's priors are withdrawn."""
 
     def worth(self, fold: Fold, streams: Sequence[Stream], shown: Sequence[int]) -> list[Stream]:
-        """Those of these streams to which a prior of this fold with these landmarks is to be sent.
+        """Select the streams to which a prior of this fold with these landmarks is to be sent.
 
-        It withdraws the earlier priors of those that are not in the team's map.
+        Streams that left the team's map are selected once, to withdraw their priors.
         """
         inside = [each for each in streams if fold.home.get(each, NOWHERE) == fold.main_key]
         out = self._withdrawn({*streams} - {*inside})
@@ -77,9 +78,7 @@ class SentPriors:
         ]
 
     def void(self, fold: Fold, streams: Sequence[Stream]) -> list[Stream]:
-        """Those of these streams whose last prior is not in the frame of the final map, or which
-        are not in that map.
-        """
+        """Select the streams outside the final map, or whose last prior is in another frame."""
         outside = []
         for stream in streams:
             old = self._sent.get(stream)
@@ -89,7 +88,7 @@ class SentPriors:
         return self._withdrawn(outside)
 
     def _withdrawn(self, streams: Iterable[Stream]) -> list[Stream]:
-        """Those of the streams that were not withdrawn before; they are noted as such."""
+        """Select the streams not withdrawn before, and note them as withdrawn."""
         new = [s for s in sorted(streams) if s not in self._sent or self._sent[s] is not None]
         self._sent |= dict.fromkeys(new)
         return new
@@ -102,10 +101,7 @@ class SentPriors:
         encounter_ns: int = NEVER,
         frame: Stream | None = None,
     ) -> bool:
-        """Whether to send a prior at this pose in this map; if so, it is noted as sent.
-
-        encounter_ns: team time of the newest inter-robot measurement of this robot or by it.
-        """
+        """Whether to send a prior at this pose in this map; if so, note it as sent."""
         offsets = blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
         old = self._sent.get(stream)
@@ -124,7 +120,6 @@ class SentPriors:
 
 
 def _newest_encounters(fold: Fold) -> dict[str, int]:
-    """Team time [ns] of the newest inter-robot measurement of each robot or by it."""
     newest: dict[str, int] = {}
     for encounter in fold.main.graph.sightings:
         seen = encounter.sighting

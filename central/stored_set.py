@@ -1,7 +1,7 @@
-"""A centre's set on disk: the messages of robots and operators for it, as they were sent.
+"""A centre's set on disk: the messages of robots and operators, as they were sent.
 
-The file is a peer's (`team.peers.set_file`). A centre that was killed continues from it: nothing
-of it has to be sent again, and the same set gives the same map.
+The file format is a peer's (`team.peers.set_file`). A restarted centre continues from it: no member
+is sent again, and the same set gives the same map.
 """
 
 import time
@@ -18,7 +18,7 @@ _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTI
 
 
 class StoredSet:
-    """Keeps each member once. Raises SetFileError where the file can not be used."""
+    """Stores each member once. Raises SetFileError if the file is unusable."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -32,13 +32,13 @@ class StoredSet:
         return self._keeper.warnings
 
     def samples(self) -> list[Sample]:
-        """The members in the file, as samples that arrive now."""
+        """Return the members in the file as samples that arrive now."""
         now_ns, found = time.time_ns(), self._found
         self._found = []
         return [member.as_sample(now_ns) for member in found]
 
     def note(self, samples: Iterable[Sample]) -> None:
-        """Keep the valid and new members among these samples."""
+        """Store the valid and new members among these samples."""
         news = []
         for sample in samples:
             found = ch.channel_of(sample.key)

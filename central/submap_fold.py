@@ -1,7 +1,7 @@
 """The fold of the stored set, and the messages of a map: the map itself, priors and paths.
 
-The map is a pure function of the set (law 2). The centre, a peer and the verification run this
-class: a recorded map comes out again from the set that it names.
+The map is a pure function of the set (law 2). Centre, peers and verification run this class: a
+recorded map is reproduced from the set that it names.
 """
 
 import math
@@ -35,7 +35,7 @@ from team.wire.digest import digest_of
 
 
 class RecordedFields(NamedTuple):
-    """The fields of a recorded map, and its priors, that do not follow from the set it names."""
+    """The fields of a recorded map, and its priors, that do not follow from its set."""
 
     missing: tuple[m.VersionEntry, ...]
     arrived: int
@@ -46,8 +46,7 @@ class SubmapFold:
     """Folds the stored set tick by tick and makes the messages of its maps.
 
     warnings: failures in words, the newest last. landmarks: number in the newest map. not_folded:
-    number of its inputs that it refused. finding: of the monitor, on the newest map. reasons: why
-    robots are not joined, and warnings about the newest map.
+    number of refused inputs. finding, reasons: of the newest map.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class SubmapFold:
         """Make a map of the stored set and the messages that accompany it.
 
         The final map is the full solution, and the last message. Other maps have the ticks that end
-        at `closed_ns` or before and, with `ahead`, everything after them.
+        at `closed_ns` or before and, with `ahead`, all later ones.
         """
         self._file_members()
         ticks, self._accused = self._ticks, {}
@@ -108,9 +107,7 @@ class SubmapFold:
         return self._messages(ticks, fold, tail, recorded)
 
     def _file_members(self) -> None:
-        """Give the new members of the store to the ticks; a folded tick is folded again with
-        them.
-        """
+        """Add the store's new members to the ticks; a folded tick is folded again with them."""
         store, ticks = self.store, self._ticks
         for robot in sorted(store.withdrawals.keys() - self._without):
             ticks.withdraw_robot(robot)
@@ -147,9 +144,7 @@ class SubmapFold:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The monitor's warnings, why robots are not joined, and warnings about the map, in
-        words.
-        """
+        """The monitor's warnings, reasons why robots are not joined, and warnings about the map."""
         suspended = (
             f"{robot} is left out of running maps: {why}"
             for robot, why in sorted(self.suspended.items())
@@ -166,7 +161,6 @@ class SubmapFold:
     def _messages(
         self, ticks: TickFold, fold: Fold, tail: Tail, recorded: RecordedFields | None
     ) -> list[Outgoing]:
-        """The messages of a fold: the map, with priors or, at the end, the whole paths."""
         final = tail == "final"
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None
@@ -213,9 +207,7 @@ class SubmapFold:
     def _streams_for_priors(
         self, fold: Fold, fused: m.FusedMap, shown: Sequence[int]
     ) -> Collection[Stream]:
-        """The streams whose priors are published with a map: of each robot the latest one, if there
-        is news for it.
-        """
+        """Select the latest stream of each robot with news, to publish its prior with a map."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
         for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
@@ -226,7 +218,7 @@ class SubmapFold:
         return self._sent_priors.worth(fold, streams, shown)
 
     def _receivable(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """The messages that every receiver accepts; others are withheld with a warning."""
+        """Keep the messages that every receiver accepts; withhold others with a warning."""
         accepted = []
         for each in out:
             why = unsound(each.message)

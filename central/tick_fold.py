@@ -9,12 +9,11 @@ tick has arrived, so the fold is final.
                                    └── Conviction <── agreement(fold) <─┘
 
 There are three pieces of state, each with one owner. The inputs depend on no fold. The checkpoints
-are a stack: a tick pushes one; what a fold lacks or must be without (a late submap, a verdict, a
-withdrawal) rolls it back to the last checkpoint before that, and the ticks are folded again. The
-conviction, the robots that contradict the rest beyond chance (`central.withdrawal`), is replaced as
-a whole; whenever it changes all ticks are folded again without these robots. Agreement is tested
-after the first tick of each broadcast's time and after the full solution, not when a broadcast
-happens to be due. So a withdrawal depends on the set alone, not on the order or time of arrival.
+are a stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back to the last
+checkpoint before it, and the ticks are folded again. The conviction, the robots that contradict the
+rest beyond chance (`central.withdrawal`), is replaced as a whole; a change folds all ticks again
+without these robots. Agreement is tested after the first tick of each broadcast's time and after
+the full solution, so a withdrawal depends on the set alone, not on order or time of arrival.
 
 A robot with few submaps is suspended: running maps leave it out at once, so that it does not move
 its teammates' poses, but it is withdrawn only once it has enough of them, or by the full solution.
@@ -22,9 +21,9 @@ Until then it is tested again, with all its submaps, whenever the set has grown 
 provisional map is tested by itself.
 
 The running fold is bounded (`condensing`): its old submaps are condensed before each tick. A tick
-that contradicts what is condensed is folded with all of it restored (`relinearising`). The full
-solution restores all of it, too. Where landmarks have no names it folds the ticks again with
-nothing condensed (but see FULL_UNNAMED).
+that contradicts them is folded with all of them restored (`relinearising`), and so is the full
+solution. Where landmarks have no names, the full solution folds the ticks again with nothing
+condensed (but see FULL_UNNAMED).
 """
 
 import math
@@ -57,12 +56,12 @@ from team.wire.messages import SightingFactor, Submap
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""
 GROWTH = 1.25
-"""Suspects that were not withdrawn are tested again once the number of submaps has grown by this
-factor."""
+"""Growth of the number of submaps after which suspects that were not withdrawn are tested again."""
 FULL_UNNAMED = 1000
-"""Where landmarks have no names, the full solution of up to this many submaps folds all ticks
-again: what counts as one landmark is decided by the ticks. With more it starts from the running
-fold, since the ticks would take hours."""
+"""Most submaps without landmark names for which the full solution folds all ticks again, since the
+ticks decide which observations are one landmark. With more, which would take hours, it starts from
+the running fold.
+"""
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
@@ -87,8 +86,8 @@ class TickFold:
     """Folds a set of submaps tick by tick.
 
     limits: sizes by which old submaps are condensed; None: never. inputs: those of another fold,
-    which are then only read. convicts: whether the fold withdraws robots by itself. undecided: in
-    words, robots that contradict each other at the last test, of which none can be told wrong.
+    read only. convicts: whether the fold withdraws robots by itself. undecided: in words, robots
+    that contradicted each other at the last test, with the wrong one undetermined.
     """
 
     def __init__(
@@ -110,7 +109,6 @@ class TickFold:
         self._restart(Conviction())
 
     def _restart(self, conviction: Conviction) -> None:
-        """Forget every tick that was folded, under another conviction."""
         self._conviction = conviction
         self._retried = 0.0
         self.checkpoints = Checkpoints()
@@ -124,7 +122,7 @@ class TickFold:
     def add_submap(
         self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()
     ) -> None:
-        """Add a submap with the inter-robot measurements from it, all of which `digest` names.
+        """Add a submap with the inter-robot measurements from it, all named by `digest`.
 
         The fold is rolled back to before the submap's tick.
         """
@@ -136,19 +134,19 @@ class TickFold:
         """Replace an operator's verdicts on pairs of unnamed landmarks, in present or future
         submaps.
 
-        The ticks are folded again from the first one with both landmarks of a verdict that is new
-        or withdrawn.
+        The ticks are folded again from the first one with both landmarks of a new or withdrawn
+        verdict.
         """
         tick = self._inputs.set_verdicts(verdicts)
         if math.isfinite(tick):
             self._fold_again(tick)
 
     def withdraw_robot(self, robot: str) -> None:
-        """Leave out a robot's submaps, and the inter-robot measurements by it or of it, now and in
+        """Leave out a robot's submaps, and the inter-robot measurements by or of it, now and in
         future.
 
-        The result is that of a team without the robot: the ticks are folded again from the robot's
-        first submap, or the first measurement of it.
+        The result is that of a team without the robot: the ticks are folded again from its first
+        submap, or the first measurement of it.
         """
         if robot not in self._ordered:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
@@ -162,7 +160,7 @@ class TickFold:
         self.fold_until(until_ns)
 
     def _roll_back(self, tick: float) -> None:
-        """Forget what was folded from a tick on, and a conviction that is based on it.
+        """Drop the ticks folded from this one on, and a conviction based on them.
 
         A convicted robot was left out from the first tick on: no checkpoint contains it.
         """
@@ -193,18 +191,17 @@ class TickFold:
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
-        """The robots that the fold is without: withdrawn ones, and suspended ones."""
+        """The withdrawn and suspended robots, which the fold leaves out."""
         return tuple(sorted(self._gone))
 
     @property
     def _until_ns(self) -> float:
-        """The end of the last tick that was folded."""
         return (self.checkpoints.tick + 1) * self._inputs.tick_ns
 
     def fold_until(self, watermark_ns: float) -> bool:
         """Fold every tick that ends at the watermark or before; return whether there was one.
 
-        A conviction restarts the fold: its first tick is then the next one.
+        A conviction restarts the fold at its first tick.
         """
         folded = False
         while ticks := self._open_ticks(watermark_ns):
@@ -220,7 +217,7 @@ class TickFold:
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
     def _push_tick(self, tick: int) -> bool:
-        """Fold a tick and test it where that is due; return whether the conviction changed."""
+        """Fold a tick and test it where due; return whether the conviction changed."""
         before = self.checkpoints.tick
         fold = self._fold_tick(self.fold, tick)
         self.checkpoints.push(tick, fold)
@@ -251,13 +248,12 @@ class TickFold:
     # The robot that contradicts the rest.
 
     def agreement(self, fold: Fold) -> Agreement:
-        """Return the agreement of a fold, cached for the last one, since a broadcast asks again."""
+        """Return the agreement of a fold, cached for the last one, which broadcasts reuse."""
         if self._agreed is None or self._agreed[0] is not fold:
             self._agreed = fold, marginals.joint_cost(fold)
         return self._agreed[1]
 
     def _due_for_retrial(self, tick: int) -> str | None:
-        """Return a suspended robot that is tested again at a tick; None if there is none."""
         suspended = self._conviction.suspended
         if not suspended:
             return None
@@ -265,17 +261,16 @@ class TickFold:
         return next((r for r in sorted(suspended) if size >= suspended[r].retried), None)
 
     def _size_until(self, tick: float) -> int:
-        """Count the submaps up to a tick, those of suspended robots included."""
         gone = self._gone.difference(self._conviction.suspended)
         ticks = self._inputs.ticks_after(-math.inf, gone)
         return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Withdraw or suspend the robot that a trial of the fold finds; return whether there is
-        one. It is then left out from the first tick on.
+        """Withdraw or suspend the robot that a trial of the fold finds, from the first tick on;
+        return whether there is one.
 
-        at: the tick; infinity for the full solution, which suspends nobody. Its warning is part of
-        the map, so a fold that withdraws nobody computes it, too.
+        at: the tick; infinity for the full solution, which suspends no robot. Its warning is part
+        of the map, so a fold that withdraws no robot computes it, too.
         """
         self.undecided = ""
         if not self.convicts and math.isfinite(at):
@@ -316,7 +311,7 @@ class TickFold:
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
-        """Fold the same inputs up to a time without some robots; no further one is withdrawn."""
+        """Fold the same inputs up to a time without some robots; withdraw no other."""
         return self._fold_others(robots, until_ns, self._limits)
 
     def _fold_others(
@@ -340,10 +335,9 @@ class TickFold:
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
         """Find the robot that contradicts the rest in a provisional fold, with the reason in words.
 
-        There is none where nothing is ahead of the watermark: closed ticks are tested themselves.
-
-        A trial folds the set again for each candidate, so its result holds until the set has grown
-        by GROWTH.
+        There is none where nothing is ahead of the watermark: closed ticks have their own test. A
+        trial folds the set again for each candidate, so its result holds until the set has grown by
+        GROWTH.
         """
         if provisional is self.fold or not self.convicts:
             return {}
@@ -358,7 +352,7 @@ class TickFold:
     def solve(self) -> Fold:
         """Solve for all inputs in full, without the robots that are then withdrawn.
 
-        Suspended robots are tested with all that they sent, one after the other.
+        Suspended robots are tested with all their submaps, one after the other.
         """
         while True:
             self.fold_until(math.inf)
@@ -374,7 +368,6 @@ class TickFold:
                 return fold
 
     def _fold_raw(self) -> Fold:
-        """Return the fold over all ticks with nothing condensed."""
         fold = self.fold
         if self._limits is None or fold.size <= self._limits.begin:
             return fold
@@ -401,13 +394,13 @@ class TickFold:
 
     @property
     def raised(self) -> Mapping[str, int]:
-        """By robot, how many folded submaps have had their covariance raised to the least one."""
+        """By robot, number of folded submaps whose covariance was raised to the least one."""
         return self._inputs.raised(self._gone)
 
     # The names of a fold.
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
-        """Name the fold's set: starts and submaps in canonical order, and `more`."""
+        """Digest the fold's set: starts and submaps in canonical order, and `more`."""
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:

@@ -1,5 +1,5 @@
-"""Conversion of associations of landmarks without names, and of an operator's verdicts, to messages
-and back.
+"""Conversion of associations of unnamed landmarks, and of an operator's verdicts, to and from
+messages.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ SHOWN = 1 + LAST
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
     """Tabulate the unnamed landmarks: member, identity, step.
 
-    every: all members of each landmark, or its first and its last ones only.
+    every: all members of each landmark, else its first and last ones.
     """
     entries = sorted(_all_members(landmarks) if every else _summarised_members(landmarks))
     table = []
@@ -53,18 +53,16 @@ def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membersh
 
 
 Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
-"""A member, its identity, the index in STEPS of its step, and the figures of that."""
+"""A member, its identity, the index of its step in STEPS, and the figures of that step."""
 
 
 def _summarised_members(landmarks: Landmarks) -> Iterator[Entry]:
-    """Iterate over the first and the last members of each landmark."""
     for id_, members in landmarks.present.items():
         for member in (members.first, *members.last):
             yield _make_entry(member, id_)
 
 
 def _all_members(landmarks: Landmarks) -> Iterator[Entry]:
-    """Iterate over all members of all landmarks."""
     identities = landmarks.identities()
     for stream, sequence, rows in landmarks.log.all_rows():
         for row in rows.tolist():
@@ -72,7 +70,6 @@ def _all_members(landmarks: Landmarks) -> Iterator[Entry]:
 
 
 def _make_entry(member: MemberRecord, id_: int) -> Entry:
-    """Make the entry of a member of the landmark with this identity."""
     name, tie = member
     if tie is None:
         return name, id_, 0, (0.0, 0.0, 0.0)

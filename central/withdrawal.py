@@ -1,17 +1,17 @@
-"""Finds the robot that contradicts the rest beyond chance, so that the team goes on without it.
+"""Find the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
 A robot's disagreement is the larger of two figures, both near or below 1 where its covariances are
-right: its share of the joint cost per degree of freedom, and χ²/dof of its submaps, which most of
-them exceed; each where it is beyond chance. The first one finds a single contradiction that enters
-the map at full weight. A robust loss bounds it; there the second one finds a robot whose submaps
+right, each counted where it is beyond chance: its share of the joint cost per degree of freedom,
+and the χ²/dof that most of its submaps exceed. The first detects a single contradiction that enters
+the map at full weight, but a robust loss bounds it; the second detects a robot whose submaps
 disagree in the majority: over all of them if there are many, over the newest ones if there are few.
 
-One wrong robot distorts the map and makes others disagree, too; one that claims to be very sure,
-or that fixes the frame, makes only others disagree. So nobody is judged by its own disagreement.
+One wrong robot distorts the map and makes others disagree, too; one with overconfident covariances,
+or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement.
 Each robot is left out in turn, which compares the joint cost of the rest with and without it in
 whatever frame the rest has: a robot is withdrawn only if the rest agree without it, and without no
-other. Two robots that contradict each other, and nobody else, are told and both stay, unless one of
-them contradicts itself when alone.
+other. Two robots that contradict each other, and no third, are reported and both stay, unless one
+of them contradicts itself when alone.
 """
 
 import math
@@ -22,32 +22,35 @@ from statistics import median
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""Least number of submaps of a robot for all of them to be judged by their median, and for it to be
-withdrawn before the final map; with fewer it is suspended."""
+"""Least number of submaps of a robot for a median over all of them, and for its withdrawal before
+the final map; with fewer it is suspended.
+"""
 NEWEST, MOST_OF = 4, 3
-"""With fewer submaps than that a robot is judged by its newest ones: by the disagreement that
-MOST_OF of the NEWEST exceed."""
+"""With fewer submaps a robot is judged by its newest ones: the disagreement that MOST_OF of NEWEST
+exceed.
+"""
 AGREEING = 0.5
-"""The rest agree if no disagreement is above this share of the limit."""
+"""Share of the limit that no disagreement may exceed for the rest to agree."""
 TRIED = 3
-"""Most robots that are left out for a trial, the most suspect first; as many again of those that
-disagree least, since the map follows a robot that claims to be very sure."""
+"""Most robots left out for a trial, the most suspect first; as many again of those that disagree
+least, since the map follows an overconfident robot.
+"""
 LEAST_DOF = 3.0
 """Least degrees of freedom of a share of the joint cost that is judged."""
 SUSPICION, ACCORD = 20.0, 7.0
-"""Exponents of the chance that a right robot's share is beyond the bound of `_bound`: for it to be
-a suspect, and for it to be no longer in accord with the rest."""
+"""Exponents of the chance that a sound robot's share exceeds `_bound`: for a suspect, and for one
+no longer in accord with the rest.
+"""
 
 Without = Callable[[Collection[str]], Agreement | None]
-"""The agreement of the team without some robots; None: nothing is left."""
+"""Agreement of the team without some robots; None if none is left."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The robot that is wrong beyond chance, None if there is none; and the reason in words.
+    """The robot that is wrong beyond chance, or None; and the reason in words.
 
-    undecided: in words, robots that contradict each other, where it can not be told which of them
-    is wrong.
+    undecided: in words, robots that contradict each other, with the wrong one undetermined.
     """
 
     robot: str | None = None
@@ -59,7 +62,7 @@ class Trial:
 class Suspension:
     """Why a robot is left out of running maps.
 
-    retried: the number of submaps of the set from which the robot is tested again.
+    retried: the number of submaps of the set at which the robot is tested again.
     """
 
     reason: str
@@ -70,8 +73,8 @@ class Suspension:
 class Conviction:
     """The robots that a fold leaves out by itself.
 
-    withdrawn: the reason by robot, in words. suspended: left out until they are tested again. at:
-    the last tick that all this is based on. tested_from: the first tick that is tested under it.
+    withdrawn: the reason by robot, in words. suspended: left out until tested again. at: the last
+    tick that this is based on. tested_from: the first tick tested under it.
     """
 
     withdrawn: Mapping[str, str] = field(default_factory=dict)
@@ -90,7 +93,7 @@ class Conviction:
         return Conviction(self.withdrawn, suspended, max(self.at, at))
 
     def acquit(self, robot: str, at: float, tested_from: float) -> "Conviction":
-        """Take a suspended robot in again, to be tested."""
+        """Restore a suspended robot, to be tested."""
         suspended = {each: why for each, why in self.suspended.items() if each != robot}
         return Conviction(self.withdrawn, suspended, max(self.at, at), tested_from)
 
@@ -98,7 +101,7 @@ class Conviction:
 def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:
     """Return the disagreement of each robot that can be judged.
 
-    chance: a share of the joint cost that a right robot exceeds with a probability above e^−chance
+    chance: a share of the joint cost that a sound robot exceeds with a probability above e^−chance
     is no disagreement.
     """
     costs: dict[str, list[tuple[float, float]]] = {}
@@ -119,8 +122,8 @@ def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
     """Return the χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it;
     None with too few submaps.
 
-    costs: χ² and dof of each, oldest first. That MOST_OF of NEWEST submaps exceed χ² bounds of
-    probability e^−x each has a probability below 4 e^(−3x).
+    costs: χ² and dof of each, oldest first. The probability that MOST_OF of NEWEST submaps exceed
+    χ² bounds of probability e^−x each is below 4 e^(−3x).
     """
     if len(costs) >= LEAST_SUBMAPS:
         return median(chi2 / dof for chi2, dof in costs)
@@ -132,10 +135,11 @@ def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
 
 
 def _share(chi2: float, dof: float, chance: float) -> float | None:
-    """Return the joint cost per degree of freedom, at most 1 where chance explains it; None where
-    too few degrees of freedom are left to judge it.
+    """Return the joint cost per degree of freedom, at most 1 where chance explains it; None with
+    too few degrees of freedom.
 
-    A cost without degrees of freedom, or without end, has overflown: a disagreement like any other.
+    A cost without degrees of freedom, or an infinite one, has overflown: a disagreement like any
+    other.
     """
     if not math.isfinite(chi2) or not math.isfinite(dof):
         return math.inf
@@ -159,8 +163,8 @@ def find_suspects(agreement: Agreement, limit: float) -> list[str]:
 def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
     """Find the robot that is wrong beyond chance by leaving out one robot after the other.
 
-    It is the only one without which the rest agree, and two others at least agree on that; or it is
-    the only one of those that contradicts itself when alone.
+    It is the only one without which the rest agree, and at least two others agree on that; or the
+    only one of those that contradicts itself when alone.
     """
     found = disagreement(agreement)
     suspected = find_suspects(agreement, limit)
@@ -206,7 +210,6 @@ def _largest(found: Mapping[str, float]) -> float:
 
 
 def _words_of(opposed: tuple[str, ...], found: Mapping[str, float]) -> str:
-    """Robots that contradict each other, in words; empty where there are none."""
     if len(opposed) < 2:
         return ""
     return (

@@ -1,10 +1,10 @@
 """The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
 
 The set holds submaps, the inter-robot measurements from them, initial poses, orders that withdraw a
-robot, and an operator's verdicts on landmarks. A submap is complete when the inter-robot
-measurements from it, of which it gives the number, are stored too. Admission enforces law 1: a
-submap whose measurements overlap another's, or that differs from a stored one of the same name, is
-refused with the reason. The centre, a peer's fold and the verification fold the same class.
+robot, and an operator's verdicts on landmarks. A submap is complete when all inter-robot
+measurements that it announces are stored. Admission enforces law 1: a submap whose measurements
+overlap another's, or that differs from a stored one of the same name, is refused with the reason.
+The centre, a peer's fold and the verification fold the same class.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,8 +43,8 @@ class StoredStream:
             self.chain.append(submap)
 
     def processed(self, count: int) -> int:
-        """`count`, unless the next submap was refused: then all later ones count, too, since none
-        of them can enter the map.
+        """`count`, or more if the next submap was refused: then all later ones count, since none
+        can enter the map.
         """
         if count not in self.refused:
             return count
@@ -57,9 +57,9 @@ _EMPTY = StoredStream()
 class SubmapStore:
     """The members of the team's set, each in one place.
 
-    chains: the submaps that a map can have, those of the streams with an initial pose; they grow
-    in place. withdrawals: the first order on each robot that an operator has withdrawn. verdicts:
-    those in force, with their landmarks in order. refused: number of refused members.
+    chains: the submaps available to a map, of streams with an initial pose; they grow in place.
+    withdrawals: an operator's first order on each withdrawn robot. verdicts: those in force, with
+    their landmarks in order. refused: number of refused members.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class SubmapStore:
     # Admission.
 
     def add(self, message: m.Message) -> str | None:
-        """Add a member of any kind; returns the reason if it is refused."""
+        """Add a member of any kind; return the reason if it is refused."""
         match message:
             case m.InitialPose():
                 self.add_start(message)
@@ -98,11 +98,11 @@ class SubmapStore:
         self._note_chain(key)
 
     def add_submap(self, submap: m.Submap) -> str | None:
-        """Add a submap; returns the reason if it is refused. A stored submap is accepted again."""
+        """Add a submap; return the reason if it is refused. A stored submap is accepted again."""
         return self._settle(submap, self._refusal_of_submap(submap))
 
     def add_sighting(self, sighting: m.SightingFactor) -> str | None:
-        """Add an inter-robot measurement; returns the reason if it is refused."""
+        """Add an inter-robot measurement; return the reason if it is refused."""
         return self._settle(sighting, self._refusal_of_sighting(sighting))
 
     def add_verdict(self, verdict: m.Verdict) -> None:
@@ -126,7 +126,7 @@ class SubmapStore:
         return found
 
     def _settle(self, member: m.Submap | m.SightingFactor, reason: str | None) -> str | None:
-        """Mark a refused member, or extend the chain by a stored one; returns the reason."""
+        """Mark a refused member, or extend the chain by a stored one; return the reason."""
         if reason is not None:
             self.refuse(member)
         else:
@@ -140,10 +140,10 @@ class SubmapStore:
             self.chains[key] = stream.chain
 
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
-        """Store a submap, or return why it can not be in the set.
+        """Store a submap, or return the reason for its refusal.
 
-        Law 1: each measurement is used once. The nearest submaps in sequence bound those of this
-        one.
+        Law 1: each measurement is used once. The measurements of the nearest submaps in sequence
+        bound those of this one.
         """
         key = submap.robot, submap.incarnation
         stream = self._stream(key)
@@ -176,7 +176,7 @@ class SubmapStore:
         return None
 
     def _refusal_of_sighting(self, sighting: m.SightingFactor) -> str | None:
-        """Store an inter-robot measurement, or return why it can not be in the set."""
+        """Store an inter-robot measurement, or return the reason for its refusal."""
         teammate = sighting.teammate
         stream = self._stream((sighting.robot, sighting.incarnation))
         from_submap = stream.sightings.setdefault(sighting.sequence, {})
@@ -250,7 +250,8 @@ class SubmapStore:
         return tuple(gaps)
 
     def messages_of(self, robot: str) -> Iterator[m.Message]:
-        """The messages from which a robot's next process continues, the latest incarnation first.
+        """Iterate over the messages from which a robot's next process continues, latest incarnation
+        first.
 
         These are the initial pose, the chain and the inter-robot measurements from it.
         """
@@ -264,12 +265,10 @@ class SubmapStore:
 
 
 def _nearest(submaps: Mapping[int, m.Submap], sequence: int) -> tuple[int | None, int | None]:
-    """The stored sequences next below and above this one."""
     below = max((s for s in submaps if s < sequence), default=None)
     return below, min((s for s in submaps if s > sequence), default=None)
 
 
 def _in_order(judgement: m.Judgement) -> m.Judgement:
-    """A judgement with the smaller landmark first."""
     first, second = sorted((judgement.first, judgement.second), key=msgspec.structs.astuple)
     return m.Judgement(first=first, second=second, same=judgement.same)

@@ -1,4 +1,4 @@
-"""Converts estimation values to messages and back: the one module that imports both."""
+"""Convert estimation values to messages and back: the only module that imports both."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -30,12 +30,14 @@ from team.wire.codec import unsound
 
 
 def frame_name(robot: str, incarnation: int) -> str:
-    """The name of the frame that the start of this stream fixes."""
+    """Name the frame that the start of a stream fixes."""
     return f"{robot}/{incarnation}"
 
 
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
-    """The initial pose and its covariance; pose None: unknown; covariance None: exactly known."""
+    """Read the initial pose and its covariance; pose None: unknown; covariance None: exactly
+    known.
+    """
     pose = floats(message.pose, "pose").copy() if message.pose else None
     covariance = (
         floats(message.covariance, "covariance").reshape(3, 3).copy()
@@ -46,7 +48,7 @@ def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matr
 
 
 def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
-    """The initial pose as a factor of map joining; None for an unknown pose."""
+    """Read the initial pose as a factor of map joining; None for an unknown pose."""
     pose, covariance = pose_of(message)
     return (
         None
@@ -56,8 +58,7 @@ def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
 
 
 def scan_of(message: m.AnyScan | m.Detections) -> Scan:
-    """The observed landmarks, in the machine's byte order; points are converted to range and
-    bearing.
+    """Read the observed landmarks, in the machine's byte order; points become range and bearing.
 
     Detections without identities have the numbers 2³¹ + their index in the message, until their
     window associates them.
@@ -78,7 +79,7 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
 
 
 def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
-    """A measurement's team time [ns]; for an odometry interval that of its end.
+    """Compute a measurement's team time [ns]; for an odometry interval that of its end.
 
     An interval that the odometry's clock stamps t ends at t + clock_offset_s.
     """
@@ -87,7 +88,7 @@ def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
 
 
 def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval:
-    """One odometry interval, in the form that the robot's motion model takes."""
+    """Read one odometry interval for the robot's motion model."""
     end_ns = message.stamp_ns + round(config.clock_offset_s * 1e9)
     duration_ns = message.duration_ns
     match message:
@@ -107,7 +108,7 @@ def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval
 def detections_of(
     message: m.Sightings,
 ) -> tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """(teammates, ranges [m], bearings [rad]) in the machine's byte order."""
+    """Read (teammates, ranges [m], bearings [rad]) in the machine's byte order."""
     return (
         message.teammates,
         floats(message.ranges, "ranges").astype(np.float64),
@@ -126,8 +127,8 @@ def submap_message(
     sightings: int = 0,
     gated: int = 0,
 ) -> m.Submap:
-    """The message of a local map, with the names of its inputs, the number of its inter-robot
-    measurements and of gated landmarks.
+    """Make the message of a local map, with the names of its inputs and the numbers of its
+    inter-robot measurements and gated landmarks.
     """
     return m.Submap(
         stamp_ns=span_ns[1],
@@ -183,7 +184,7 @@ def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
 def association_message(
     robot: str, incarnation: int, sequence: int, stamp_ns: int, became: Became
 ) -> m.Association:
-    """The message with the outcomes of all detections of a submap's window."""
+    """Make the message with the outcomes of all detections of a submap's window."""
     landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
     return m.Association(
         stamp_ns=stamp_ns,
@@ -200,7 +201,7 @@ def association_message(
 def sighting_message(
     sighting: InterRobotFactor, config: bytes, measurements: tuple[int, ...]
 ) -> m.SightingFactor:
-    """The message of an inter-robot factor, with the names of its inputs."""
+    """Make the message of an inter-robot factor, with the names of its inputs."""
     return m.SightingFactor(
         stamp_ns=sighting.stamp_ns,
         robot=sighting.robot,
@@ -216,7 +217,7 @@ def sighting_message(
 
 
 def sighting_of(message: m.SightingFactor) -> InterRobotFactor:
-    """The inter-robot factor in a message, as map joining takes it."""
+    """Read the inter-robot factor of map joining."""
     return InterRobotFactor(
         message.robot,
         message.incarnation,
@@ -229,7 +230,7 @@ def sighting_of(message: m.SightingFactor) -> InterRobotFactor:
 
 
 def contribution_of(message: m.Submap) -> Contribution:
-    """The submap in a message, as map joining takes it."""
+    """Read the submap as a contribution to map joining."""
     return Contribution(
         message.robot,
         message.incarnation,
@@ -251,7 +252,7 @@ def pose_message(
     frame: str,
     in_team_frame: bool,
 ) -> m.PoseEstimate:
-    """The message of a pose with its covariance, which is made exactly symmetric.
+    """Make the message of a pose; its covariance is made exactly symmetric.
 
     frame: named as in `FusedMap.frame`; in_team_frame: whether it is the team's.
     """
@@ -271,12 +272,12 @@ def pose_message(
 
 
 def joint_bytes(covariance: Matrix) -> bytes:
-    """The bytes of a joint covariance: its packed upper triangle."""
+    """Pack the upper triangle of a joint covariance."""
     return from_floats(packed(covariance))
 
 
 def block_bytes(blocks: Float[np.ndarray, "L 2 2"]) -> bytes:
-    """The packed upper triangles of L 2 × 2 blocks."""
+    """Pack the upper triangles of L 2 × 2 blocks."""
     return from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
 
 
@@ -288,7 +289,7 @@ def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
 
 
 def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
-    """The bytes of a landmark covariance: the joint one, or each landmark's own block only."""
+    """Pack a landmark covariance: the joint one, or each landmark's own block."""
     return joint_bytes(covariance) if joint else block_bytes(blocks_of(covariance))
 
 
@@ -323,10 +324,10 @@ NAMED = 10
 
 
 def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
-    """The map in a form that every receiver accepts, and in words what it omits for that.
+    """Reduce the map to a form that every receiver accepts; describe the omissions.
 
     A joint covariance that is not positive definite by rounding is replaced by the landmarks' own
-    ones; a landmark whose own covariance is invalid, or whose mean is not finite, is omitted.
+    ones; a landmark with an invalid own covariance, or a mean that is not finite, is omitted.
     """
     warnings = []
     if message.joint and unsound(message) is not None:
@@ -382,7 +383,7 @@ def prior_message(
     received: int = 0,
     withdrawn: int = 0,
 ) -> m.Prior:
-    """The message of a robot's prior: the joint marginal of its last fused end pose and the
+    """Make the message of a robot's prior: the joint marginal of its last fused end pose and the
     landmarks in the team's frame, with the members of the set that it contains.
     """
     return m.Prior(
@@ -410,7 +411,7 @@ def prior_message(
 
 
 def prior_of(message: m.Prior) -> RobotPrior:
-    """The prior in a message, as the robot's conditioning takes it."""
+    """Read the prior for the robot's conditioning."""
     mean = floats(message.mean, "mean").astype(np.float64)
     covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
     landmark_ids = ids(message.ids, "ids").astype(np.uint32)
@@ -428,7 +429,7 @@ def trajectory_message(
     poses: Float[np.ndarray, "K 3"],
     covariances: Float[np.ndarray, "K 3 3"],
 ) -> m.Trajectory:
-    """The smoothed end poses of a robot's submaps."""
+    """Make the message of the smoothed end poses of a robot's submaps."""
     symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return m.Trajectory(
         stamp_ns=stamp_ns,
@@ -444,7 +445,7 @@ def trajectory_message(
 def trajectory_of(
     message: m.Trajectory | m.Truth,
 ) -> tuple[np.ndarray, Float[np.ndarray, "K 3"]]:
-    """(stamps_ns, poses) of a smoothed or a true trajectory."""
+    """Read (stamps_ns, poses) of a smoothed or a true trajectory."""
     return (
         stamps(message.stamps, "stamps").astype(np.int64),
         floats(message.poses, "poses").astype(np.float64).reshape(-1, 3),

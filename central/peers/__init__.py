@@ -9,8 +9,8 @@
       ├──> PeerNode                   the set, and requests between peers     team/peers
       └──> PeerFold ──> CentralNode   the fold: attendance, maps, priors      fold.py, central
 
-Calls go down only, and messages are returned. A measurement goes to the estimator; its submap goes
-into the set and out to the others; the fold reads the new members of the set and gives them to its
-own centre's node; the map goes out under the peer's name, and the prior goes to the estimator for
-`team/pose`. The three nodes are independent of each other, except that the fold reads the set.
+Calls go down only, and messages are returned. The estimator receives a measurement; its submap
+enters the set and is published; the fold reads the set's new members and passes them to its own
+centre's node; the map is published under the peer's name, and the estimator uses the prior for
+`team/pose`. The three nodes are independent, except that the fold reads the set.
 """

@@ -1,6 +1,6 @@
 """A centre among peers: it has no estimator, and keeps and folds the team's set as they do.
 
-It may join, leave and come back at any time: no robot waits for it, and it requests missing members
+It may join, leave and return at any time: no robot waits for it, and it requests missing members
 from any peer. It publishes a centre's maps, which peers do not need.
 """
 
@@ -26,11 +26,11 @@ class PeerCentre(Peer):
         super().__init__(CENTRE, central, robots, proofs=proofs)
 
     def begin(self) -> list[Outgoing]:
-        """The first messages: its configuration."""
+        """Make the first message: the configuration."""
         return self.fold.centre.begin()
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """A centre's maps and orders; no robot needs its credit."""
+        """Select the fold's maps and orders; no robot needs this centre's credit."""
         return [each for each in messages if each.channel is not ch.CENTRAL_PROGRESS]
 
     def status(self) -> m.Status:

@@ -1,10 +1,10 @@
 """A peer's own fold: a centre's node that receives the peer's set instead of the network's
 messages.
 
-So its maps are the centre's, byte for byte, wherever the set is the same. The fold begins anew
-where a folded member changes (a robot has contradicted itself), or where the set grows after the
-final map. For a changed member it does so when there is time, or once the set is complete, so that
-a robot that contradicts itself again and again does not keep its peers from their own work.
+Its maps are the centre's, byte for byte, wherever the set is the same. The fold restarts where a
+folded member changes (a robot contradicts itself), or where the set grows after the final map. For
+a changed member it does so when there is time, or once the set is complete, so that a robot that
+keeps contradicting itself does not block its peers.
 """
 
 import hashlib
@@ -27,8 +27,8 @@ FoldWhen = Literal["always", "request", "end"]
 class PeerFold:
     """Folds the set of a `PeerNode`.
 
-    centre: the node that folds. restarts: how often it has begun anew. final: the newest final map;
-    finals: number of final maps.
+    centre: the node that folds. restarts: number of restarts. final: the newest final map; finals:
+    number of final maps.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class PeerFold:
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
 
     def note(self, message: m.Message) -> list[Outgoing]:
-        """Take a message that is no member: progress, liveliness, the end of the streams."""
+        """Process a message that is no member: progress, liveliness, the end of the streams."""
         if isinstance(message, m.Liveliness) and ch.robot_of(message.node) not in self._robots:
             return []
         out: list[Outgoing] = []
@@ -62,7 +62,7 @@ class PeerFold:
         return [*out, *self._give(message), *self.grow()]
 
     def _end_by_others(self) -> list[Outgoing]:
-        """Infer from other peers' conclusions that all streams have ended, where the message was
+        """Infer the end of all streams from other peers' conclusions, where the message was
         missed.
         """
         stated = self._peer.replica.statements
@@ -82,7 +82,7 @@ class PeerFold:
         return self._give(m.End(stamp_ns=0, streams=tuple(streams)))
 
     def grow(self) -> list[Outgoing]:
-        """Fold the new members of the set; returns the messages to publish."""
+        """Fold the new members of the set; return the messages to publish."""
         if self._waits:
             if not self._whole:
                 return []
@@ -99,9 +99,7 @@ class PeerFold:
         return out
 
     def _restart(self) -> list[Outgoing]:
-        """Fold the whole set from the beginning: as `Done` is given last, all of it is in the final
-        map.
-        """
+        """Fold the whole set again; `Done` is given last, so that the final map has all of it."""
         self._peer.restart_fold()
         self.centre.restart()
         self.restarts += 1
@@ -111,7 +109,7 @@ class PeerFold:
         return out
 
     def ask(self) -> list[Outgoing]:
-        """Fold the present set, without waiting; returns the messages to publish."""
+        """Fold the present set, without waiting; return the messages to publish."""
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False
@@ -120,11 +118,10 @@ class PeerFold:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """A map of the whole set, if the last one lacks a member."""
+        """Make a map of the whole set, if the last one lacks a member."""
         return [] if self._waits else [*self._restart_if_changed(), *self.centre.refresh()]
 
     def _restart_if_changed(self) -> list[Outgoing]:
-        """Begin the fold anew if a folded member has changed."""
         return self._restart() if self._peer.rebuild else []
 
     def _give(self, message: m.Message) -> list[Outgoing]:
@@ -137,7 +134,6 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        """Whether all members up to an announced end are in the set."""
         return any(self._is_here(end) for end in self.centre.attendance.ends)
 
     def _is_here(self, end: m.End) -> bool:
@@ -154,7 +150,7 @@ class PeerFold:
         return True
 
     def conclusion(self, robot: str) -> m.Concluded | None:
-        """The `Concluded` message of a robot's peer about its final map."""
+        """Make the `Concluded` message of a robot's peer about its final map."""
         final = self.final
         if final is None:
             return None

@@ -23,30 +23,28 @@ from team.wire.bus import Bus, Tap
 
 LINGER_S = 5.0
 """Time [s] for which a robot stays once all others have concluded, so that they receive its own
-conclusion, too.
+conclusion.
 """
 FRESH_SHARE = 0.2
 """Share of the time for maps that are not due: a robot has more to do than a centre."""
 WORLD_GONE_S = 1.0
-"""Time [s] after the world's end before a peer leaves: a world that has died is started again
-sooner.
-"""
+"""Delay [s] after the world's end before a peer leaves: a crashed world is restarted sooner."""
 _ENDS = (ch.CONCLUDED,)
-"""A team of peers ends where each robot has its final map, as that robot itself announces it."""
+"""Channels that end a team of peers: each robot announces its own final map."""
 _ORDERS = m.KeptRequest(stamp_ns=0, channels=tuple(each.name for each in ch.ORDERS))
 _LOG = logging.getLogger("teamslam")
 
 
 class Alone:
-    """Measures how long a peer has been left alone; a peer that comes back after all others have
-    left leaves, too.
+    """Measures how long a peer has been alone; a peer that returns after all others have left
+    leaves, too.
     """
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def since(self, now: float, *, alone: bool) -> bool:
-        """Whether it has been left alone for LINGER_S."""
+        """Whether it has been alone for LINGER_S."""
         self._since = (self._since or now) if alone else None
         left = self._since is not None and now - self._since >= LINGER_S
         if left:
@@ -106,7 +104,7 @@ class PeerShell(RobotShell):
         self.shell.answer(ch.FOLD, self._peer.robot, self._peer.answer_fold)
 
     def _resume(self) -> bool:
-        """Take over the stored set; returns whether the robot's own stream continues after it."""
+        """Restore the stored set; return whether the robot's own stream continues after it."""
         stored = self._keeper.members
         if not stored:
             return False
@@ -135,23 +133,20 @@ class PeerShell(RobotShell):
         self._peer.finished = self._may_leave(now)
 
     def _log_carried(self) -> None:
-        """Write members that others have forwarded into the robot's own log, under their first
-        publisher's name, so that the log proves the robot's maps, and logs of a team can be merged.
+        """Log members that others have forwarded, under their first publisher's name, so that the
+        log proves the robot's maps, and logs of a team can be merged.
         """
         members, self._peer.carried = self._peer.carried, []
         self._log(members)
 
     def _log(self, members: Sequence[Member]) -> None:
-        """Write members into the robot's own log, which may have lost them when the process
-        died.
-        """
+        """Log members that the robot's own log may have lost when the process died."""
         tap: Tap | None = getattr(self.bus, "tap", None)
         if tap is not None and members:
             now_ns = time.time_ns()
             tap([member.as_sample(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
-        """Whether no other peer needs this one: all have concluded, or the world has left."""
         if self._alone.since(now, alone=self._peer.is_left_alone):
             return True
         if self._peer.final is None:

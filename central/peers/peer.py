@@ -1,7 +1,7 @@
 """The common part of a robot without a centre and a centre among peers: the set and its fold.
 
-A peer takes members from any publisher, gives new ones to its own fold, and publishes the fold's
-messages under its own name. A subclass adds the rest, such as an estimator.
+A peer accepts members from any publisher, folds new ones, and publishes the fold's messages under
+its own name. A subclass adds the rest, such as an estimator.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ from team.wire.bus import Outgoing, Sample, sound
 from team.wire.codec import decoded, encoded
 
 SET_CHANNELS = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
-"""Channels of the set, which its traffic figures count; requests count, too."""
+"""Channels of the set for its traffic figures, requests included."""
 CENTRE = "central"
 """The node name of a centre."""
 
@@ -27,10 +27,10 @@ class Peer:
     """Keeps the team's set as the node `name` and folds it.
 
     finished: whether it may leave; set by its shell. carried: members that others have forwarded,
-    until the shell takes them. uplink, downlink: bytes of the set's channels that were published,
+    until the shell logs them. uplink, downlink: bytes of the set's channels that were published,
     each message once, and received. world_alive: None before any message of a world. ended: the
     robots whose end the router stores. others: the other robots and the centre that are present.
-    unpublished: messages of a fold that was requested; newest: its last map.
+    unpublished: messages of a requested fold; newest: its last map.
     """
 
     def __init__(
@@ -79,21 +79,21 @@ class Peer:
         )
 
     def keep(self, members: Iterable[Member]) -> None:
-        """Take the stored set of an earlier process."""
+        """Restore the stored set of an earlier process."""
         for member in members:
             self.peer.take(member, self.name)
 
     def news_of_set(self) -> list[Member]:
-        """The members that are new since the last call."""
+        """Return the members that are new since the last call."""
         members, self.peer.unsaved = self.peer.unsaved, []
         return members
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take a message without its key: as `handle_sample` of a reply."""
+        """Process a message without its key, as `handle_sample` of a reply."""
         return self.handle_sample(message, reply_sample(m.tag_of(type(message)), encoded(message)))
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        """Take one message of a robot, a peer, the world or an operator."""
+        """Process one message of a robot, a peer, the world or an operator."""
         found = ch.channel_of(sample.key)
         channel, name = (None, "") if found is None else found
         if channel in SET_CHANNELS and channel.publisher(name) != self.name:
@@ -102,7 +102,9 @@ class Peer:
         return self._take(message, sample, channel, name) if answered is None else answered
 
     def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        """Take a message about the set or the team's progress; None: it is another message."""
+        """Process a message about the set or the team's progress; return None for any other
+        message.
+        """
         match message:
             case m.Members():
                 self.carried += self.peer.take_carried(message)
@@ -129,7 +131,7 @@ class Peer:
                 return None
 
     def _meet(self, token: m.Liveliness) -> None:
-        """Note that a node has come, which may lack members, or gone."""
+        """Note a node's arrival, with members it may lack, or departure."""
         if token.node == self.name or token.node not in self.peer.known:
             return
         (self.others.add if token.alive else self.others.discard)(token.node)
@@ -138,10 +140,10 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether the team has ended, and no node is present that has the missing members.
+        """Whether the team has ended, and no present node has the missing members.
 
-        It has ended where every other robot has announced its own end, but for those that an
-        operator has given up or withdrawn.
+        The team has ended where every other robot has announced its own end, except those given up
+        or withdrawn by an operator.
         """
         stated = self.peer.replica.statements
         others = {
@@ -161,19 +163,18 @@ class Peer:
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str
     ) -> list[Outgoing]:
-        """Take a member."""
         if channel is None or channel not in CHANNELS:
             return []
         self.peer.take_sample(sample, channel.publisher(name))
         return self.grown()
 
     def tick(self, now_s: float) -> list[Outgoing]:
-        """The messages that are due, by any clock that does not run backwards."""
+        """Make the messages that are due, by any monotonic clock."""
         unpublished, self.unpublished = self.unpublished, []
         return [*unpublished, *self.counted(self.peer.tick(now_s))]
 
     def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """The same messages, with those of the set's channels counted."""
+        """Count the messages of the set's channels; return all."""
         talk = (
             each.message
             for each in out
@@ -183,28 +184,26 @@ class Peer:
         return list(out)
 
     def grown(self) -> list[Outgoing]:
-        """Fold the new members of the set; returns the fold's messages."""
+        """Fold the new members of the set; return the fold's messages."""
         return self._from_fold(self.fold.grow())
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """The fold's messages as this node publishes them."""
+        """Convert the fold's messages to those that this node publishes."""
         return list(messages)
 
     def refresh(self) -> list[Outgoing]:
-        """A map of the members since the last map; to be called when there is time."""
+        """Make a map of the members since the last map, when there is time."""
         return self._from_fold(self.fold.refresh())
 
     def answer(self, request: bytes) -> list[bytes]:
-        """The answer to a peer's `MembersRequest`."""
+        """Answer a peer's `MembersRequest`."""
         answer = self.peer.answer(request)
         self.uplink += sum(len(batch) for batch in answer)
         self.downlink += len(request)
         return answer
 
     def answer_fold(self, request: bytes) -> list[bytes]:
-        """The answer to a `FoldRequest`: the newest map, once all members that are here have been
-        folded.
-        """
+        """Answer a `FoldRequest` with the newest map, once all present members are folded."""
         decoded(request, m.FoldRequest)
         self.unpublished += self._from_fold(self.fold.ask())
         maps = [each.message for each in self.unpublished if isinstance(each.message, m.FusedMap)]
@@ -212,8 +211,8 @@ class Peer:
         return [] if self.newest is None else [encoded(self.newest)]
 
     def set_figures(self) -> dict[str, float]:
-        """The figures of the set: its size, its newest submap by robot, its sources, and the peers
-        with the same set.
+        """Figures of the set: its size, newest submap by robot, sources, and the peers with the
+        same set.
         """
         replica = self.peer.replica
         figures = {
@@ -234,5 +233,5 @@ class Peer:
 
 
 def member_in(out: Outgoing) -> Member:
-    """A message of this node as a member of the set."""
+    """Convert a message of this node to a member of the set."""
     return Member(out.channel.key(about(out.message)), encoded(out.message), out.message)

@@ -1,8 +1,8 @@
 """A robot that needs no centre: its estimator, its copy of the set, and its own fold of it.
 
-The estimator's submaps go into the set, the set's members into the fold, and the fold's prior back
-to the estimator for `team/pose`, as a centre's would. Law 1 holds as with a centre: nothing of the
-fold reaches what the robot sends for fusion.
+The estimator's submaps enter the set, its members the fold, and the fold's prior returns to the
+estimator for `team/pose`, like a centre's. Law 1 holds as with a centre: no data of the fold
+reaches the robot's messages for fusion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ _OF_THE_FOLD = {
     ch.FINAL_MAP: ch.TEAM_FINAL,
     ch.TRAJECTORY: ch.TEAM_TRAJECTORY,
 }
-"""The robot's channels in place of a centre's, for its own fold's messages."""
+"""The robot's channels for its own fold's messages, in place of a centre's."""
 _OF_A_CENTRE = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
 """Channels on which a robot receives a centre's messages, and a peer those of its own fold."""
 
@@ -57,7 +57,7 @@ class PeerRobot(Peer):
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
-        """The channels of its own stream, and of the world, to subscribe to under its name."""
+        """The channels of its own stream and of the world, to subscribe to under its name."""
         return tuple(channel for channel in RobotNode.listens if channel not in _OF_A_CENTRE)
 
     @property
@@ -66,15 +66,15 @@ class PeerRobot(Peer):
         return tuple(dict.fromkeys((*super().overhears, *self.node.overhears)))
 
     def begin(self) -> list[Outgoing]:
-        """The first messages: its configuration, and that of its fold."""
+        """Make the first messages: its configuration, and that of its fold."""
         announced = msgspec.structs.replace(self.fold.centre.announcement, node=self.name)
         config = Outgoing(ch.TEAM_CONFIG, self.robot, announced)
         return [config, *self._certified(), *self._from_estimator(self.node.begin())]
 
     def _certified(self) -> list[Outgoing]:
-        """With keys: the certificate that verifies its signatures, and these of its stored members.
+        """With keys, make the certificate of its signatures, and those of its stored members.
 
-        An earlier process has signed them with a key that may be revoked since.
+        An earlier process has signed them with a key that may have been revoked since.
         """
         proofs = self.peer.proofs
         if proofs is None:
@@ -90,7 +90,7 @@ class PeerRobot(Peer):
         return [certificate, *signatures]
 
     def _vouched(self, outgoing: Outgoing) -> list[Outgoing]:
-        """Take a member of its own into the set; with keys its signature is published after it."""
+        """Store a member of its own in the set; with keys its signature is published after it."""
         member = member_in(outgoing)
         self.peer.take(member, self.name)
         proofs = self.peer.proofs
@@ -99,8 +99,8 @@ class PeerRobot(Peer):
         return [Outgoing(ch.SIGNATURE, self.robot, proofs.signed(member))]
 
     def restore(self, members: Iterable[Member]) -> bool:
-        """Take the stored set of an earlier process, before `begin`; returns whether its own stream
-        continues from it.
+        """Restore the stored set of an earlier process, before `begin`; return whether its own
+        stream continues from it.
         """
         self.keep(members)
         stored = self._own_stored()
@@ -114,8 +114,8 @@ class PeerRobot(Peer):
         return True
 
     def _own_stored(self) -> list[m.Message]:
-        """The messages that the estimator takes over: of each incarnation of its own stream, the
-        latest first.
+        """Return the estimator's stored messages of each incarnation of its own stream, the latest
+        first.
         """
         found: list[m.Message] = []
         own = (s for s in self.peer.replica.streams if s[0] == self.robot)
@@ -128,8 +128,8 @@ class PeerRobot(Peer):
         return found
 
     def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        """Take a message about the set or the team's progress; those of its own stream go to the
-        estimator, too.
+        """Process a message about the set or the team's progress; the estimator gets those of its
+        own stream, too.
         """
         match message:
             case m.StreamHead() if message.robot == self.robot:
@@ -148,7 +148,7 @@ class PeerRobot(Peer):
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str
     ) -> list[Outgoing]:
-        """Take a member, a measurement, or another message for the estimator."""
+        """Route a member, a measurement, or another message for the estimator."""
         out: list[Outgoing] = []
         if channel is not None and channel in CHANNELS:
             self.peer.take_sample(sample, channel.publisher(name))
@@ -167,7 +167,7 @@ class PeerRobot(Peer):
         return self._from_estimator(self.counted(self.boundary.hand(self.node, message, sample)))
 
     def _from_estimator(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """The estimator's messages to publish; those for fusion go into the set, too."""
+        """Select the estimator's messages to publish; those for fusion enter the set, too."""
         out = list(messages)
         for each in messages:
             if each.channel in CHANNELS:
@@ -177,7 +177,9 @@ class PeerRobot(Peer):
         return out + self.grown()
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """The fold's messages under this robot's name; the prior goes to the estimator first."""
+        """Convert the fold's messages to this robot's name; the prior goes to the estimator
+        first.
+        """
         out: list[Outgoing] = []
         for each in messages:
             channel = _OF_THE_FOLD.get(each.channel)
@@ -206,7 +208,7 @@ class PeerRobot(Peer):
         return out
 
     def status(self) -> m.Status:
-        """The estimator's status with the figures of the set, and the fold's findings."""
+        """Report the estimator's status with the figures of the set, and the fold's findings."""
         own, fold = self.node.status(), self.fold.centre.status()
         figures = {f"fold.{name}": value for name, value in fold.figures.items()}
         faults = [*self.boundary.warnings, *self.fold.boundary.warnings]

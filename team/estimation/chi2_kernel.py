@@ -2,8 +2,8 @@
 
 χ² of n degrees of freedom does not exceed x with the probability P(n/2, x/2), the regularised
 incomplete gamma function: a series below its middle, a continued fraction of 1 − P above it (Press
-et al. 2007, section 6.2). Its inverse is found by Halley's steps within a bracket. Relative errors
-are of some 1e-15; SciPy has the same function, but importing it takes 0.13 s and 25 MB.
+et al. 2007, section 6.2). Its inverse is found by Halley's steps within a bracket, to some 1e-15.
+SciPy has the same function, but importing it takes 0.13 s and 25 MB.
 """
 
 import math
@@ -20,7 +20,7 @@ MOST_TERMS = 100_000
 MOST_STEPS = 200
 PRECISE = 1e-16
 SETTLED = 1e-9
-"""Relative length of a last step: Halley's next one would be shorter than rounding."""
+"""Relative length of the last step: Halley's next one would be shorter than rounding."""
 
 
 @compiled
@@ -48,7 +48,7 @@ def _density(a: float, x: float) -> float:
 
 @compiled
 def _tails(a: float, x: float) -> tuple[float, float, float]:
-    """P(a, x), 1 − P(a, x) and the density dP/dx."""
+    """Compute P(a, x), 1 − P(a, x) and the density dP/dx."""
     density = _density(a, x)
     if x < a + 1.0:
         term, total = 1.0, 1.0
@@ -75,7 +75,7 @@ def _tails(a: float, x: float) -> tuple[float, float, float]:
 
 @compiled
 def _quantile(a: float, below: float, above: float) -> float:
-    """The x with P(a, x) = below = 1 − above; the smaller of the two is solved for."""
+    """Solve P(a, x) = below = 1 − above for x, by the smaller of the two."""
     low, high = 0.0, math.inf
     tail = min(below, above)
     t = math.sqrt(-2.0 * elementary.log(tail))
@@ -103,8 +103,8 @@ def _quantile(a: float, below: float, above: float) -> float:
 def chi2_quantiles(
     below: float, above: float, dof: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """The values that χ² of so many degrees of freedom exceeds with the probability above = 1 −
-    below; NaN of less than one degree of freedom.
+    """Compute the values that χ² exceeds with the probability above = 1 − below; NaN for less than
+    one degree of freedom.
     """
     found = np.full(len(dof), math.nan)
     for k in range(len(dof)):

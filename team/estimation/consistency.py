@@ -1,4 +1,4 @@
-"""Consistency tests of covariances: normalised squared errors, and the intervals that they lie in.
+"""Consistency tests of covariances: normalised squared errors and their intervals.
 
 Bar-Shalom, Li and Kirubarajan 2001, section 5.4.
 """
@@ -24,14 +24,15 @@ FEW = 600
 def state_error(
     estimate: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """The error of a state (x [m], y [m], theta [rad], …), theta's wrapped to (−π, π]."""
+    """Compute the error of a state (x [m], y [m], theta [rad], …), theta's wrapped to (−π, π]."""
     error: Float[np.ndarray, " n"] = estimate - truth
     error[2] += 2.0 * np.pi * np.floor((np.pi - error[2]) / (2.0 * np.pi))
     return error
 
 
 def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -> float:
-    """Normalised estimation error squared, eᵀ P⁻¹ e: χ² with n degrees of freedom, mean n.
+    """Compute the normalised estimation error squared, eᵀ P⁻¹ e: χ² with n degrees of freedom, mean
+    n.
 
     Raises NotACovarianceError if P is not a covariance.
     """
@@ -42,10 +43,10 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 
 @lru_cache
 def chi2_limit(dof: int, tail: float) -> float:
-    """What χ² of `dof` degrees of freedom exceeds with the probability `tail`.
+    """Compute the value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
-    Rounded to twelve digits. Of few degrees of freedom it is found by bisection of the finite sum
-    (Abramowitz & Stegun 26.4.4 and 26.4.5), of more by `chi2_kernel`.
+    Rounded to twelve digits. For few degrees of freedom by bisection of the finite sum (Abramowitz
+    & Stegun 26.4.4 and 26.4.5), for more by `chi2_kernel`.
     """
     if dof > FEW:
         return float(f"{chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
@@ -58,7 +59,6 @@ def chi2_limit(dof: int, tail: float) -> float:
 
 
 def _chi2_tail(value: float, dof: int) -> float:
-    """The probability that χ² of `dof` degrees of freedom exceeds this value."""
     half = 0.5 * value
     term, total = math.exp(-half), 0.0
     if dof % 2:
@@ -73,10 +73,9 @@ def _chi2_tail(value: float, dof: int) -> float:
 def chi2_quantile(
     probability: float, dof: Float[np.ndarray, " n"] | float | int
 ) -> Float[np.ndarray, " n"] | float:
-    """The value that χ² of `dof` degrees of freedom does not exceed with this probability.
+    """Compute the value that χ² of `dof` degrees of freedom does not exceed with this probability.
 
-    NaN of less than one degree of freedom. Rounded to 36 bits, as it was when a library's last bits
-    differed from processor to processor.
+    NaN for less than one degree of freedom. Rounded to 36 bits.
     """
     exact = chi2_quantiles(probability, 1.0 - probability, np.atleast_1d(np.asarray(dof, float)))
     mantissa, exponent = np.frexp(exact)
@@ -85,7 +84,7 @@ def chi2_quantile(
 
 
 def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float]:
-    """The two-sided interval that holds the mean over `runs` of NEES/dof with this probability.
+    """Compute the two-sided interval of the mean over `runs` of NEES/dof with this probability.
 
     The sum of `runs` independent χ² of `dof` degrees of freedom is χ² with dof·runs of them.
     """
@@ -97,7 +96,7 @@ def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float
 def coverage(
     nees_values: Float[np.ndarray, " runs"], dof: Float[np.ndarray, " runs"], probability: float
 ) -> float:
-    """The share of runs whose NEES lies in the ellipsoid that should hold `probability` of them."""
+    """Compute the share of runs whose NEES lies in the ellipsoid of this probability."""
     return float(np.mean(nees_values <= chi2_quantile(probability, dof)))
 
 
@@ -117,13 +116,13 @@ def covariance_scale(
     dof: Float[np.ndarray, " K"],
     medians: Float[np.ndarray, " K"] | None = None,
 ) -> Scale | None:
-    """The scale s where half of the terms, by degrees of freedom, lie below s times their median.
+    """Estimate the scale s such that half of the terms, by degrees of freedom, lie below s times
+    their median.
 
     Each term is s χ² with dof degrees of freedom, so median_k(squared_k / median χ²(dof_k)) is s.
-    It changes with all covariances alike and is insensitive to a few outliers, however large. None
-    where no term has one degree of freedom or more; terms with fewer are left out.
-
-    medians: median χ²(dof) of each term, where the caller has it.
+    It changes with all covariances alike and is insensitive to a few outliers, however large. Terms
+    with less than one degree of freedom are left out; None where none is left. medians: median
+    χ²(dof) of each term, if available.
     """
     judged = dof >= 1.0
     if not judged.any():

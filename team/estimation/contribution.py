@@ -15,16 +15,16 @@ Stream: TypeAlias = tuple[str, int]
 Key: TypeAlias = tuple[int, str, int, int]
 """(end stamp, robot, incarnation, sequence): a submap's place in the canonical order."""
 UNIX_S = 1e9
-"""Team times from here on [s] are Unix times: 1e9 s is in 2001."""
+"""Team times from here on [s] are Unix times (2001)."""
 
 
 def named(stream: Stream) -> str:
-    """`r3 (incarnation 2)`."""
+    """Name a stream: `r3 (incarnation 2)`."""
     return f"{stream[0]} (incarnation {stream[1]})"
 
 
 def moment(stamp_ns: int) -> str:
-    """Team time in words: seconds, or the time of day (UTC) where it is Unix time."""
+    """Word a team time: seconds, or the time of day (UTC) if it is Unix time."""
     seconds = 1e-9 * stamp_ns
     if seconds < UNIX_S:
         return f"{seconds:,.1f} s"
@@ -32,7 +32,7 @@ def moment(stamp_ns: int) -> str:
 
 
 class Observation(NamedTuple):
-    """Which landmarks a submap has: what data association asks of it, without its measurements.
+    """The landmarks of a submap for data association, without its measurements.
 
     unnamed, spacings, distinct: see `LocalMap`.
     """
@@ -67,7 +67,7 @@ class Contribution:
 
     @cached_property
     def observation(self) -> Observation:
-        """Which landmarks it has."""
+        """The submap's landmarks for data association."""
         of = self.local
         return Observation(self.stream, self.sequence, of.ids, of.unnamed, of.spacings, of.distinct)
 

@@ -1,8 +1,8 @@
 """Products and solutions of dense matrices with the same bits on every processor.
 
-A BLAS takes other kernels, with other orders of sums, on other processors. Here an entry of a
-product is one sum in the order of its index, whatever the shapes; what runs in parallel lanes are
-different entries. Arrays of three and more axes are stacks of matrices, as NumPy has them.
+A BLAS uses other kernels, with other orders of sums, on other processors. Here an entry of a
+product is one sum in the order of its index, whatever the shapes; parallel lanes hold different
+entries. Arrays of three and more axes are stacks of matrices, as in NumPy.
 """
 
 import math
@@ -27,7 +27,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def product(a: Array, b: Array) -> Array:
-    """A B, of matrices, vectors or stacks of them, as NumPy's `matmul` has it.
+    """Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
 
     Raises ValueError where A has not as many columns as B has rows.
     """
@@ -58,7 +58,8 @@ def product(a: Array, b: Array) -> Array:
 
 
 def solve(A: Array, B: Array) -> Array:
-    """A⁻¹ B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
+    """Solve A⁻¹ B by elimination with partial pivoting; B is a vector, a matrix or a stack of
+    these.
 
     Raises LinAlgError where A is singular.
     """
@@ -78,12 +79,12 @@ def solve(A: Array, B: Array) -> Array:
 
 
 def inverse(A: Array) -> Array:
-    """A⁻¹ of a matrix or of each of a stack. Raises LinAlgError where one is singular."""
+    """Invert a matrix or each of a stack. Raises LinAlgError where one is singular."""
     return solve(A, np.broadcast_to(np.eye(A.shape[-1]), A.shape))
 
 
 def cholesky(A: Matrix) -> Matrix:
-    """Lower L with L Lᵀ = A, of which the lower triangle is read.
+    """Compute the lower L with L Lᵀ = A from the lower triangle of A.
 
     Raises LinAlgError where A is not positive definite.
     """
@@ -94,19 +95,19 @@ def cholesky(A: Matrix) -> Matrix:
 
 
 def inverse_of_factored(L: Matrix) -> Matrix:
-    """(L Lᵀ)⁻¹ of a lower triangular L, exactly symmetric."""
+    """Compute (L Lᵀ)⁻¹ of a lower triangular L, exactly symmetric."""
     return inverse_from_factor(np.array(L, np.float64, order="C"))
 
 
 def forward(L: Matrix, B: Array) -> Array:
-    """L⁻¹ B of a lower triangular L; B is a vector or a matrix."""
+    """Compute L⁻¹ B of a lower triangular L; B is a vector or a matrix."""
     solved = np.array(B, np.float64, order="C")
     solve_lower(np.array(L, np.float64, order="C"), _columns(solved))
     return solved
 
 
 def solve_factored(L: Matrix, B: Array) -> Array:
-    """(L Lᵀ)⁻¹ B of a lower triangular L; B is a vector or a matrix."""
+    """Compute (L Lᵀ)⁻¹ B of a lower triangular L; B is a vector or a matrix."""
     solved = np.array(B, np.float64, order="C")
     right = _columns(solved)
     left = np.array(L, np.float64, order="C")
@@ -116,5 +117,5 @@ def solve_factored(L: Matrix, B: Array) -> Array:
 
 
 def _columns(values: Array) -> Float[np.ndarray, "n k"]:
-    """The same numbers as a matrix: a vector is one column."""
+    """Reshape a vector to one column."""
     return values[:, None] if values.ndim == 1 else values

@@ -1,8 +1,8 @@
 """The kernels of `team.estimation.dense`: every sum in the order of its index.
 
 A vector register holds different entries, never parts of one sum, so its width changes no bit. Big
-matrices go by tiles of columns and blocks of terms, which are copied to where the compiler sees
-that nothing overlaps; four rows and four terms at once then leave most of the work in registers.
+matrices are processed by tiles of columns and blocks of terms, copied so that the compiler can rule
+out overlaps; four rows and four terms at once then keep most of the work in registers.
 """
 
 import math
@@ -16,11 +16,11 @@ Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 Panel = Float[np.ndarray, "n k"]
 TILE = 64
-"""Columns of a product that are worked at once."""
+"""Columns of a product that are processed at once."""
 DEPTH = 32
-"""Terms of its sums that are added in one go: with TILE columns they stay in the first cache."""
+"""Terms of a sum that are added at once: with TILE columns they stay in the first cache."""
 BLOCK = 32
-"""Columns that are factored or solved by loops before a product takes them from the others."""
+"""Columns that are factored or solved by loops before a product subtracts them from the others."""
 
 
 @compiled
@@ -121,10 +121,11 @@ def add_product(
     upper: bool,
     lower: bool,
 ) -> None:
-    """C + A B, in place from C's corner on; each entry takes its terms in their order.
+    """Compute C + A B in place from C's corner on; each entry adds its terms in order.
 
-    `upper`: of the square A B only the upper triangle is wanted, other tiles may stay as they are.
-    `lower`: B is lower triangular, and what is above its diagonal is not read, but for its tiles.
+    `upper`: only the upper triangle of the square A B is required; tiles below may stay unchanged.
+    `lower`: B is lower triangular; entries above its diagonal are not read, except within its
+    tiles.
     """
     n, k = a.shape
     m = b.shape[1]
@@ -194,7 +195,6 @@ def _add_terms(
 
 @compiled
 def _take(rows: Panel, i: int, factor: float, k: int, begin: int) -> None:
-    """Row i less `factor` times row k, from column `begin` on."""
     for j in range(begin, rows.shape[1]):
         rows[i, j] -= factor * rows[k, j]
 
@@ -213,7 +213,9 @@ def _exchange(rows: Panel, k: int, i: int) -> None:
 
 @compiled
 def _solve_one(A: Matrix, B: Panel) -> bool:
-    """Overwrite B with A⁻¹ B and A with what elimination leaves; False where a pivot is zero."""
+    """Overwrite B with A⁻¹ B and A with the rest of the elimination; return False for a zero
+    pivot.
+    """
     n = len(A)
     for k in range(n):
         best = k
@@ -248,9 +250,8 @@ def solve_stack(A: Float[np.ndarray, "s n n"], B: Float[np.ndarray, "s n k"]) ->
 
 @compiled
 def factored(U: Matrix) -> tuple[Matrix, bool]:
-    """The lower factor of a matrix of which the upper triangle is read and overwritten.
-
-    And whether each pivot is positive; where one is not the factor is worth nothing.
+    """Factor a matrix, whose upper triangle is read and overwritten; return also whether each pivot
+    is positive, else the factor is invalid.
     """
     n = len(U)
     L = np.zeros((n, n))
@@ -276,7 +277,7 @@ def factored(U: Matrix) -> tuple[Matrix, bool]:
 
 @compiled
 def _negative_transposed(U: Matrix, begin: int, end: int) -> Panel:
-    """Of the rows begin … end − 1 what is behind column `end`, transposed, with the other sign."""
+    """Copy the part of rows begin … end − 1 after column `end`, transposed and negated."""
     rows = np.empty((len(U) - end, end - begin))
     for k in range(begin, end):
         for i in range(end, len(U)):
@@ -303,7 +304,6 @@ def solve_lower(L: Matrix, right: Panel) -> None:
 
 @compiled
 def _solve_lower_one(L: Matrix, right: Panel) -> None:
-    """`solve_lower` of one column: four rows at once."""
     n = len(L)
     whole = n - n % 4
     for k in range(0, whole, 4):

@@ -19,7 +19,7 @@ Point = Float[np.ndarray, "2"]
 
 @inlined
 def wrapped(angle: float) -> float:
-    """The same direction in (−π, π]."""
+    """Wrap an angle to (−π, π]."""
     turns = math.floor((math.pi - angle) / (2.0 * math.pi))
     return angle + 2.0 * math.pi * turns
 
@@ -39,7 +39,7 @@ def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
 
 @compiled
 def composed_with(a_from_b: Pose, poses: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    """`compose` with each of some poses."""
+    """Compose a pose with each of several poses."""
     found = np.empty_like(poses)
     for k in range(len(poses)):
         pose = compose(a_from_b, poses[k])
@@ -82,7 +82,8 @@ def transformed(a_from_b: Pose, point_in_b: Point) -> Point:
 
 @inlined
 def swept(forward: float, left: float, turn: float) -> tuple[float, float]:
-    """V(turn)·(forward, left): where a constant twist leads in unit time, without an allocation.
+    """Compute V(turn)·(forward, left): the end of a constant twist in unit time, without an
+    allocation.
 
     V(θ) = [[sin θ/θ, −(1−cos θ)/θ], [(1−cos θ)/θ, sin θ/θ]]; near θ = 0 the two quotients are taken
     from their series, so the limit is exact and smooth.

@@ -1,8 +1,8 @@
 """A teammate seen from a pose node: a range-bearing factor between two pose nodes of two robots.
 
-The point seen is carried to the observer's pose node by the observer's odometry T ∘ Exp(xi),
-xi ~ N(0, C): p' = T Exp(xi) p forward of the node, p' = (T Exp(xi))⁻¹ p where the node came later;
-its covariance grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
+The observed point is carried to the observer's pose node by the observer's odometry T ∘ Exp(xi), xi
+~ N(0, C): p' = T Exp(xi) p to an earlier node, p' = (T Exp(xi))⁻¹ p to a later one; its covariance
+grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ SightingKey: TypeAlias = tuple[int, str, int, str]
 
 @dataclass(frozen=True, eq=False)
 class InterRobotFactor:
-    """An inter-robot measurement: from the pose node at stamp_ns of submap `sequence` of (robot,
+    """An inter-robot measurement from the pose node at stamp_ns of submap `sequence` of (robot,
     incarnation).
 
     measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
@@ -66,11 +66,11 @@ class CarriedPoint(NamedTuple):
 
 
 def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) -> CarriedPoint:
-    """A teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the node's
-    time.
+    """Locate a teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the
+    node's time.
 
-    Its covariance is the sum of the sensor's variances along and across the ray, of that of the
-    marker's position on the teammate (marker_sigma) and of that of the drift.
+    Its covariance is the sum of the sensor's variances along and across the ray, that of the
+    marker's position on the teammate (marker_sigma) and that of the drift.
     """
     range_variance, bearing_variance = noise(sensor, distance)
     own = elementary.squared(sensor.marker_sigma) + drift * drift
@@ -80,7 +80,7 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
 
 
 def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
-    """A point that the sensor sees, in the frame of the base on which it is mounted."""
+    """Transform a point that the sensor sees into the frame of the base that carries the sensor."""
     turn = _turn(float(mount[2]))
     return CarriedPoint(
         transformed(mount, seen.point), dense.product(dense.product(turn, seen.covariance), turn.T)
@@ -88,9 +88,7 @@ def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
 
 
 def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
-    """The point in the frame of a later node: the observer has moved by node_from_here before
-    reaching it.
-    """
+    """Carry the point to a later node, which the observer reaches by node_from_here."""
     T = node_from_here.mean
     turn = _turn(float(T[2]))
     J = dense.product(turn, np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]]))
@@ -101,7 +99,7 @@ def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
 
 
 def carried_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
-    """The point in the frame of an earlier node, from which the observer has moved by
+    """Carry the point back to an earlier node, from which the observer has moved by
     here_from_node.
     """
     T = inverse(here_from_node.mean)
@@ -122,7 +120,8 @@ def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
 def reduced(
     carried: Sequence[CarriedPoint],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """One (range, bearing) and its covariance for several measurements of a teammate from one node.
+    """Reduce several measurements of a teammate from one node to one (range, bearing) and its
+    covariance.
 
     The median of each, bearings relative to the first one; the covariance is the mean of theirs, as
     for one measurement: a camera repeats its error on a marker from one moment to the next.

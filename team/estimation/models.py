@@ -1,7 +1,7 @@
 """The motion of one interval as a Gaussian on SE(2), and the range-bearing sensor.
 
-Both are the field's textbook models (Thrun, Burgard and Fox 2005, sections 5.3 and 6.6) with the
-noise of motion carried to the tangent space of the motion's end, so that motions compose.
+Both are textbook models (Thrun, Burgard and Fox 2005, sections 5.3 and 6.6) with the motion noise
+in the tangent space of the motion's end, so that motions compose.
 """
 
 import math
@@ -18,9 +18,9 @@ from team.estimation.compiled import compiled
 from team.estimation.geometry import Point, Pose, adjoint, inverse, swept, wrapped
 
 NEAREST_M = 1e-3
-"""A point that is nearer than this has no bearing; ranges are taken as at least this [m]."""
+"""Least range [m]: a nearer point has no bearing."""
 OFF_AXIS = 0.17364817766693041
-"""Least cosine of the angle to the optical axis at which a depth tells a range."""
+"""Least cosine of the angle to the optical axis at which a depth determines a range."""
 
 
 class Increment(msgspec.Struct, frozen=True, gc=False):
@@ -93,10 +93,10 @@ def go(pose: Pose, then: Pose) -> None:
 
 
 class CourseModel(NamedTuple):
-    """The numbers of a `MotionModel` as kernels take them: `model_of`.
+    """The parameters of a `MotionModel` for the kernels (`model_of`).
 
-    Densities are (per_s, per_m, per_rad). What a model does not have has its flag down; a limit
-    that it does not have is infinite, as is the range of speeds whose scale is known.
+    Densities are (per_s, per_m, per_rad). An absent part of a model has its flag down; an absent
+    limit is infinite, as is the range of speeds whose scale is known.
     """
 
     turns_first: bool
@@ -127,7 +127,7 @@ Course = tuple[float, float, float, float, float, float, float]
 
 
 def model_of(motion: MotionModel) -> CourseModel:
-    """The numbers of a motion model."""
+    """Convert a motion model to the kernels' parameters."""
     alphas, shares, base = motion.alphas, motion.shares, motion.wheel_base
     speeds = motion.calibrated_speed
     return CourseModel(
@@ -161,16 +161,17 @@ def _densities(noise: MotionNoise) -> Densities:
 
 @lru_cache(maxsize=256)
 def known_model(motion: MotionModel) -> CourseModel:
-    """`model_of`, kept from call to call."""
+    """Convert a motion model as `model_of`, cached."""
     return model_of(motion)
 
 
 def increment_of(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Increment:
-    """One odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
+    """Compute the motion of one odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for
+    `duration_s`.
 
-    The motion of `course_of`, and its noise in the tangent space of its end.
+    The motion of `course_of`, with its noise in the tangent space of its end.
     """
     model = known_model(motion)
     kernel = turn_then_drive if model.turns_first else arc
@@ -179,17 +180,16 @@ def increment_of(
 
 @compiled
 def course_of(model: CourseModel, duration_s: float, forward: float, yaw_rate: float) -> Course:
-    """The way [m] and the turn [rad] of an interval, and the `_variances` over them.
+    """Compute the path length [m] and turn [rad] of an interval, and their `_variances`.
 
-    With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below),
-    ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the way
-    d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the noises
-    a (forward, on d), b (turn, on φ), c (final turn), l (lateral):
-    all others: Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma & Ma
-    eq. 1-4, with its limit φ → 0.
-    "turn-then-drive": turn φ + b, drive d + a, then (0, l, c): the thesis, section 4.3.1.
-    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|, and what `_of_alphas`,
-    `_of_wheels` and the shares add; by the wheels alone are a and b correlated.
+    With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below), ω =
+    clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the path length d = sign(v) max(|v| − turn_drag·|ω|,
+    0)·t, the turn φ = ω t + veer·d and the noises a (forward, on d), b (turn, on φ), c (final
+    turn), l (lateral): all others: Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al.
+    table 5.3 and Ma & Ma eq. 1-4, with its limit φ → 0. "turn-then-drive": turn φ + b, drive d + a,
+    then (0, l, c): the thesis, section 4.3.1. Each variance is the density's per_s² t + per_m² |d|
+    + per_rad² |φ|, plus the terms of `_of_alphas`, `_of_wheels` and the shares; only the wheels
+    correlate a and b.
     """
     rate = _clipped(model.yaw_scale * yaw_rate, model.yaw_rate_limit)
     lost = model.turn_drag * abs(rate) * duration_s
@@ -212,7 +212,7 @@ def _clipped(rate: float, limit: float) -> float:
 def motion_variances(
     motion: MotionModel, duration_s: float, distance: float, turn: float
 ) -> tuple[float, float, float, float, float]:
-    """The noises of a motion model over a way [m] and a turn [rad], as `_variances` has them."""
+    """Compute the `_variances` of a motion model over a path length [m] and a turn [rad]."""
     return _variances(known_model(motion), duration_s, distance, turn)
 
 
@@ -220,8 +220,8 @@ def motion_variances(
 def _variances(
     model: CourseModel, duration_s: float, distance: float, turn: float
 ) -> tuple[float, float, float, float, float]:
-    """Of (forward, turn, final turn, lateral) over a way and a turn, the third before the last two:
-    the covariance of forward and turn.
+    """Variances of forward, turn, final-turn and lateral noise, with cov(forward, turn) before the
+    last two, for a path length and a turn.
     """
     forward_var = _variance(model.forward, duration_s, distance, turn)
     turn_var = _variance(model.turn, duration_s, distance, turn)
@@ -256,10 +256,10 @@ def _variance(noise: Densities, duration_s: float, distance: float, turn: float)
 def _of_alphas(
     alphas: Alphas, interval_s: float, duration_s: float, distance: float, turn: float
 ) -> tuple[float, float, float]:
-    """Variances of (forward [m²], turn [rad²], final turn [rad²]) by Ma & Ma's α₁ … α₆.
+    """Compute variances of (forward [m²], turn [rad²], final turn [rad²]) by Ma & Ma's α₁ … α₆.
 
     Their errors of v, ω and γ have the variances α₁v² + α₂ω², α₃v² + α₄ω², α₅v² + α₆ω² and are held
-    for one interval T (eq. 2-4): times T² on the way and the turns. As a density that is T·t.
+    for one interval T (eq. 2-4): times T² on the path and the turns. As a density that is T·t.
     """
     v, w = distance / duration_s, turn / duration_s
     v2, w2 = v * v, w * w
@@ -276,10 +276,11 @@ def _of_alphas(
 def _of_wheels(
     base: float, left: float, right: float, distance: float, turn: float
 ) -> tuple[float, float, float]:
-    """(var d, var φ, cov(d, φ)) of the wheels' errors: J diag(V_l, V_r) Jᵀ, V = noise² |way|.
+    """Compute (var d, var φ, cov(d, φ)) of the wheels' errors: J diag(V_l, V_r) Jᵀ, V = noise²
+    |way|.
 
-    d = (s_r + s_l)/2 and φ = (s_r − s_l)/base (Downs eq. 2.3-2.4), so s = d ± φ base/2 and
-    J = [[1/2, 1/2], [−1/base, 1/base]] for (s_l, s_r).
+    d = (s_r + s_l)/2 and φ = (s_r − s_l)/base (Downs eq. 2.3-2.4), so s = d ± φ base/2 and J =
+    [[1/2, 1/2], [−1/base, 1/base]] for (s_l, s_r).
     """
     half = 0.5 * base * turn
     of_left, of_right = left * left * abs(distance - half), right * right * abs(distance + half)
@@ -291,8 +292,8 @@ def _of_wheels(
 def scale_column(
     model: CourseModel, duration_s: float, forward: float, yaw_rate: float
 ) -> tuple[float, float]:
-    """d/db at 0 of the interval's motion (ahead, left) if the true way is (1 + b) times the
-    measured one, in the tangent space of its end: `odometry.forward_column`.
+    """Compute d/db at 0 of the interval's motion (ahead, left) if the true path length is (1 + b)
+    times the measured one, in the tangent space of its end: `odometry.forward_column`.
     """
     least, most = model.calibrated_speed
     if least <= abs(forward) <= most:
@@ -315,7 +316,7 @@ def arc(
     final: float,
     lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
-    """`drive_arc` as a motion of its own."""
+    """Return the motion of `drive_arc`."""
     step, covariance = np.empty(3), np.empty((3, 3))
     course = distance, turn, forward_var, turn_var, both, final, lateral
     drive_arc(course, step, covariance)
@@ -324,11 +325,11 @@ def arc(
 
 @compiled
 def drive_arc(course: Course, step: Pose, covariance: Float[np.ndarray, "3 3"]) -> None:
-    """The motion of an arc and its noise, in place: the two columns of SE(2)'s right Jacobian at
-    (d, 0, φ) that the noises a and b act through.
+    """Write the motion of an arc and its noise, in place, by the two columns of SE(2)'s right
+    Jacobian at (d, 0, φ) for the noises a and b.
 
-    Jr₁ = (sin φ/φ, −(1 − cos φ)/φ, 0), Jr₃ = (d(φ − sin φ)/φ², d(1 − cos φ)/φ², 1); Solà et al.,
-    A micro Lie theory, eq. 163. Near φ = 0 the quotients are taken from their series. `both` is the
+    Jr₁ = (sin φ/φ, −(1 − cos φ)/φ, 0), Jr₃ = (d(φ − sin φ)/φ², d(1 − cos φ)/φ², 1); Solà et al., A
+    micro Lie theory, eq. 163. Near φ = 0 the quotients are taken from their series. `both` is the
     covariance of a and b.
     """
     distance, turn, forward_var, turn_var, both, final, lateral = course
@@ -367,7 +368,7 @@ def turn_then_drive(
     final: float,
     lateral: float,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
-    """`turn_and_drive` as a motion of its own."""
+    """Return the motion of `turn_and_drive`."""
     step, covariance = np.empty(3), np.empty((3, 3))
     course = distance, turn, forward_var, turn_var, both, final, lateral
     turn_and_drive(course, step, covariance)
@@ -376,7 +377,7 @@ def turn_then_drive(
 
 @compiled
 def turn_and_drive(course: Course, step: Pose, covariance: Float[np.ndarray, "3 3"]) -> None:
-    """The motion of a turn and a way behind it, and its noise, in place.
+    """Write the motion of a turn and a straight path after it, and its noise, in place.
 
     The noises (a, b) reach the end's tangent space by J = [[1, 0], [0, d], [0, 1]].
     """
@@ -394,7 +395,7 @@ def turn_and_drive(course: Course, step: Pose, covariance: Float[np.ndarray, "3 
 
 @compiled
 def predicted(pose: Pose, landmark: Point) -> tuple[float, float]:
-    """Range [m] and bearing [rad] of a point landmark seen from pose, both in the map frame.
+    """Predict range [m] and bearing [rad] of a point landmark from a pose, both in the map frame.
 
     range = max(‖landmark − (x, y)‖, NEAREST_M), bearing = atan2(Δy, Δx) − theta in (−π, π].
     """
@@ -405,27 +406,31 @@ def predicted(pose: Pose, landmark: Point) -> tuple[float, float]:
 
 @compiled
 def pose_jacobian(distance: float, bearing: float) -> Float[np.ndarray, "2 3"]:
-    """∂z/∂xi of h(pose ∘ Exp(xi), landmark) at xi = 0, from the predicted (range, bearing)."""
+    """Compute ∂z/∂xi of h(pose ∘ Exp(xi), landmark) at xi = 0, from the predicted (range,
+    bearing).
+    """
     s, c = elementary.sin_and_cos(bearing)
     return np.array([[-c, -s, 0.0], [s / distance, -c / distance, -1.0]])
 
 
 @compiled
 def landmark_jacobian(distance: float, direction: float) -> Float[np.ndarray, "2 2"]:
-    """∂z/∂landmark, from the predicted range and the direction = theta + bearing in the map."""
+    """Compute ∂z/∂landmark, from the predicted range and the direction = theta + bearing in the
+    map.
+    """
     s, c = elementary.sin_and_cos(direction)
     return np.array([[c, s], [-s / distance, c / distance]])
 
 
 @compiled
 def located(pose: Pose, distance: float, bearing: float) -> Point:
-    """The inverse model: the point at (range, bearing) from pose, in the pose's map frame."""
+    """Invert the model: the point at (range, bearing) from pose, in the pose's map frame."""
     s, c = elementary.sin_and_cos(pose[2] + bearing)
     return np.array([pose[0] + distance * c, pose[1] + distance * s])
 
 
 def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
-    """(σ_range² [m²], σ_bearing² [rad²]) at a predicted range: σ_r² = range_sigma² + (per_m r)²."""
+    """Compute (σ_range² [m²], σ_bearing² [rad²]) at a range: σ_r² = range_sigma² + (per_m r)²."""
     slope = sensor.range_sigma_per_m * predicted_range
     return elementary.squared(sensor.range_sigma) + slope * slope, elementary.squared(
         sensor.bearing_sigma
@@ -433,7 +438,7 @@ def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
 
 
 def variances(sensor: Sensor) -> tuple[float, float, float]:
-    """(σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]): what kernels take as a sensor."""
+    """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]), the kernels' form of a sensor."""
     return (
         elementary.squared(sensor.range_sigma),
         elementary.squared(sensor.range_sigma_per_m),
@@ -442,7 +447,7 @@ def variances(sensor: Sensor) -> tuple[float, float, float]:
 
 
 class Calibration(NamedTuple):
-    """The numbers of a `Sensor` that make a raw measurement a corrected one, or refuse it."""
+    """The parameters of a `Sensor` that correct a raw measurement, or refuse it."""
 
     range_offset: float
     range_scale: float
@@ -457,7 +462,7 @@ class Calibration(NamedTuple):
 
 @lru_cache(maxsize=256)
 def calibration_of(sensor: Sensor) -> Calibration:
-    """The calibration of a sensor as the kernel takes it."""
+    """Return the calibration of a sensor for the kernel."""
     lens = sensor.bearing_lens
     return Calibration(
         range_offset=float(sensor.range_offset),
@@ -478,7 +483,7 @@ Scanned = tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarra
 def scanned(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> Scanned:
-    """`acceptable` and `corrected` of the same measurements, in one call."""
+    """Compute `acceptable` and `corrected` of the same measurements, in one call."""
     raw = np.array(ranges, np.float64), np.array(bearings, np.float64)
     return _scanned(calibration_of(sensor), *raw)
 
@@ -486,7 +491,7 @@ def scanned(
 def corrected(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The calibration applied: ((r − range_offset)/range_scale, b − bearing_offset − lens(b)).
+    """Apply the calibration: ((r − range_offset)/range_scale, b − bearing_offset − lens(b)).
 
     A depth is divided by cos(b − optical_axis) too; where that is below OFF_AXIS it is NaN.
     """
@@ -496,10 +501,10 @@ def corrected(
 def acceptable(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which raw measurements lie in [min_range, max_range] and in the field of view.
+    """Mark raw measurements in [min_range, max_range] and in the field of view.
 
-    Measurements that are not finite do not; neither does one whose corrected range is not positive,
-    or a depth beyond OFF_AXIS.
+    Not finite measurements, those whose corrected range is not positive, and depths beyond OFF_AXIS
+    are not.
     """
     return scanned(sensor, ranges, bearings)[0]
 

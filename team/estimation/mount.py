@@ -1,10 +1,10 @@
-"""A sensor that is mounted at a place of its own on the robot's base.
+"""A sensor mounted off the origin of the robot's base.
 
 The front end follows the sensor: within a window poses and motions are the sensor's, so that a
-measurement is range and bearing from the pose, whatever its noise. Of a base that moves by T the
+measurement is range and bearing from the pose, whatever its noise. For a motion T of the base the
 sensor at m moves by m⁻¹ ∘ T ∘ m. At the window's end the poses become the base's again, particle by
 particle: with S the sensor's pose since the window's start, the base's is m ∘ S ∘ m⁻¹, and a point
-p that is seen from the sensor's start is m p from the base's.
+p in the frame of the sensor's start is m p in that of the base's.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from team.estimation.models import Increment
 
 
 def of_sensor(step: Increment, mount: Pose) -> Increment:
-    """The sensor's motion as the base moves: T Exp(ξ) m = m (m⁻¹ T m) Exp(Ad(m⁻¹) ξ)."""
+    """Convert a motion of the base to the sensor's: T Exp(ξ) m = m (m⁻¹ T m) Exp(Ad(m⁻¹) ξ)."""
     away = inverse(mount)
     Ad = adjoint(away)
     C = dense.product(dense.product(Ad, step.covariance), Ad.T)
@@ -25,12 +25,12 @@ def of_sensor(step: Increment, mount: Pose) -> Increment:
 
 
 def of_base(step: Increment, mount: Pose) -> Increment:
-    """The base's motion as the sensor moves: `of_sensor` the other way round."""
+    """Convert a motion of the sensor to the base's, the inverse of `of_sensor`."""
     return of_sensor(step, inverse(mount))
 
 
 def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:
-    """The pose ∘ step of a pose in (x, y, θ), and its covariance."""
+    """Compose a pose in (x, y, θ) and a motion, with covariance."""
     end = compose(pose.mean, step)
     dx, dy = end[:2] - pose.mean[:2]
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
@@ -38,7 +38,7 @@ def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:
 
 
 def base_poses(poses: Float[np.ndarray, "*n 3"], mount: Pose) -> Float[np.ndarray, "*n 3"]:
-    """Of each sensor's pose S the base's, m ∘ S ∘ m⁻¹."""
+    """Convert each sensor pose S to the base's, m ∘ S ∘ m⁻¹."""
     away = inverse(mount)
     s, c = elementwise.sin_and_cos(poses[..., 2])
     x = poses[..., 0] + c * away[0] - s * away[1]
@@ -49,7 +49,7 @@ def base_poses(poses: Float[np.ndarray, "*n 3"], mount: Pose) -> Float[np.ndarra
 
 
 def base_points(points: Float[np.ndarray, "*n 2"], mount: Pose) -> Float[np.ndarray, "*n 2"]:
-    """The mount m applied to points p of the sensor's start: m p."""
+    """Map points p of the sensor's start to the base's: m p."""
     found: Float[np.ndarray, "*n 2"] = np.stack(
         _turned(points[..., 0], points[..., 1], mount), axis=-1
     )
@@ -60,7 +60,7 @@ def base_points(points: Float[np.ndarray, "*n 2"], mount: Pose) -> Float[np.ndar
 def base_shifts(
     shifts: Float[np.ndarray, "*b n 3"], poses: Float[np.ndarray, "n 3"], mount: Pose
 ) -> Float[np.ndarray, "*b n 3"]:
-    """The shifts (dx, dy, dθ) of the base's poses that follow from those of the sensor's poses."""
+    """Convert shifts (dx, dy, dθ) of the sensor's poses to those of the base's."""
     away = inverse(mount)
     s, c = elementwise.sin_and_cos(poses[:, 2])
     x = shifts[..., 0] - (s * away[0] + c * away[1]) * shifts[..., 2]

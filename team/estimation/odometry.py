@@ -46,14 +46,14 @@ class OdometryInterval(NamedTuple):
     moved: Moved | None = None
 
     def part(self, motion: MotionModel, duration_ns: int, rest_ns: int) -> Increment:
-        """The motion of a part of the interval, which is followed by rest_ns of it."""
+        """Compute the motion of a part of the interval, which is followed by rest_ns of it."""
         if self.moved is None:
             return increment_of(motion, duration_ns * 1e-9, self.forward, self.yaw_rate)
         share, rest = duration_ns / self.duration_ns, rest_ns / self.duration_ns
         return part_of(motion, self.moved, self.duration_ns * 1e-9, share, rest)
 
     def gone_on(self, end_ns: int, duration_ns: int) -> "OdometryInterval":
-        """A later interval at the same speeds."""
+        """Extrapolate to a later interval at the same speeds."""
         if self.moved is None:
             return self._replace(end_ns=end_ns, duration_ns=duration_ns)
         twist = self.moved.twist * (duration_ns / self.duration_ns)
@@ -61,15 +61,13 @@ class OdometryInterval(NamedTuple):
 
     @property
     def speed(self) -> float:
-        """Magnitude of the velocity [m/s], or the signed forward speed where no motion was
-        reported.
-        """
+        """Magnitude of the velocity [m/s]; without a reported motion, the signed forward speed."""
         if self.moved is None:
             return self.forward
         return elementary.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
 
     def forward_column(self, motion: MotionModel, duration_ns: int) -> Float[np.ndarray, "3"]:
-        """`forward_column` of a part of the interval."""
+        """Compute `forward_column` of a part of the interval."""
         if self.moved is None:
             return forward_column(motion, duration_ns * 1e-9, self.forward, self.yaw_rate)
         column, speeds = np.zeros(3), motion.calibrated_speed
@@ -83,13 +81,14 @@ class OdometryInterval(NamedTuple):
 
 
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)
-"""The interval that is assumed before the first measurement."""
+"""The interval assumed before the first measurement."""
 
 
 def forward_column(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Float[np.ndarray, "3"]:
-    """d/db at 0 of the interval's motion if the true way is (1 + b) times the measured one.
+    """Compute d/db at 0 of the interval's motion if the true path length is (1 + b) times the
+    measured one.
 
     In the tangent space of its end; zero where |forward| lies in `calibrated_speed`, whose scale is
     known, and without such a range.
@@ -99,7 +98,7 @@ def forward_column(
 
 
 def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:
-    """(forward [m/s], yaw rate [rad/s]) of a car, from its wheel and steering encoders.
+    """Compute (forward [m/s], yaw rate [rad/s]) of a car from its wheel and steering encoders.
 
     With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at (0,
     h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). Two NaN where the
@@ -116,14 +115,14 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
 
 
 def moved(increment: Pose, covariance: Float[np.ndarray, "3 3"] | None) -> Moved:
-    """The motion whose end, seen in its start, is `increment` (x, y, theta), |theta| ≤ π."""
+    """Convert a motion whose end, seen in its start, is `increment` (x, y, theta), |theta| ≤ π."""
     return Moved(logarithm(increment), covariance)
 
 
 def calibrated(motion: MotionModel, twist: Pose, duration_s: float) -> Pose:
-    """A measured twist with the model's scales, limit, drag and veer, as `increment_of` has them.
+    """Apply the model's scales, limit, drag and veer to a measured twist, as `increment_of`.
 
-    The scales of speed are of the way, whichever its direction; veer goes by its forward part.
+    The scales of speed apply to the path length in any direction; veer follows its forward part.
     """
     limit = math.inf if motion.yaw_rate_limit is None else motion.yaw_rate_limit
     turn = motion.yaw_scale * float(twist[2])
@@ -139,12 +138,12 @@ def calibrated(motion: MotionModel, twist: Pose, duration_s: float) -> Pose:
 def part_of(
     motion: MotionModel, whole: Moved, duration_s: float, share: float, rest: float
 ) -> Increment:
-    """A share of a measured motion at constant twist, which is followed by the share `rest`.
+    """Compute a share of a measured motion at constant twist, followed by the share `rest`.
 
-    Without a covariance of the source the noise is the model's over this way, turn and time. The
-    source's covariance C is of the whole interval: a share f of it is f Ad C Adᵀ, with Ad of the
-    motion that follows. Seen from the interval's end the error then grows evenly, so however the
-    interval is split, its parts compose to C: Σ Ad⁻¹ (f Ad C Adᵀ) Ad⁻ᵀ = C.
+    Without the source's covariance the noise is the model's over this path length, turn and time.
+    The source's covariance C is of the whole interval: a share f of it is f Ad C Adᵀ, with Ad of
+    the motion that follows. Seen from the interval's end the error then grows evenly, so however
+    the interval is split, its parts compose to C: Σ Ad⁻¹ (f Ad C Adᵀ) Ad⁻ᵀ = C.
     """
     twist = calibrated(motion, whole.twist, duration_s)
     xi = share * twist
@@ -165,11 +164,12 @@ def part_of(
 def _spread(
     xi: Pose, way: float, noises: tuple[float, float, float, float, float]
 ) -> Float[np.ndarray, "3 3"]:
-    """The covariance at its end of Exp(ξ + (a u, b)), then l across the way and a final turn c.
+    """Compute the covariance at its end of Exp(ξ + (a u, b)), then l across the path and a final
+    turn c.
 
-    (ξ₀, ξ₁) = d u with the way d, which is negative backwards; u stays the direction of motion in
-    the moving frame. a and b act through Jr (u, 0) and the last column of SE(2)'s right Jacobian
-    Jr at ξ (Solà et al., A micro Lie theory, eq. 163).
+    (ξ₀, ξ₁) = d u with the path length d, negative backwards; u stays the direction of motion in
+    the moving frame. a and b act through Jr (u, 0) and the last column of SE(2)'s right Jacobian Jr
+    at ξ (Solà et al., A micro Lie theory, eq. 163).
     """
     forward_var, turn_var, both, final, lateral = noises
     x, y, turn = xi[0], xi[1], xi[2]

@@ -1,10 +1,9 @@
-"""Limits BLAS to one thread in this process, so that a map's bits do not depend on how it was
-started.
+"""Limit BLAS to one thread, so that a map's bits do not depend on how the process was started.
 
-A BLAS that divides a product among threads sums it in another order, so two threads give other bits
-than one. Environment variables are read only when such a library is loaded: NumPy's may have been
-loaded by a user's own script long ago, so what is there is configured directly when estimation is
-imported. SciPy's is loaded by those who need it, robots do not, and then finds the variables.
+A BLAS that divides a product among threads sums it in another order. Environment variables are read
+only when such a library is loaded: a user's script may have loaded NumPy's before, so loaded ones
+are configured directly when estimation is imported. SciPy's, which robots do not load, then reads
+the variables.
 """
 
 import os

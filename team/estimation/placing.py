@@ -1,7 +1,7 @@
-"""Parts of arrays are written in loops within kernels.
+"""Write parts of arrays in loops within kernels.
 
-An assignment `A[i:j, k:l] = B` checks that the shapes fit, and its message makes the compiler
-compile NumPy's and Python's formatting of numbers with the kernel: seconds for each process.
+An assignment `A[i:j, k:l] = B` checks the shapes, and its message makes the compiler compile
+NumPy's and Python's number formatting with the kernel: seconds for each process.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""Checks values against the bounds of what is physically sensible, and describes what exceeds them.
+"""Check values against physically sensible bounds, and describe violations.
 
-The wire checks whether a message is well formed; this module checks whether it can be true of a
-robot on the ground. A refusal is not an error of the program: it is a value, with its reason.
+The wire checks the form of a message; this module checks whether it can be true of a robot on the
+ground. A refusal is a value with its reason, not an error of the program.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
-    """Why a submap is refused; None if it is within the bounds."""
+    """Give the reason why a submap is refused; None if it is within the bounds."""
     if len(local.ids) > bounds.submap_landmarks:
         return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
     angles = _angles_of(local)
@@ -33,10 +33,10 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
 
 
 def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
-    """The submap whose covariance P is raised to P + F where P − F is not positive definite.
+    """Raise the submap's covariance P to P + F where P − F is not positive definite.
 
     F = diag(least²) for coordinates [m] and headings [rad]. Where each pose and each landmark has
-    an error of its own that is not smaller, P − F is a covariance, and P stays to the bit.
+    an error of its own that is not smaller, P − F is a covariance, and P is unchanged to the bit.
     """
     angles = _angles_of(local)
     sigmas = np.where(angles, least[1], least[0])
@@ -50,20 +50,21 @@ def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
 
 
 def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
-    """Marks the headings among the numbers of a submap."""
     angles = np.zeros(len(local.mean), dtype=np.bool_)
     angles[2 : 3 * (1 + len(local.node_stamps)) : 3] = True
     return angles
 
 
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
-    """Why an inter-robot measurement is refused; None if it is within the bounds."""
+    """Give the reason why an inter-robot measurement is refused; None if it is within the
+    bounds.
+    """
     why = _far(sighting.measurement[:1], bounds.extent_m, "of its observer")
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)
 
 
 def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
-    """Why an initial pose is refused; None if it is within the bounds."""
+    """Give the reason why an initial pose is refused; None if it is within the bounds."""
     if abs(start.pose[2]) > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(start.pose[:2], bounds.coordinate_m, "of the origin")
@@ -73,9 +74,9 @@ def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
 
 
 def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None:
-    """Why a prior (x, y, θ, x₁, y₁, …) is refused; None if it is within the bounds.
+    """Give the reason why a prior (x, y, θ, x₁, y₁, …) is refused; None if it is within the bounds.
 
-    A variance of zero is a known constant; what many submaps agree on has any small one.
+    A variance of zero is a known constant; the agreement of many submaps allows any small one.
     """
     points = np.arange(len(mean)) != 2
     why = _far(mean[points], bounds.coordinate_m, "of the origin")
@@ -110,7 +111,7 @@ def _far(coordinates: Values, limit_m: float, of: str) -> str | None:
 
 
 def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | None:
-    """Why a covariance with these headings is refused."""
+    """Give the reason why a covariance with these headings is refused."""
     variances = np.diag(covariance)
     if not (variances > 0.0).all():
         return "a variance that is not positive"

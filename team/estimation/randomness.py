@@ -1,4 +1,4 @@
-"""Random numbers keyed by what they are for: any submap can be computed again alone."""
+"""Random numbers keyed by their use: any submap can be computed again alone."""
 
 import hashlib
 
@@ -6,10 +6,10 @@ import numpy as np
 
 
 def generator(seed: int, robot: str, incarnation: int, sequence: int) -> np.random.Generator:
-    """A counter-based generator (Philox 4x64) for one window of one robot.
+    """Make the counter-based generator (Philox 4x64) of one window of one robot.
 
     Its 128-bit key is the BLAKE2b digest of (seed, robot, incarnation, sequence), so streams of
-    different windows are independent and none depends on how many numbers another one drew.
+    different windows are independent, and none depends on the draws of another.
     """
     digest = hashlib.blake2b(
         f"{seed}/{robot}/{incarnation}/{sequence}".encode(),

@@ -1,10 +1,10 @@
 """Scans of landmarks, each measurement with its own covariance or with the sensor's.
 
-`own` has a row for each measurement: of length 0 where none of them brings a covariance, else (rr
-[m²], rb [m·rad], bb [rad²], form). form POLAR: range and bearing have this covariance. form POINT:
-they are those of a point in the sensor's frame, whose noise is Gaussian in the plane with this
-covariance to first order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured bearing,
-from which S can be recovered exactly. form SENSOR: the sensor's noise, at the predicted range.
+`own` has a row for each measurement: of length 0 where none has a covariance, else (rr [m²], rb
+[m·rad], bb [rad²], form). form POLAR: the covariance of range and bearing. form POINT: that of a
+point in the sensor's frame with Gaussian noise in the plane, converted to first order: diag(1, 1/r)
+S diag(1, 1/r), S along and across the measured bearing, from which S can be recovered exactly. form
+SENSOR: the sensor's noise, at the predicted range.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ Own = Float[np.ndarray, "_ _"]
 
 
 def unclaimed(count: int) -> Own:
-    """The rows of measurements none of which brings a covariance."""
+    """Make the rows of measurements without covariances."""
     return np.empty((count, 0))
 
 
@@ -34,7 +34,7 @@ class Scan(NamedTuple):
     own: Own
 
     def only(self, taken: Bool[np.ndarray, " n"]) -> "Scan":
-        """The scan with only these of its measurements."""
+        """Select measurements of the scan."""
         return Scan(self.ids[taken], self.ranges[taken], self.bearings[taken], self.own[taken])
 
 
@@ -44,7 +44,7 @@ def polar_scan(
     bearings: Float[np.ndarray, " n"],
     covariances: Float[np.ndarray, "n 3"] | None = None,
 ) -> Scan:
-    """Ranges and bearings, each with its covariance (rr, rb, bb) if they bring any."""
+    """Make a scan of ranges and bearings, with covariances (rr, rb, bb) if any."""
     if covariances is None:
         return Scan(ids, ranges, bearings, unclaimed(len(ids)))
     form = np.full((len(ids), 1), POLAR)
@@ -56,7 +56,7 @@ def point_scan(
     points: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 3"] | None = None,
 ) -> Scan:
-    """Points (x, y) in the sensor's frame, each with its covariance (xx, xy, yy) if they bring any.
+    """Make a scan of points (x, y) in the sensor's frame, with covariances (xx, xy, yy) if any.
 
     (r, b) = (‖p‖, atan2(y, x)) and J S Jᵀ with J = ∂(r, b)/∂p.
     """
@@ -75,7 +75,7 @@ def point_scan(
 
 
 def calibrated(own: Own, sensor: Sensor) -> Own:
-    """The covariances of measurements after the sensor's calibration."""
+    """Apply the sensor's calibration to the covariances."""
     if not own.size or sensor.range_scale == sensor.covariance_factor == 1.0:
         return own
     scale, factor = sensor.range_scale, sensor.covariance_factor
@@ -84,8 +84,8 @@ def calibrated(own: Own, sensor: Sensor) -> Own:
 
 
 def together(parts: list[tuple[int, Own]]) -> Own:
-    """The rows of several scans, given by count and rows; where only some bring covariances, the
-    others have form SENSOR.
+    """Join the rows of several scans, given by count and rows; form SENSOR where only some have
+    covariances.
     """
     if not any(own.size for _, own in parts):
         return unclaimed(sum(count for count, _ in parts))
@@ -96,8 +96,8 @@ def together(parts: list[tuple[int, Own]]) -> Own:
 
 
 def of_each(parts: list[tuple[int, Own]]) -> Float[np.ndarray, "_ 4"]:
-    """The rows of several scans, given by count and rows; without a covariance of its own a row has
-    form SENSOR.
+    """Join the rows of several scans, given by count and rows; form SENSOR where there is no
+    covariance.
     """
     found = together(parts)
     sensors = np.array([0.0, 0.0, 0.0, SENSOR])
@@ -105,7 +105,7 @@ def of_each(parts: list[tuple[int, Own]]) -> Float[np.ndarray, "_ 4"]:
 
 
 def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[np.ndarray, " n"]:
-    """Marks measurements whose standard deviations are within the bounds, where they bring any."""
+    """Mark measurements whose own standard deviations, if any, are within the bounds."""
     if not own.size:
         return np.ones(len(own), dtype=np.bool_)
     (least_m, most_m), (least_rad, most_rad) = bounds.sigma_m, bounds.sigma_rad
@@ -123,10 +123,10 @@ def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[
 def carried(
     own: Float[np.ndarray, " own"], distance: float, direction: float, to: Float[np.ndarray, "2"]
 ) -> Own:
-    """The row of a measurement as seen from another pose, where its point lies at `to`.
+    """Transform the row of a measurement to another pose, where its point lies at `to`.
 
     direction: of the measurement's ray, in that pose's frame. Its covariance in the plane, along
-        and across the ray, is converted to the point's range and bearing there.
+    and across the ray, is converted to the point's range and bearing there.
     """
     if own[3] == SENSOR:
         return own[None]
@@ -141,7 +141,7 @@ def carried(
 
 
 def mean_claim(claims: list[Own]) -> Own:
-    """One row for the median of several measurements: the mean of their covariances.
+    """Average the covariances of several measurements to the row of their median.
 
     It is not divided by their number: an error on a landmark is repeated a moment later.
     """

@@ -18,11 +18,10 @@ NO_COLUMNS = np.empty((0, 0))
 
 @dataclass(frozen=True)
 class Unnamed:
-    """A window's knowledge of its U unnamed landmarks, by ascending number.
+    """Observations of a window's U unnamed landmarks, by ascending number.
 
-    counts: number of measurements of each, at least 1.
-    seen: which of the window's keyframes with detections observed it; two landmarks that one
-        keyframe observed are distinct.
+    counts: number of measurements of each, at least 1. seen: the window's keyframes with detections
+    that observed it; two landmarks that one keyframe observed are distinct.
     """
 
     counts: UInt32[np.ndarray, " U"]
@@ -30,7 +29,7 @@ class Unnamed:
 
     @cached_property
     def views(self) -> tuple[Int64[np.ndarray, " _"], ...]:
-        """The largest sets of three landmarks or more that one keyframe saw, ascending."""
+        """The largest sets of at least three landmarks that one keyframe saw, ascending."""
         seen = np.unique(self.seen.astype(np.float64), axis=1)
         count = seen.sum(axis=0)
         inside = seen.T @ seen == count[:, None]
@@ -52,9 +51,9 @@ class Slipped(NamedTuple):
 class Became:
     """The outcomes of a window's detections without identities.
 
-    stamps: of M scans [ns]; counts: number of detections of each.
-    By detection: rows, its index in its scan's message; landmarks, its number in the submap, 0
-    where it is in none; clutter, whether it is a false detection.
+    stamps: of M scans [ns]; counts: number of detections of each. By detection: rows, its index in
+    its scan's message; landmarks, its number in the submap, 0 for none; clutter, whether it is a
+    false detection.
     """
 
     stamps: Int64[np.ndarray, " M"]
@@ -65,9 +64,7 @@ class Became:
 
     @property
     def silent(self) -> list[tuple[int, bool]]:
-        """The stamps of the scans of which nothing is in the submap, and whether they are
-        clutter.
-        """
+        """Stamps of the scans without a landmark in the submap, and whether they are clutter."""
         k = len(self.counts)
         scan = np.repeat(np.arange(k), self.counts)
         used = np.bincount(scan[self.landmarks > 0], minlength=k)
@@ -85,15 +82,13 @@ NONE_UNNAMED = Unnamed(np.empty(0, np.uint32), np.empty((0, 0), np.bool_))
 class LocalMap:
     """N(mean, covariance) of (end pose, pose nodes, landmarks) in the frame of its start pose.
 
-    ids:         identities of the L landmarks, strictly ascending.
-    mean:        (x [m], y [m], theta [rad]) of the end pose and of K further poses of the robot,
-                 then (x₁, y₁, …, x_L, y_L); theta in (−π, π].
-    covariance:  symmetric positive definite, [m², m·rad, rad²].
-    node_stamps: team time of the K pose nodes [ns], strictly ascending.
-    biases, sensitivity: errors b that the robot's submaps share, ascending, and a row ∂mean/∂b of
-    each: given b the mean is mean + bᵀ sensitivity.
-    unnamed: of the landmarks without names, those from number 2³¹ on.
-    The start pose is exactly zero with zero uncertainty: nothing from outside the window is in it.
+    ids: identities of the L landmarks, strictly ascending. mean: (x [m], y [m], theta [rad]) of the
+    end pose and of K further poses of the robot, then (x₁, y₁, …, x_L, y_L); theta in (−π, π].
+    covariance: symmetric positive definite, [m², m·rad, rad²]. node_stamps: team time of the K pose
+    nodes [ns], strictly ascending. biases, sensitivity: errors b that the robot's submaps share,
+    ascending, and a row ∂mean/∂b of each: given b the mean is mean + bᵀ sensitivity. unnamed: of
+    the unnamed landmarks, those from number 2³¹ on. The start pose is exactly zero with zero
+    uncertainty: the submap contains no information from outside the window.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -116,7 +111,7 @@ class LocalMap:
 
     @property
     def spacings(self) -> Float[np.ndarray, "U U"]:
-        """Distances between landmarks without names that one keyframe saw [m]; ∞ between others."""
+        """Distances [m] between unnamed landmarks that one keyframe saw; ∞ between others."""
         x, y = self.landmarks[self.ids >= UNNAMED].T
         masks = self.unnamed.seen.astype(np.float32)
         away = elementwise.hypot(x[:, None] - x, y[:, None] - y)
@@ -126,8 +121,8 @@ class LocalMap:
 
     @property
     def distinct(self) -> Bool[np.ndarray, "L L"]:
-        """Which two landmarks, by their places in `ids`, can not be one: two that one keyframe
-        observed, and all pairs with a landmark that has a name. None where all have.
+        """Pairs of landmarks, by index in `ids`, that cannot be one: two that one keyframe
+        observed, and all pairs with a named landmark. None where all are named.
         """
         unnamed = self.ids >= UNNAMED
         together = np.full((len(self.ids), len(self.ids)), bool(unnamed.any()))
@@ -142,7 +137,7 @@ class LocalMap:
 
     @property
     def named(self) -> "LocalMap":
-        """The marginal without the unnamed landmarks, which have no meaning in another window."""
+        """The marginal without the unnamed landmarks, whose numbers hold in this window only."""
         if not len(self.ids) or self.ids[-1] < UNNAMED:
             return self
         named = int(np.searchsorted(self.ids, UNNAMED))
@@ -163,7 +158,7 @@ class LocalMap:
 
     @property
     def without_biases(self) -> "LocalMap":
-        """The same submap with the errors that the robot's submaps share taken as zero."""
+        """The same submap with the shared errors taken as zero."""
         return LocalMap(
             self.ids, self.mean, self.covariance, self.node_stamps, unnamed=self.unnamed
         )

@@ -1,16 +1,16 @@
-"""Certainty: the probability that a detection is of the landmark that it is associated with.
+"""Certainty: the probability that a detection is of its associated landmark.
 
-In one scan each landmark gives one detection at most, and each detection is of one landmark, of an
-unmapped one, or clutter. For a landmark j that is in view with probability v_j and detected with
+In one scan each landmark gives at most one detection, and each detection is of one landmark, of an
+unmapped one, or clutter. For a landmark j in view with probability v_j and detected with
 probability P_D, the odds of "z is of landmark j" against "z is of something else and j was missed"
 are
 
     ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)).
 
 ρ is the number of detections per square metre of a view, ρ_out that of the detections in no
-landmark, and V_j = π γ √|S_j| the volume of the gate γ: a landmark that lies in the gate of another
-one may be part of it. The marginals over all joint associations of the scan
-follow by belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
+landmark, and V_j = π γ √|S_j| the volume of the gate γ: a landmark in the gate of another one may
+be part of it. The marginals over all joint associations of the scan follow by belief propagation
+(Williams and Lau 2014, IEEE TAES 50(4)).
 """
 
 from dataclasses import dataclass
@@ -27,14 +27,13 @@ from team.estimation.association.smoothing import SmoothedWindow
 LEAST = 0.1
 """Least probability that a detected landmark is in view."""
 WIDER, FARTHER = 0.5, 1.25
-"""The sector in view extends this far [rad] beyond the outermost bearing, and to this multiple
-of the median range at least: a robot that stands still sees a landmark at one place only, but
-more of its surroundings are in view.
+"""Margin [rad] of the sector in view beyond the outermost bearing, and its least range in multiples
+of the median: a robot that stands still sees a landmark at one place only, but views more.
 """
 ROUNDS = 30
 """Most rounds of belief propagation."""
 SETTLED = 1e-6
-"""Belief propagation ends when no message changes by more."""
+"""Change of the messages below which belief propagation ends."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class FieldOfView:
     def probability_in_view(
         self, seen: Float[np.ndarray, "L 2"], spread: Float[np.ndarray, "L 2 2"]
     ) -> Float[np.ndarray, " L"]:
-        """Probability that each place, given in the sensor's frame, is in view."""
+        """Compute the probability that each place, in the sensor's frame, is in view."""
         ranges = np.maximum(elementwise.hypot(seen[:, 0], seen[:, 1]), 1e-6)
         bearings = elementwise.atan2(seen[:, 1], seen[:, 0])
         along = seen / ranges[:, None]
@@ -70,8 +69,8 @@ class FieldOfView:
 
 
 def estimate_view(scans: Scans) -> FieldOfView:
-    """Estimate the sector that the window's detections fill, without the widening by their noise,
-    and the density of detections in it.
+    """Estimate the sector filled by the window's detections, before its widening by their noise,
+    and their density in it.
     """
     ranges = elementwise.hypot(scans.points[:, 0], scans.points[:, 1])
     bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
@@ -90,9 +89,7 @@ def association_probabilities(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> Float[np.ndarray, " N"]:
-    """Probability, for each detection, that it is of the landmark that it is associated with; 0 for
-    a detection without a landmark.
-    """
+    """Compute the probability that each detection is of its landmark; 0 without one."""
     view = estimate_view(scans)
     counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(window.landmarks))
     alone = landmark_of == UNASSIGNED
@@ -126,9 +123,7 @@ def association_probabilities(
 
 
 def marginals(weights: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
-    """Compute P(detection i is of landmark j) from the odds ψ_ij of the pairs, with each detection
-    and each landmark in one pair at most.
-    """
+    """Compute P(detection i is of landmark j) from the odds ψ_ij, each in at most one pair."""
     messages = np.ones_like(weights)
     for _ in range(ROUNDS):
         of_landmark = (weights * messages).sum(axis=0) - weights * messages

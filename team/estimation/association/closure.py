@@ -2,15 +2,14 @@
 
 The patch, the landmarks of a stream's last submaps, is compared with the rest of its island, or
 with another island, in which its place is unknown. Pair voting proposes alignments; each is grown
-from two of its pairs under the joint covariance. The evidence for it is the log-likelihood ratio of
-its pairs less a penalty for absent landmarks: those that one side has where the other side observed
-and has none. The best alignment is a closure only if it passes the tests of `verification`, among
+from two of its pairs under the joint covariance. Its evidence is the log-likelihood ratio of its
+pairs less a penalty for absent landmarks: those of one side that the other side viewed without
+having one. The best alignment is a closure only if it passes the tests of `verification`, among
 them a margin to every other alignment.
 
-Voting needs many pairs, since it searches everywhere. Where the place of a submap is uncertain by a
-few metres only, `assign_nearby` weighs all joint assignments to the landmarks there instead: three
-pairs on which they agree suffice, if together they have the evidence that a single uncertain pair
-needs.
+Voting needs many pairs, since it searches everywhere. Where the place of a submap is uncertain by
+only a few metres, `assign_nearby` weighs all joint assignments to the landmarks there: three pairs
+on which they agree suffice, if together they have the evidence required of one uncertain pair.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,21 +52,17 @@ from team.estimation.geometry import compose
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""
 WEAK = 2
-"""An alignment with this many times fewer votes than the best one has pairs is no rival of it."""
+"""Ratio of the best alignment's pairs to the votes of another, from which that is no rival."""
 EXAMINED = 120
-"""Number of alignments that are examined: those with the most matched points."""
+"""Number of examined alignments, those with the most matched points."""
 TRIED = 8
-"""Number of them that are grown: those with the fewest absent landmarks for their matched ones."""
+"""Number of grown ones, those with the fewest absent landmarks for their matched ones."""
 WORTH = 3.0
-"""About what a matched point adds to the log-likelihood ratio; it decides which alignments are
-grown.
-"""
+"""Approximate log-likelihood ratio of a matched point, to select the alignments to grow."""
 SEEDS = 3
-"""Number of pairs of seeds that are tried for each."""
+"""Number of tried pairs of seeds for each."""
 PART = 15
-"""Number of neighbouring landmarks in a part of the patch that votes for an alignment of its
-own.
-"""
+"""Number of neighbouring landmarks in a part of the patch that votes by itself."""
 TOLERANCE, REACH = 0.4, 30.0
 """Largest distance of matched points in a proposal, and of two points that vote together, in radii
 of one object.
@@ -79,10 +74,9 @@ NEARLY = 2.0
 class Side(NamedTuple):
     """Landmarks of one side: their indices in the joint Gaussian, their positions and spreads.
 
-    ids: their indices in the caller's map.
-    within: their indices in the whole side.
-    views: which landmarks of the whole side were observed together.
-    parts: groups of neighbours in the whole side.
+    ids: their indices in the caller's map. within: their indices in the whole side. views:
+    landmarks of the whole side that were observed together. parts: groups of neighbours in the
+    whole side.
     """
 
     at: Indices
@@ -94,14 +88,13 @@ class Side(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """A placement of the patch on the target: its pairs, and the part of the target that it was
-    grown on.
+    """A placement of the patch on the target: its pairs, and the part of the target it was grown
+    on.
 
-    absent: number of landmarks that one side has where the other side observed and has none.
-    evidence: log-likelihood ratio of the pairs less the penalty for the absent landmarks.
-    as_rival: the same where a landmark is absent only if the other side has none at all beside it,
-        matched or not. Where maps are bent, few of the pairs of a place are found, and unmatched
-        landmarks beside others are no evidence against it.
+    absent: number of landmarks of one side that the other side viewed without having one. evidence:
+    log-likelihood ratio of the pairs less the penalty for them. as_rival: the same where a landmark
+    is absent only if the other side has none at all beside it, matched or not: in bent maps few of
+    a place's pairs are found, and unmatched landmarks beside others are no evidence against it.
     """
 
     merged: MergedPairs
@@ -119,15 +112,13 @@ class Placement(NamedTuple):
 
 
 JointOf = Callable[[Vote], tuple[Joint, Side]]
-"""The joint Gaussian of both sides for a proposed alignment, and the target's part that is in
-it.
-"""
+"""The joint Gaussian of both sides for a proposed alignment, and the target's part in it."""
 
 
 def align(
     patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile
 ) -> list[Placement]:
-    """Find the alignments of a patch with a target, the one with the most evidence first."""
+    """Find the alignments of a patch with a target, by decreasing evidence."""
     tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
     votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
     votes = votes[:EXAMINED]
@@ -163,11 +154,10 @@ def find_closure(
     tests: ClosureTests,
     aliases: Callable[[], Sequence[Placement]] = tuple,
 ) -> Closure | None:
-    """Find the best alignment of a patch with a target and test it; None where no alignment has two
-    pairs.
+    """Find the best alignment of a patch with a target and test it; None where none has two pairs.
 
     aliases: returns alignments of the patch that are certainly wrong: evidence as strong as theirs
-        does not prove a place. Called only for an alignment that passes all other tests.
+    does not prove a place. Called only for an alignment that passes all other tests.
     """
     found = align(patch, target, joint_of, profile)
     if not found:
@@ -205,9 +195,6 @@ def find_closure(
 
 
 def _compare_with_rivals(closure: Closure, others: Sequence[Placement]) -> Closure:
-    """Return the closure with the figures of the best rival, if one of `others` is better than its
-    present one.
-    """
     best = max(others, key=lambda each: each.as_rival, default=None)
     if best is None or best.as_rival <= closure.rival_llr:
         return closure
@@ -215,7 +202,6 @@ def _compare_with_rivals(closure: Closure, others: Sequence[Placement]) -> Closu
 
 
 def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: AssociationProfile) -> float:
-    """Estimate the evidence for an alignment from the positions as voted."""
     local = patch.points.mean - patch.points.mean.mean(axis=0)
     sides = (apply_motion(vote.motion, local), vote.first), (target.points.mean, vote.second)
     absent, _ = _count_missing(*sides, (patch.views, target.views), profile)
@@ -225,8 +211,8 @@ def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: Associati
 def _count_absent(
     merged: MergedPairs, patch: Side, target: Side, profile: AssociationProfile
 ) -> tuple[int, int]:
-    """Count the landmarks of either side that are not matched where the other side observed, and
-    those of them beside which it has none.
+    """Count the landmarks of either side unmatched where the other side viewed, and those of them
+    with none of the other side nearby.
     """
     mean = merged.joint.mean
     place = np.full(int(max(target.views.max(initial=-1), target.within.max())) + 1, -1)
@@ -247,7 +233,7 @@ def _count_missing(
     profile: AssociationProfile,
 ) -> tuple[int, int]:
     """Count the unmatched points of two sides, given with the matched ones' indices, inside the
-    other side's views, and those of them that no point of the other side is close to.
+    other side's views, and those of them far from all points of the other side.
 
     A point close to a matched place may be a split-off part of that landmark, and is not counted.
     """
@@ -268,11 +254,11 @@ def combine_maps(
     patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
 ) -> tuple[Joint, Side]:
     """Combine two maps in the target's frame, with the patch as voted and free to lie anywhere;
-    returns also the part of the target that is in it.
+    return also the target's part in it.
 
     The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
-    map's extent. Only the target's landmarks near the patch as voted are included: no others can
-    be paired.
+    map's extent. Only the target's landmarks near the patch as voted can be paired, and are
+    included.
     """
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
@@ -331,7 +317,7 @@ def _grow_alignment(
 
 
 def patch_step(profile: AssociationProfile) -> int:
-    """Number of submaps by which successive patches of a stream are shifted."""
+    """Number of submaps between successive patches of a stream."""
     return max(1, profile.recent // 2)
 
 
@@ -403,10 +389,9 @@ def search_other_island(
 
 
 def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
-    """Find the first of these submaps, the newest first, whose landmarks are assigned to those of
-    submaps elsewhere.
+    """Find the first of these submaps, the newest first, whose landmarks are assigned to others.
 
-    The assignment needs SURE_AFTER pairs or more, one of them with a standard deviation above
+    The assignment needs at least SURE_AFTER pairs, one of them with a standard deviation above
     `near`, the joint evidence of `assign_jointly`, and the share of a closure.
     """
     profile = view.profile
@@ -442,8 +427,8 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
 
 
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
-    """Find the landmarks with which those of the patch may coincide by the joint covariance; none
-    where all are certain.
+    """Find the landmarks that may coincide with the patch's by the joint covariance; none where all
+    are certain.
 
     An alignment with any other landmark is no rival: `grow_pairs` would reject its seeds.
     """
@@ -457,9 +442,7 @@ def _find_reachable(view: IslandView, patch: Indices) -> Indices:
 
 
 def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
-    """Make a side of landmarks of an island, with their observations by keyframes of some of its
-    submaps.
-    """
+    """Make a side of an island's landmarks, with the views of some submaps."""
     n = len(view.ids)
     own = view.joint.covariance.reshape(n, 2, n, 2)[at, :, at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))

@@ -1,7 +1,7 @@
 """Clustering: the association of one closed window's detections to landmarks.
 
 Track, smooth, associate again, merge, drop. The association uses no map and no other window, so
-that submaps stay independent. A window has one association, which all its particles share.
+that submaps stay independent. All particles of a window share it.
 """
 
 import math
@@ -32,11 +32,10 @@ RARE = 0.05
 class WindowAssociation:
     """The landmark of each detection of a window.
 
-    landmark_of: by detection, in [0, L); UNASSIGNED for a detection that is left out. names: the
-    identity of each landmark, UNASSIGNED where it has none; sorted by name, then in the order of
-    their first detections. counts: the number of detections of each landmark. seen: the keyframes
-    that saw it. slips: of the odometry. clutter: for each detection that is left out, whether its
-    place was observed again without finding it.
+    landmark_of: by detection, in [0, L); UNASSIGNED for one that is left out. names: the identity
+    of each landmark, UNASSIGNED without one; sorted by name, then by first detection. counts:
+    number of detections of each landmark. seen: the keyframes that saw it. slips: of the odometry.
+    clutter: for each detection left out, whether its place was observed again without finding it.
     """
 
     landmark_of: Int64[np.ndarray, " N"]
@@ -51,9 +50,9 @@ class WindowAssociation:
 class Clusters:
     """The detections of a window, each of one landmark, before doubtful ones are left out.
 
-    landmark_of: by detection. names: of each landmark, UNASSIGNED where it has none. window: the
-    window smoothed under this association. slips: of the odometry; `scans` has larger covariances
-    of the motions that slipped.
+    landmark_of: by detection. names: of each landmark, UNASSIGNED without one. window: smoothed
+    under this association. slips: of the odometry; `scans` has larger covariances of the motions
+    that slipped.
     """
 
     scans: Scans
@@ -93,7 +92,6 @@ def associate_window(scans: Scans, settings: AssociationSettings) -> WindowAssoc
 
 
 def _inflate_slips(scans: Scans, slips: list[Slip]) -> Scans:
-    """Enlarge the covariances of the motions that slipped."""
     covariances = scans.motion_covariances.copy()
     for slip in slips:
         covariances[slip.keyframe] += slip_covariance(slip.by)
@@ -103,7 +101,6 @@ def _inflate_slips(scans: Scans, slips: list[Slip]) -> Scans:
 def _mark_seen(
     scans: Scans, landmark_of: Int64[np.ndarray, " N"], landmarks: int
 ) -> Bool[np.ndarray, "L K"]:
-    """Mark the keyframes that saw each landmark."""
     seen = np.zeros((landmarks, len(scans.motions)), np.bool_)
     used = landmark_of != UNASSIGNED
     seen[landmark_of[used], scans.keyframes[used]] = True
@@ -133,7 +130,7 @@ def _associate_again(
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     """Associate every scan again, from the smoothed path against the landmarks of the whole window.
 
-    A detection that matches none becomes a new landmark, also for the scans that follow.
+    A detection without a match becomes a new landmark, also for later scans.
     """
     k, n = len(window.poses), len(window.covariance)
     most = n + 2 * len(scans.points)
@@ -200,7 +197,6 @@ def _drop_uncertain(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> Int64[np.ndarray, " N"]:
-    """Leave out detections whose association is uncertain (`certain`), unless they have a name."""
     sure = association_probabilities(scans, landmark_of, window, settings) >= settings.certain
     return np.where(sure | (scans.names != UNASSIGNED), landmark_of, UNASSIGNED)
 
@@ -210,7 +206,6 @@ def _mark_confirmed(
     names: Int64[np.ndarray, " L"],
     settings: AssociationSettings,
 ) -> Bool[np.ndarray, " L"]:
-    """Mark the landmarks that are accepted: with a name, or detected often enough."""
     counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
     return np.asarray((counts >= settings.least_seen) | (names != UNASSIGNED))
 
@@ -222,11 +217,11 @@ def _mark_clutter(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> Bool[np.ndarray, " N"]:
-    """Mark the detections of unconfirmed landmarks that real landmarks would have more of.
+    """Mark the detections of unconfirmed landmarks that have too few for a real one.
 
     A keyframe observes a place if it saw something at least as far off and the place lies between
-    the outermost bearings of what it saw. A landmark with detection probability p that was observed
-    v times is clutter if so few detections have a probability below RARE.
+    the outermost bearings that it saw. A landmark with detection probability p that was observed v
+    times is clutter if so few detections have a probability below RARE.
     """
     clutter = np.zeros(len(landmark_of), np.bool_)
     scan_of = scans.keyframes
@@ -250,7 +245,6 @@ def _mark_clutter(
 
 
 def _is_rare(seen: int, looks: int, settings: AssociationSettings) -> bool:
-    """Whether P(at most `seen` of `looks` detections) < RARE with the detection probability."""
     p = settings.detection_probability
     term, total = math.prod([1.0 - p] * looks), 0.0
     for c in range(seen + 1):

@@ -1,14 +1,14 @@
 """The local density λ of landmarks, and the lengths that follow from their spacing.
 
-Landmarks observed by one keyframe are different ones, whatever else is uncertain. Their distances
-give the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976,
-J. Appl. Prob. 13). Where landmarks stand in groups it is far above the mean density of the map: a
-pair whose difference is as uncertain as the spacing within a group may be either of its members.
-The observations of one keyframe do not contain neighbours that hide each other: these are counted
-in the map, among the landmarks that several submaps have observed.
+Landmarks observed by one keyframe are distinct, whatever else is uncertain. Their distances give
+the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J.
+Appl. Prob. 13). In groups of landmarks it is far above the map's mean density: a pair whose
+difference is as uncertain as the spacing within a group may be either of its members. The
+observations of one keyframe lack neighbours that hide each other: these are counted in the map,
+among the landmarks that several submaps have observed.
 
-The distances also bound the lengths of a profile: two landmarks that are farther apart than their
-neighbours are not one landmark that was split.
+The distances also bound the lengths of a profile: two landmarks farther apart than their neighbours
+are not one landmark that was split.
 """
 
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ from team.association import AssociationProfile
 from team.estimation import elementary, elementwise
 
 CLOSE = 0.1
-"""Quantile of the landmarks' spacing that is used as the spacing within groups."""
+"""Quantile of the landmarks' spacings taken as the spacing within groups."""
 FEWEST = 10
 """With fewer landmarks that have a neighbour the smallest spacing is used."""
 SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
@@ -35,8 +35,8 @@ Spacings = Float[np.ndarray, "U U"]
 class LandmarkDensity:
     """The spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
-    spacings: of each submap (`LocalMap.spacings`).
-    confirmed: positions of the landmarks that several submaps have observed [m].
+    spacings: of each submap (`LocalMap.spacings`). confirmed: positions [m] of the landmarks that
+    several submaps have observed.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ class LandmarkDensity:
         return np.sort(found[np.isfinite(found)])
 
     def around_landmarks(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Density [1/m²] of further landmarks within each radius [m] of a landmark, as single
-        keyframes observed them.
+        """Density [1/m²] of further landmarks within each radius [m] of a landmark, in single
+        keyframes.
 
         (ordered pairs within R + 1) / (n π R²): half a pair is assumed beside those observed.
         """
@@ -76,8 +76,8 @@ class LandmarkDensity:
     def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Density [1/m²] of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
 
-        Two landmarks that are one but not merged yet are counted as neighbours, so the density is
-        too large, never too small, while association is incomplete.
+        Duplicates that are not merged yet count as neighbours, so the density is too large, never
+        too small, while association is incomplete.
         """
         pairs = np.searchsorted(self._in_map, radius, side="right")
         found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (
@@ -86,7 +86,7 @@ class LandmarkDensity:
         return found
 
     def limit_lengths(self, profile: AssociationProfile) -> AssociationProfile:
-        """Return the profile with lengths small enough to distinguish neighbours."""
+        """Shorten the profile's lengths so that they distinguish neighbours."""
         if not len(self.nearest):
             return profile
         share = CLOSE if len(self.nearest) >= FEWEST else 0.0

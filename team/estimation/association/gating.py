@@ -27,9 +27,7 @@ LEAST_DETERMINANT = 1e-32
 (`team.config.Bounds.sigma_m`).
 """
 SPLIT = 1.0
-"""Additional log-likelihood ratio that two landmarks need where one window has both: a window
-seldom splits a landmark.
-"""
+"""Additional log-likelihood ratio for a pair of one window, which seldom splits a landmark."""
 
 
 def compute_mahalanobis(
@@ -50,10 +48,10 @@ def match_scan(
     mapped_names: Int64[np.ndarray, " L"],
     settings: AssociationSettings,
 ) -> Int64[np.ndarray, " n"]:
-    """Match the detections of a scan with landmarks; UNASSIGNED where no landmark matches.
+    """Match the detections of a scan with landmarks; UNASSIGNED without a match.
 
-    A detection without a name matches landmarks without one that lie in its gate; one with a name
-    matches the landmark of this name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|.
+    An unnamed detection matches unnamed landmarks in its gate; a named one matches the landmark of
+    this name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|.
 
     points, covariances: of the detections, in the robot's frame [m, m²]. predicted: the landmarks'
     positions in that frame, with their covariances.
@@ -71,8 +69,8 @@ def match_best_first(
 ) -> Int64[np.ndarray, " n"]:
     """Assign a landmark to each detection of a scan; UNASSIGNED where no allowed one is left.
 
-    The allowed pair with the least cost is assigned first, then the next one whose detection and
-    landmark are both free. Equal costs are assigned in their order.
+    The allowed pair of least cost is assigned first, then the next one whose detection and landmark
+    are both free. Equal costs are assigned in their order.
     """
     found = np.full(len(allowed), UNASSIGNED)
     rows, columns = np.nonzero(allowed)
@@ -87,15 +85,12 @@ def match_best_first(
 class Joint(NamedTuple):
     """Landmarks with their joint covariance, in one frame.
 
-    mean: positions [m].
-    covariance: of (x₁, y₁, x₂, …) [m²].
-    apart: pairs that can not be one landmark, symmetric: observed in one scan, named differently,
-        or declared to be two by an operator.
-    density: their local density; None: that of the profile.
-    unseen: of the landmarks of one map, the probability that all windows that saw each of them
-        missed another one beside it; the density of the profile is then an upper bound of the
-        map's own.
-    apart_in_window: pairs that one submap has as two landmarks, symmetric; None: not recorded.
+    mean: positions [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: pairs that cannot be one
+    landmark, symmetric: observed in one scan, named differently, or declared to be two by an
+    operator. density: their local density; None: that of the profile. unseen: for the landmarks of
+    one map, the probability that all windows that saw each of them missed another one beside it;
+    the density of the profile is then an upper bound of the map's own. apart_in_window: pairs that
+    one submap has as two landmarks, symmetric; None: not recorded.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -121,10 +116,10 @@ class Joint(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two landmarks that are one, which keeps the index of the second.
+    """Two landmarks that are one, with the index of the second.
 
-    llr: log-likelihood ratio. sd: largest standard deviation [m] of the difference. rival: the best
-    LLR of a pair that excludes this one.
+    llr: log-likelihood ratio. sd: largest standard deviation [m] of the difference. rival: best LLR
+    of a pair that excludes this one.
     """
 
     first: int
@@ -152,7 +147,7 @@ def list_pairs(first: Indices, second: Indices) -> tuple[Indices, Indices]:
 def evaluate_pairs(
     joint: Joint, first: Indices, second: Indices, profile: AssociationProfile
 ) -> Likelihoods:
-    """Evaluate for each pair the likelihood that it is one landmark."""
+    """Evaluate the likelihood that each pair is one landmark."""
     n = len(joint.mean)
     P = joint.covariance.reshape(n, 2, n, 2)
     R = P[first, :, first] + P[second, :, second] - P[first, :, second] - P[second, :, first]
@@ -180,7 +175,7 @@ def gate_pairs(
     most_sd: float = np.inf,
 ) -> tuple[Indices, Indices, Float[np.ndarray, " k"]]:
     """Select the pairs that can be one landmark: within the gate, with a standard deviation of the
-    difference of at most `most_sd` [m], and not apart. Returns them with their standard deviations.
+    difference of at most `most_sd` [m], and not apart; return them with it.
     """
     at = evaluate_pairs(joint, first, second, profile)
     open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
@@ -194,7 +189,7 @@ def required_llr(
     sd: Float[np.ndarray, " k"],
     profile: AssociationProfile,
 ) -> Float[np.ndarray, " k"]:
-    """Log-likelihood ratio that each pair needs to be merged where it has no rival.
+    """Log-likelihood ratio for which each pair is merged without a rival.
 
     It is larger where the standard deviation is large, and by SPLIT where one submap has both.
     """

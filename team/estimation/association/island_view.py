@@ -1,14 +1,14 @@
 """The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
 
 Every submap adds its unnamed landmarks to the map as landmarks of their own; here they are merged.
-The steps of a tick, in their order: *tracking* against the last submaps of the same robot; *near*,
-landmarks of older submaps where the standard deviation of the difference is small, one submap after
-the other; *sweep*, landmarks that were split. Closures and merges of islands follow (`closure`).
+The steps of a tick, in order: *tracking* against the last submaps of the same robot; *near*,
+landmarks of older submaps where the standard deviation of the difference is small, submap by
+submap; *sweep*, landmarks that were split. Closures and merges of islands follow (`closure`).
 
-The landmarks of one submap are different ones. Those of the whole map are not, while some of them
-are unmerged: fragments of one landmark are candidates for each other, and the assignments to all of
-them at once do not agree on any. So the landmarks of a submap are assigned to those of one other
-submap at a time, together with landmarks that are certainly different from these.
+The landmarks of one submap are distinct. Those of the whole map are not, while some are unmerged:
+fragments of one landmark are candidates for each other, and the assignments to all of them at once
+do not agree on any. So the landmarks of a submap are assigned to those of one other submap at a
+time, with landmarks that are certainly different from these.
 """
 
 from collections.abc import Iterable, Sequence
@@ -43,12 +43,12 @@ from team.estimation.contribution import Observation, Stream
 COMPARED = 6
 """Number of submaps that one submap is compared with: those with the most candidates."""
 REEXAMINED = 8
-"""Number of older submaps with undecided landmarks that a tick examines again: the newest half of
-them, and the others by turns.
+"""Number of older submaps with undecided landmarks that a tick examines again: the newest half, and
+the others by turns.
 """
 REEXAMINED_WITHIN = 10.0
-"""An older submap is examined again if its undecided landmarks lie within this many object radii of
-a landmark of the tick.
+"""Distance in object radii between undecided landmarks of an older submap and the tick's within
+which the submap is examined again.
 """
 
 
@@ -81,11 +81,10 @@ class ViewedSubmap(NamedTuple):
 class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
-    ids: the identity of each landmark. place_of: its index, by identity.
-    submaps: the submaps that are examined. seen_by: their landmarks.
-    sees: which landmarks each submap has, updated as landmarks are merged.
-    merged: which landmarks are merged into another one. ties: the merges, with their figures.
-    stamp_ns: the last end of a submap.
+    ids: the identity of each landmark; place_of: its index, by identity. submaps: those examined;
+    seen_by: their landmarks. sees: landmarks of each submap, updated by merges. merged: landmarks
+    that are merged into another one. ties: the merges, with their figures. stamp_ns: last end of a
+    submap.
     """
 
     def __init__(
@@ -101,8 +100,8 @@ class IslandView:
     ) -> None:
         """View the landmarks with this mean [m] and covariance [m²].
 
-        forgotten: pairs of landmarks that one submap has that is not among `submaps`, and which of
-            these pairs one keyframe observed.
+        forgotten: pairs of landmarks of one submap that is not among `submaps`, and which of these
+        pairs one keyframe observed.
         """
         count = len(ids)
         self.ids = ids
@@ -131,7 +130,7 @@ class IslandView:
         )
 
     def _mark_apart(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
-        """Mark pairs of landmarks that can not be one: observed by one keyframe, named differently,
+        """Mark pairs of landmarks that cannot be one: observed by one keyframe, named differently,
         or declared to be two by an operator.
         """
         named = np.array(self.ids) < UNNAMED
@@ -151,7 +150,6 @@ class IslandView:
         return apart
 
     def _mark_apart_in_window(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
-        """Mark pairs of landmarks that one submap has."""
         of = self.sees.astype(np.float32)
         apart = np.asarray(of.T @ of > 0.0)  # exact: sums of ones
         first, second = forgotten.T
@@ -160,7 +158,6 @@ class IslandView:
         return apart
 
     def _find_place(self, member: LocalLandmark) -> int | None:
-        """Find the index of a member's landmark; None where the island does not have it."""
         identity = self._landmarks.identity(member)
         return None if identity is None else self.place_of.get(identity)
 
@@ -187,12 +184,11 @@ class IslandView:
             self.sees[:, pair.first] = False
 
     def _resolve(self, places: Indices) -> Indices:
-        """Replace merged landmarks by those that they are merged into."""
         return np.unique(self._merged_into[places])
 
     def apply_verdicts(self) -> None:
-        """Merge the landmarks that an operator has declared to be one, verdict by verdict in their
-        order; one that would merge two landmarks that were declared to be two has no effect.
+        """Merge the landmarks that an operator has declared to be one, verdict by verdict; a merge
+        of landmarks declared to be two has no effect.
         """
         declared = [
             (here, there, each.same)
@@ -211,7 +207,7 @@ class IslandView:
             self.record_merges(MergedPairs((pair,), joint), "verdict")
 
     def track(self, k: int) -> None:
-        """Merge landmarks of submap k with those of the same robot's submaps before it, then with
+        """Merge landmarks of submap k with those of the same robot's earlier submaps, then with
         nearby ones of all other submaps.
         """
         of = self.submaps[k].observation
@@ -238,8 +234,8 @@ class IslandView:
             self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:
-        """Merge pairs of submap k and one other submap after the other on which all likely joint
-        assignments of the two agree.
+        """Merge pairs of submap k and each other submap on which all likely joint assignments of
+        the two agree.
         """
         own = self._resolve(self.submaps[k].unnamed)
         others = self.sees.copy()
@@ -251,8 +247,8 @@ class IslandView:
             self.record_merges(found, "near")
 
     def compare_again(self, fresh: Sequence[int], turn: int) -> None:
-        """Compare older submaps near the tick's ones (`fresh`) whose landmarks may be one with
-        others: a pair that was undecided may be decidable now.
+        """Compare older submaps near the tick's ones (`fresh`) with undecided landmarks, which may
+        be decidable now.
 
         turn: selects among many such submaps, other ones at each turn.
         """
@@ -272,8 +268,8 @@ class IslandView:
         """Merge landmarks at one place, certain relative to each other and never seen together,
         where all likely joint assignments of them agree.
 
-        Landmarks that were undecided when they were new are uncertain: one pair after the other,
-        each by itself the likeliest, can turn a robot by a spacing.
+        Landmarks that were undecided when new are uncertain: pair by pair, each the likeliest by
+        itself, they can turn a robot by a spacing.
         """
         at = np.flatnonzero(~self.merged)
         mean = self.joint.mean[at]
@@ -293,7 +289,7 @@ class IslandView:
 
 
 def join_indices(of: Iterable[Indices]) -> Int64[np.ndarray, " _"]:
-    """Join lists of indices to one, ascending."""
+    """Join lists of indices, ascending."""
     places: Int64[np.ndarray, " _"] = np.unique(np.concatenate([np.zeros(0, np.int64), *of]))
     return places
 
@@ -305,14 +301,13 @@ def select_comparisons(
     profile: AssociationProfile,
     most_sd: float,
 ) -> list[Indices]:
-    """Select, for each submap that is worth a comparison, the landmarks that `own` may be.
+    """Select the landmarks that `own` may be, for each submap worth a comparison.
 
-    Beside the submap's landmarks these are the rivals that it lacks: landmarks that one of `own`
-    may be, and that are known to be none of those of the submap that it may be. Without them a
-    landmark that the submap missed would be associated with its neighbour.
+    Besides the submap's landmarks these are the rivals that it lacks: landmarks that one of `own`
+    may be, known to be none of the submap's candidates. Without them a landmark that the submap
+    missed would be associated with its neighbour.
 
-    sees: which landmarks each submap has. most_sd: pairs with a larger standard deviation of the
-        difference are left out.
+    sees: landmarks of each submap. most_sd: largest standard deviation of a pair's difference.
     """
     others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
     one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)
@@ -343,9 +338,7 @@ def find_undecided(joint: Joint, around: Indices, profile: AssociationProfile) -
 
 
 def select_by_turns(submaps: Sequence[int], turn: int) -> list[int]:
-    """Select the newest REEXAMINED / 2 of these submaps, and as many of the older ones, other ones
-    at each turn.
-    """
+    """Select the newest REEXAMINED / 2 of these submaps, and as many older ones, by turns."""
     half = REEXAMINED // 2
     if len(submaps) <= REEXAMINED:
         return list(submaps)

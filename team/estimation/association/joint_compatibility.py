@@ -1,16 +1,16 @@
 """Joint compatibility: which pairs of landmarks of a joint Gaussian are merged together.
 
-A pair that is merged conditions the joint Gaussian, and the pairs after it are evaluated given it,
-so the sum of the log-likelihood ratios (`gating`) is the ratio of all of them together.
+A merged pair conditions the joint Gaussian for the pairs after it, so the sum of the log-likelihood
+ratios (`gating`) is the ratio of all of them together.
 
 `grow_pairs` merges the likeliest pair first, as long as it has no rival. `assign_jointly` is for
-pairs that have rivals: two neighbouring landmarks, each of which may be either of two mapped ones,
-are distinguished by each other, since their relative position is far more certain than their
-absolute ones. Landmarks are assigned one after the other, each to one of the mapped landmarks given
-the pairs before it, or to a new one. An assignment has the weight exp(Σ LLR) of its pairs, and a
-pair is accepted when the assignments that contain it outweigh all others. Joint compatibility
-branch and bound (Neira and Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with the most
-pairs; here it also has to be the only likely one.
+pairs with rivals: two neighbouring landmarks, each of which may be either of two mapped ones, are
+distinguished by each other, since their relative position is far more certain than their absolute
+ones. Landmarks are assigned one by one, each to a mapped landmark given the pairs before it, or to
+a new one. An assignment has the weight exp(Σ LLR) of its pairs, and a pair is accepted when the
+assignments that contain it outweigh all others. Joint compatibility branch and bound (Neira and
+Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with the most pairs; here it also has to be the
+only likely one.
 """
 
 from collections.abc import Iterable, Sequence
@@ -35,18 +35,18 @@ PREGATE = 4.0
 """Multiple of the gate beyond which a pair is excluded for good."""
 SURE_AFTER = 3
 """Number of pairs after which an alignment grows only by pairs of small standard deviation: others
-connect landmarks to neighbours that are one spacing off.
+connect landmarks to neighbours one spacing off.
 """
 MOST_ASSIGNED = 10
 """Number of landmarks that are assigned together: those with the most certain candidates."""
 BEAM = 100
 """Number of assignments that are continued from landmark to landmark."""
 HOPELESS = 12.0
-"""An assignment is dropped whose log weight is below the best one's by more than this [nat]."""
+"""Log weight below the best assignment's [nat] at which another is dropped."""
 
 
 class MergedPairs(NamedTuple):
-    """Pairs in the order in which they were merged, and the joint Gaussian given them."""
+    """Pairs in the order of their merges, and the joint Gaussian given them."""
 
     pairs: tuple[Pair, ...]
     joint: Joint
@@ -58,8 +58,8 @@ class MergedPairs(NamedTuple):
 
 
 def condition_on_pair(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
-    """Condition the joint Gaussian on two landmarks being one; the second inherits the relations
-    of the first.
+    """Condition the joint Gaussian on two landmarks being one; the second inherits the first's
+    relations.
 
     With H the difference of the two and S = HPHᵀ + s₀²I, mean −= PHᵀS⁻¹(Hm), P −= PHᵀS⁻¹HP.
     """
@@ -81,7 +81,6 @@ def condition_on_pair(joint: Joint, first: int, second: int, profile: Associatio
 
 
 def _inherit(relation: Bool[np.ndarray, "n n"], first: int, second: int) -> Bool[np.ndarray, "n n"]:
-    """Give the second the entries of both in a symmetric relation."""
     out = relation.copy()
     out[second] = out[:, second] = relation[first] | relation[second]
     return out
@@ -90,8 +89,8 @@ def _inherit(relation: Bool[np.ndarray, "n n"], first: int, second: int) -> Bool
 def merge_in_order(
     joint: Joint, pairs: Iterable[tuple[int, int]], profile: AssociationProfile
 ) -> MergedPairs | None:
-    """Merge pairs in this order, each evaluated given those before it; None where one fails its
-    gate or is apart.
+    """Merge pairs in this order, each given those before it; None where one fails its gate or is
+    apart.
     """
     merged: list[Pair] = []
     for one, two in pairs:
@@ -114,13 +113,11 @@ def grow_pairs(
     most_sd: float = np.inf,
     sure_sd: float = np.inf,
 ) -> MergedPairs | None:
-    """Merge pairs one after the other, the likeliest first; None where a seed fails its gate.
+    """Merge pairs one by one, the likeliest first; None where a seed fails its gate.
 
-    candidates: two lists of landmarks, pair by pair; when a landmark is merged, its other pairs are
-        dropped.
-    seeds: pairs to begin with, whatever their rivals.
-    most_sd: pairs with a larger standard deviation are not merged; sure_sd: the same, once
-        SURE_AFTER pairs are merged.
+    candidates: two lists of landmarks, pair by pair; a merged landmark's other pairs are dropped.
+    seeds: first pairs, whatever their rivals. most_sd: largest standard deviation of a merged pair;
+    sure_sd: the same, once SURE_AFTER pairs are merged.
     """
     begun = merge_in_order(joint, seeds, profile)
     if begun is None:
@@ -155,8 +152,7 @@ def grow_pairs(
 def _find_rivals(
     joint: Joint, first: Indices, second: Indices, at: Likelihoods, profile: AssociationProfile
 ) -> Float[np.ndarray, " k"]:
-    """Find the best LLR of each pair's rivals: another partner of its first or of its second
-    landmark.
+    """Find the best LLR of each pair's rivals: another partner of its first or second landmark.
 
     A partner that may be the same object as this one (split in two, close to it, never observed
     with it) is no rival: fragments of one landmark would block each other.
@@ -172,7 +168,6 @@ def _find_rivals(
 
 
 def _list_common(landmarks: Indices) -> tuple[Indices, Indices]:
-    """List every two pairs that have a landmark in common, in both orders."""
     order = np.argsort(landmarks, kind="stable")
     ordered = landmarks[order]
     begin = np.searchsorted(ordered, ordered, side="left")
@@ -200,8 +195,7 @@ def assign_jointly(
     of one of these pairs exceeds `tight`, all of them together need a log-likelihood ratio of
     `llr_loose`, as a single such pair does (`gating.required_llr`): a few uncertain landmarks fit
     others by chance. Where it exceeds `tight` but for pairs of the assignment that are not
-    accepted, the assignment as a whole needs it.
-    most_sd: pairs with a larger standard deviation are left out.
+    accepted, the assignment as a whole needs it. most_sd: largest standard deviation of a pair.
     """
     first, second, sd = gate_pairs(joint, first, second, profile, most_sd)
     if not len(first):
@@ -230,7 +224,6 @@ def assign_jointly(
 
 
 def _order_landmarks(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
-    """Order the landmarks for assignment: the one with the most certain pair first."""
     surest: dict[int, float] = {}
     for each, own in zip(first.tolist(), sd.tolist(), strict=True):
         surest[each] = min(own, surest.get(each, np.inf))
@@ -267,9 +260,7 @@ def _extend(
 
 
 def _find_fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
-    """Find a landmark's likely fragments, itself included: two parts of one landmark are no
-    rivals.
-    """
+    """Find a landmark's likely fragments, itself included, which are no rivals."""
     n = len(joint.mean)
     at = evaluate_pairs(joint, np.full(n, landmark), np.arange(n), profile)
     near = elementwise.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
@@ -283,8 +274,8 @@ def _accept_agreed(
 ) -> list[Pair]:
     """Accept the pairs of the best assignment that the others contain as well, by weight.
 
-    part: the landmarks involved, before any pair is merged. lost: the weight of the dropped
-    assignments, relative to the best one's.
+    part: the landmarks before any merge. lost: weight of the dropped assignments, relative to the
+    best one's.
     """
     best = beam[0]
     weights = elementwise.exp(np.array([one.weight - best.weight for one in beam]))
@@ -308,7 +299,6 @@ def _accept_agreed(
 
 
 def _is_loose(pairs: list[Pair], profile: AssociationProfile) -> bool:
-    """Whether the difference of one of these pairs is uncertain."""
     return any(pair.sd > profile.tight for pair in pairs)
 
 

@@ -1,9 +1,9 @@
 """Unnamed landmarks as sets of (submap, local landmark), with the evidence for each merge.
 
-A submap adds each of its unnamed landmarks as a set of its own, with a number derived from the
-submap's name; association merges sets. A set has the number of its smallest member, so its identity
-lasts while members are added; a set with a named landmark has that name. All of this depends only
-on the order in which submaps are added.
+A submap adds each of its unnamed landmarks as a set with a number derived from the submap's name;
+association merges sets. A set has the number of its smallest member, so its identity lasts while
+members are added; a set with a named landmark has that name. All of this depends only on the order
+in which submaps are added.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ from team.estimation.association.member_log import (
 from team.estimation.contribution import Contribution, Key, Stream, named
 
 OPEN = 2**62
-"""Sequence number of the last submap of a side that all later submaps belong to."""
+"""Last sequence number of a side that includes all later submaps."""
 MOST_DECISIONS = 400
 """Number of newest decisions that are stored."""
 
@@ -34,11 +34,9 @@ MOST_DECISIONS = 400
 class Decision(NamedTuple):
     """A closure, or a merge of robots, that was accepted, undone or deferred.
 
-    kind: "closure", "merge", "undone", "waits".
-    about: the robots concerned, in words.
-    why: the test that failed; empty where it was accepted.
-    absent: number of landmarks that one side has where the other side observed and has none.
-    rival_llr: the evidence for the best other alignment.
+    kind: "closure", "merge", "undone", "waits". about: the robots concerned, in words. why: the
+    failed test; empty if accepted. absent: number of landmarks of one side that the other side
+    viewed without having one. rival_llr: evidence for the best other alignment.
     """
 
     stamp_ns: int
@@ -55,7 +53,7 @@ class Decision(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """An operator's decision on two local landmarks: that they are one landmark, or two."""
+    """An operator's decision that two local landmarks are one, or two."""
 
     first: LocalLandmark
     second: LocalLandmark
@@ -65,7 +63,7 @@ class Verdict(NamedTuple):
 class Opened(NamedTuple):
     """An accepted closure: its pairs by their smallest members, and its newer side.
 
-    newer: the streams of that side, with the first and the last submap of each that belongs to it.
+    newer: the streams of that side, each with its first and last submap on it.
     """
 
     decision: Decision
@@ -77,12 +75,10 @@ class Opened(NamedTuple):
 class Landmarks:
     """The sets of unnamed landmarks.
 
-    present: the members of each landmark of the map, by its identity.
-    log: all members, those of dropped landmarks included.
-    names: names that an operator has declared to be another one.
-    waits: the last failed attempt of each stream.
-    opened: the closures of the last tick.
-    undone: closures that are not accepted again.
+    present: the members of each landmark of the map, by its identity. log: all members, also of
+    dropped landmarks. names: names that an operator has declared to be another one. waits: the last
+    failed attempt of each stream. opened: the closures of the last tick. undone: closures that are
+    not accepted again.
     """
 
     present: Mapping[int, MemberSummary] = field(default_factory=dict)
@@ -111,7 +107,7 @@ class Landmarks:
         return {id_: tuple(sets[id_]) for id_ in sorted(sets)}
 
     def identities(self) -> Mapping[int, int]:
-        """The identity of each number that was ever given; O(members of the run)."""
+        """Tabulate the identity of each number ever given; O(members of the run)."""
         return {number: self._resolve_name(id_) for number, id_ in self.log.identities().items()}
 
     def identity(self, member: LocalLandmark) -> int | None:
@@ -130,15 +126,15 @@ class Landmarks:
         return number
 
     def without(self, ids: Collection[int]) -> "Landmarks":
-        """Return the landmarks without those that the map drops."""
+        """Remove landmarks that the map drops."""
         present = {id_: of for id_, of in self.present.items() if id_ not in ids}
         return replace(self, present=present)
 
     def restore(
         self, contributions: Iterable[Contribution]
     ) -> tuple["Landmarks", dict[Key, list[int]]]:
-        """Return the landmarks with those of these submaps that were dropped, and the present
-        identities of each submap's landmarks.
+        """Restore the dropped landmarks of these submaps; return also the present identities of
+        each submap's landmarks.
         """
         identities, numbers = self.identities(), {}
         back: dict[int, MemberSummary] = {}
@@ -155,11 +151,11 @@ class Landmarks:
         return replace(self, present={**self.present, **back}), numbers
 
     def add_decisions(self, *decisions: Decision) -> "Landmarks":
-        """Return the landmarks with further decisions, of which the newest are stored."""
+        """Add decisions, of which the newest are stored."""
         return replace(self, decisions=(*self.decisions, *decisions)[-MOST_DECISIONS:])
 
     def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
-        """Whether a closure was undone that has a third or more of these pairs of identities."""
+        """Whether a closure with a third or more of these pairs of identities was undone."""
         proposed = {frozenset(pair) for pair in pairs}
         for each in self.undone:
             old = {frozenset((self.identity(one), self.identity(two))) for one, two in each.pairs}
@@ -174,7 +170,7 @@ NO_LANDMARKS = Landmarks()
 def add_landmarks(
     landmarks: Landmarks, contributions: Sequence[Contribution]
 ) -> tuple[Landmarks, dict[Key, list[int]]]:
-    """Add each unnamed landmark of the submaps as a set of its own; returns also the numbers of the
+    """Add each unnamed landmark of the submaps as a set of its own; return also the numbers of the
     landmarks of each submap that has some.
     """
     present, log = dict(landmarks.present), landmarks.log
@@ -197,7 +193,6 @@ def add_landmarks(
 
 
 def _choose_numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[int]:
-    """Choose the numbers of new members; one that was given before is skipped."""
     numbers = [number_of(each) for each in members]
     if len(set(numbers)) == len(numbers) and not log.mark_given(np.array(numbers, np.uint32)).any():
         return numbers
@@ -211,7 +206,7 @@ def _choose_numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[in
 
 
 def number_of(member: LocalLandmark) -> int:
-    """2³¹ | 31 bits of the BLAKE2b digest of a member's name."""
+    """Hash a member's name: 2³¹ | 31 bits of its BLAKE2b digest."""
     digest = hashlib.blake2b(str(member).encode(), digest_size=4).digest()
     return UNNAMED | int.from_bytes(digest, "little") & (UNNAMED - 1)
 
@@ -219,11 +214,11 @@ def number_of(member: LocalLandmark) -> int:
 def merge_sets(
     landmarks: Landmarks, ties: Sequence[tuple[int, MergeRecord]]
 ) -> tuple[Landmarks, dict[int, int]]:
-    """Merge sets; returns them with the new number of each identity that was renumbered.
+    """Merge sets; return also the new number of each renumbered identity.
 
-    ties: each identity that is merged with `tie.into`. The result has the name of a named set, else
-        the number of its smallest member; where that is the identity to be lost, the tie is
-        recorded in the other direction.
+    ties: each identity to merge with `tie.into`. The result has the name of a named set, else the
+    number of its smallest member; where that is the identity to be lost, the tie is recorded in the
+    other direction.
     """
     present, log, names = dict(landmarks.present), landmarks.log, dict(landmarks.names)
     becomes: dict[int, int] = {}

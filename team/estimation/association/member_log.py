@@ -1,9 +1,9 @@
 """Append-only log of the members of all unnamed landmarks, in few bytes and shared arrays.
 
 A member is a local landmark of a submap. It starts with a number of its own, which it loses when
-its landmark is merged with another one. Rows that are written once stay: a longer log shares all
-but its last rows with the log before, so checkpoints store no row twice, and the time of a tick
-depends on its own submaps only.
+its landmark is merged with another. Written rows are final: a longer log shares all but its last
+rows with the log before, so checkpoints store no row twice, and the time of a tick depends on its
+own submaps only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -62,8 +62,8 @@ class LocalLandmark(NamedTuple):
 class MergeRecord(NamedTuple):
     """The step that merged the set of this number into another one, and its figures.
 
-    rival: the best log-likelihood ratio of a pair that excludes it.
-    stamp_ns: the last end of a submap in the tick.
+    rival: best log-likelihood ratio of a pair that excludes it. stamp_ns: last end of a submap in
+    the tick.
     """
 
     kind: str
@@ -128,7 +128,7 @@ class MemberLog:
     def add_submap(
         self, stream: Stream, sequence: int, locals_: Sequence[int], numbers: Sequence[int]
     ) -> "MemberLog":
-        """Return the log with the unnamed landmarks of one more submap."""
+        """Append the unnamed landmarks of one more submap."""
         rows = np.zeros(len(numbers), ROW)
         rows["local"], rows["number"] = locals_, numbers
         log = self._write(stream, sequence, rows)
@@ -140,9 +140,9 @@ class MemberLog:
     def record_merge(
         self, member: LocalLandmark, tie: MergeRecord, into: LocalLandmark | None
     ) -> "MemberLog":
-        """Return the log in which a member has lost its number to `tie.into`.
+        """Record that a member has lost its number to `tie.into`.
 
-        into: the member whose number that is; None for a name.
+        into: the member of that number; None for a name.
         """
         stream = (member.robot, member.incarnation)
         rows = self.rows(stream, member.sequence).copy()
@@ -188,7 +188,7 @@ class MemberLog:
             member = LocalLandmark(robot, incarnation, *there)
 
     def identities(self) -> dict[int, int]:
-        """Look up the identity of each number that was ever given."""
+        """Tabulate the identity of each number ever given."""
         into: dict[int, int] = {}
         numbers: list[int] = []
         for _, _, rows in self.all_rows():

@@ -15,13 +15,11 @@ UNASSIGNED = -1
 class Scans:
     """The motion of a window and the detections of each of its K keyframes.
 
-    motions:     the pose of keyframe k in the frame of keyframe k − 1; of the first, in that of the
-                 window's start.
-    motion_covariances: of (forward, left, turn), in the tangent space of the motion's end.
-    keyframes:   the keyframe of each of the N detections, ascending.
-    points:      their positions in the robot's frame at their keyframe [m].
-    covariances: of the points [m²].
-    names:       the identity of each, UNASSIGNED where it has none.
+    motions: the pose of keyframe k in the frame of keyframe k − 1, of the first in that of the
+    window's start. motion_covariances: of (forward, left, turn), in the tangent space of the
+    motion's end. keyframes: the keyframe of each of the N detections, ascending. points: their
+    positions in the robot's frame at their keyframe [m]. covariances: of the points [m²]. names:
+    the identity of each, UNASSIGNED without one.
     """
 
     motions: Float[np.ndarray, "K 3"]
@@ -90,7 +88,7 @@ def predict_landmarks(
 ) -> tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]]:
     """Predict each landmark's position relative to a pose, with its covariance.
 
-    P: joint covariance, in which the pose begins at `at` and the landmarks at `first`.
+    P: joint covariance with the pose at `at` and the landmarks at `first`.
     """
     count, own_pose = len(landmarks), slice(at, at + 3)
     turn = rotation(pose[2])
@@ -115,7 +113,7 @@ def initialise_landmark(
 ) -> Float[np.ndarray, "2"]:
     """Initialise a landmark from a detection: return its position, append its covariance to P.
 
-    P: joint covariance of `end` numbers, in which the pose begins at `at`; written in place.
+    P: joint covariance of `end` numbers with the pose at `at`; written in place.
     """
     own_pose, new = slice(at, at + 3), slice(end, end + 2)
     turn = rotation(pose[2])

@@ -1,4 +1,4 @@
-"""Smoothing: estimates a window's path and landmarks by Gauss-Newton for a given association."""
+"""Smoothing: estimate a window's path and landmarks by Gauss-Newton for a given association."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,11 @@ from team.estimation.association.scans import (
 from team.estimation.geometry import wrapped
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to each motion's covariance [m², m², rad²]: noise of motion may be of rank 2 or none."""
+"""Added to each motion's covariance [m², m², rad²], which may be of rank 2 or zero."""
 ITERATIONS = 6
 """Most Gauss-Newton steps."""
 SETTLED = 1e-4
-"""The iteration ends at a step whose largest entry [m, rad] is smaller: it changes no
-association."""
+"""Largest entry [m, rad] of a last step: it changes no association."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,8 @@ def smooth_window(
     """Minimise Σ ‖Log(motion⁻¹ ∘ before⁻¹ ∘ pose)‖² + Σ ‖point − Rᵀ(landmark − t)‖².
 
     The norms are those of the covariances; the window starts at zero. landmark_of: by detection,
-    UNASSIGNED for one that is left out; every landmark has a detection. Raises LinAlgError without
-    a solution.
+    UNASSIGNED for one left out; every landmark has a detection. Raises LinAlgError without a
+    solution.
     """
     used = np.nonzero(landmark_of != UNASSIGNED)[0]
     seen_by, seen = scans.keyframes[used], landmark_of[used]
@@ -90,9 +89,8 @@ def _linearise_motions(
     poses: Float[np.ndarray, "K 3"],
     size: int,
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], float]:
-    """Linearise the motions: their information, gradient and cost.
-
-    The residual of a motion is the error of its end.
+    """Linearise the motions to information, gradient and cost; residuals are errors of their
+    ends.
     """
     k = len(poses)
     before = np.concatenate((np.zeros((1, 3)), poses[:-1]))

@@ -1,9 +1,9 @@
 """Tracking within a window: an extended Kalman filter that matches the best pair first.
 
 EKF-SLAM (Smith, Self and Cheeseman 1990) with detections as points. A slip of the odometry is
-detected where few detections match although there are landmarks nearby, and nearly all match if the
-robot is assumed to have jumped (one-point RANSAC; Ortín and Montiel 2001). The covariance of that
-motion is then enlarged by the jump.
+detected where few detections match despite landmarks nearby, and nearly all match if the robot is
+assumed to have jumped (one-point RANSAC; Ortín and Montiel 2001). The covariance of that motion is
+then enlarged by the jump.
 """
 
 from typing import NamedTuple
@@ -26,9 +26,9 @@ from team.estimation.consistency import chi2_limit
 from team.estimation.geometry import adjoint, compose, inverse
 
 FEW = 0.5
-"""A slip is suspected where a smaller share of a scan's detections matches."""
+"""Share of matched detections in a scan below which a slip is suspected."""
 MOST = 0.7
-"""A slip is accepted where at least this share of the possible pairs matches after it."""
+"""Least share of the possible pairs that match after an accepted slip."""
 RARE = 1e-3
 """Probability with which correct pairs exceed the limit of the joint distance."""
 SLIP_TURN = 0.1
@@ -36,7 +36,7 @@ SLIP_TURN = 0.1
 LEAST_SLIP = 0.02
 """Least standard deviation of a slip [m, rad]."""
 SLIP_DETECTIONS = 3
-"""Least number of detections in a scan, and of landmarks, in which a slip is searched."""
+"""Least number of detections in a scan, and of landmarks, to search for a slip."""
 
 
 class Slip(NamedTuple):
@@ -47,9 +47,7 @@ class Slip(NamedTuple):
 
 
 class TrackedWindow(NamedTuple):
-    """The result of tracking: the landmark of each detection, and the landmarks' names and
-    positions.
-    """
+    """The landmark of each detection, and the landmarks' names and positions."""
 
     landmark_of: Int64[np.ndarray, " N"]
     names: list[int]
@@ -135,7 +133,7 @@ class Tracker:
     def add_landmark(
         self, point: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"], name: int
     ) -> int:
-        """Add a new landmark from a detection; returns its index."""
+        """Add a new landmark from a detection; return its index."""
         index = len(self.names)
         at = initialise_landmark(self.pose, point, covariance, self._P, 0, self._size)
         self._points[index] = at
@@ -148,7 +146,7 @@ class Tracker:
         covariances: Float[np.ndarray, "n 2 2"],
         names: Int64[np.ndarray, " n"],
     ) -> Int64[np.ndarray, " n"]:
-        """Match the detections of a scan; UNASSIGNED where no landmark matches."""
+        """Match the detections of a scan; UNASSIGNED without a match."""
         if not len(points) or not self.names:
             return np.full(len(points), UNASSIGNED)
         predicted = self.predict_landmarks()
@@ -162,8 +160,8 @@ class Tracker:
         points: Float[np.ndarray, "m 2"],
         covariances: Float[np.ndarray, "m 2 2"],
     ) -> float:
-        """Compute the joint squared Mahalanobis distance of these pairs over the limit that jointly
-        compatible pairs exceed with probability RARE.
+        """Compute the joint squared Mahalanobis distance of these pairs over its limit, exceeded
+        with probability RARE.
         """
         m, n = len(landmarks), self._size
         if not m:
@@ -182,10 +180,9 @@ class Tracker:
     ) -> Float[np.ndarray, "3"] | None:
         """Find the slip (forward, left, turn) that explains most of a scan; None if none does.
 
-        Each pair of a detection and a landmark near it proposes a slip, given that the pose may be
-        wrong by slip_m; the other pairs are counted under that proposal. A slip must explain more
-        pairs than those `found` without it, and must fit better by more than the cost of one pair
-        that does not fit.
+        Each pair of a detection and a landmark near it proposes a slip, given a pose wrong by
+        slip_m; the other pairs are counted under that proposal. A slip must explain more pairs than
+        those `found` without it, and fit better by more than the cost of one misfitting pair.
         """
         gate, reach = self._settings.gate, self._settings.slip_m
         seen, spread = self.predict_landmarks()
@@ -289,8 +286,8 @@ def _is_slip_suspected(
     covariances: Float[np.ndarray, "n 2 2"],
     reach: float,
 ) -> bool:
-    """Whether a slip is suspected: few detections match, some miss a landmark nearby, or the
-    pairs do not fit together.
+    """Whether few detections match, some miss a landmark nearby, or the pairs do not fit
+    together.
     """
     known = np.nonzero(found != UNASSIGNED)[0]
     if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
@@ -306,7 +303,6 @@ def _is_match_missed(
     points: Float[np.ndarray, "n 2"],
     reach: float,
 ) -> bool:
-    """Whether an unmatched detection and an unmatched landmark lie within reach of each other."""
     seen, _ = tracker.predict_landmarks()
     free = np.ones(len(seen), np.bool_)
     free[found[found != UNASSIGNED]] = False
@@ -315,7 +311,6 @@ def _is_match_missed(
 
 
 def _smaller_eigenvalue(S: Float[np.ndarray, "l 2 2"]) -> Float[np.ndarray, " l"]:
-    """The smaller eigenvalue of each symmetric matrix."""
     half = 0.5 * (S[:, 0, 0] - S[:, 1, 1])
     return np.asarray(
         0.5 * (S[:, 0, 0] + S[:, 1, 1]) - np.sqrt(half * half + S[:, 1, 0] * S[:, 1, 0])

@@ -1,8 +1,8 @@
-"""The tests of a closure, when it is proposed and while it is audited, and of a map's landmarks.
+"""The tests of a closure, at its proposal and during its audit, and of a map's landmarks.
 
-A closure is accepted only if it passes every test of `find_failed_test`; else the first failed test
-is the reason for which it is deferred. An accepted closure is audited for some ticks by
-`overlap_share`, and undone where that falls below the bound of the profile.
+A closure is accepted only if it passes every test of `find_failed_test`; the first failed test is
+the reason for its deferral. An accepted closure is audited for some ticks by `overlap_share`, and
+undone where that falls below the bound of the profile.
 """
 
 from collections.abc import Collection
@@ -23,13 +23,12 @@ WIDE = 3.0
 class Closure(NamedTuple):
     """The best alignment of a patch with its figures.
 
-    why: the test that failed; empty: it is accepted.
-    llr: log-likelihood ratio of its pairs.
-    absent: number of landmarks that one side has where the other side observed and has none.
-    rival_pairs, rival_llr: pairs and evidence of the best other alignment.
-    share: share of the landmarks near the matched places that are matched, of the side with fewer.
-    sd: largest standard deviation [m] of a pair's difference when the pair was accepted.
-    motion: (x, y, θ) that maps the patch onto the target; of a patch of the same map zero.
+    why: the failed test; empty if accepted. llr: log-likelihood ratio of its pairs. absent: number
+    of landmarks of one side that the other side viewed without having one. rival_pairs, rival_llr:
+    pairs and evidence of the best other alignment. share: matched share of the landmarks near the
+    matched places, of the side with fewer. sd: largest standard deviation [m] of a pair's
+    difference at its acceptance. motion: (x, y, θ) that maps the patch onto the target; zero within
+    one map.
     """
 
     pairs: tuple[Pair, ...]
@@ -87,10 +86,9 @@ def matched_share(
     places: Float[np.ndarray, "k 2"],
     profile: AssociationProfile,
 ) -> float:
-    """Matched places over the number of points near them, of the side with fewer.
+    """Compute matched places over the number of points near them, of the side with fewer.
 
-    A point is near if it is no farther from a matched place than the median distance between
-    neighbouring places.
+    A point is near if within the median distance between neighbouring places of a matched place.
     """
     if len(places) < 2:
         return 0.0
@@ -105,12 +103,12 @@ def overlap_share(
     places: Float[np.ndarray, "k 2"],
     profile: AssociationProfile,
 ) -> float:
-    """Matched places over the number of points of the side with fewer, where both sides observed
-    the area.
+    """Compute matched places over the number of points, of the side with fewer, where both sides
+    viewed.
 
-    one, two: all points of either side, the matched ones among them. The area is within WIDE
-        spacings of a matched place and within one spacing of a point of the other side: where two
-        robots have been at different places their maps differ in extent.
+    one, two: all points of either side, matched ones included. The area is within WIDE spacings of
+    a matched place and within one spacing of a point of the other side: maps of two robots differ
+    in extent.
     """
     if len(places) < 2 or not len(one) or not len(two):
         return 0.0
@@ -144,11 +142,11 @@ def nearest_distance(
 
 
 def find_possible_duplicates(view: IslandView, ids: Collection[int]) -> dict[int, int]:
-    """Find the landmarks among these that may be one with another one of them; maps each to the
-    likeliest other one, which stays.
+    """Map each of these landmarks that may be one with another of them to the likeliest, which
+    stays.
 
     Two landmarks may be one where they are within the gate, and have the log-likelihood ratio
-    (`gating`) with which a pair without a rival is merged, or would not have it even at one place:
+    (`gating`) with which a pair without a rival is merged, or would lack it even at one place:
     there the density of landmarks in the gate exceeds the evidence. The landmark with the most
     certain position stays, by the area of its covariance's ellipse.
     """

@@ -1,8 +1,7 @@
-"""Negative evidence: landmarks of one side that the other side should have observed, and did not.
+"""Negative evidence: landmarks of one side that the other side viewed without observing them.
 
-The landmarks that one keyframe observed together span a polygon inside its field of view, since a
-field of view is convex. A landmark of the other side that lies in this polygon and is not matched
-should have been observed.
+The landmarks that one keyframe observed together span a polygon inside its field of view, which is
+convex. A landmark of the other side in this polygon should have been observed.
 """
 
 from collections.abc import Iterable, Sequence
@@ -31,7 +30,7 @@ def pad_views(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
 
 
 def renumber_views(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
-    """Renumber the landmarks of the views; −1 leaves a landmark out, and a view with fewer than
+    """Renumber the landmarks of the views; −1 drops a landmark, and a view with fewer than
     three.
     """
     if not views.size:
@@ -71,10 +70,10 @@ def mark_visible(
 def miss_probabilities(
     points: Float[np.ndarray, "n 2"], seen_by: Sequence[Int64[np.ndarray, " _"]], radius: float
 ) -> Float[np.ndarray, " n"]:
-    """Probability, for each landmark, that all windows that saw it missed another one beside it.
+    """Compute the probability that all windows that saw each landmark missed another one beside it.
 
-    seen_by: the landmarks of each window. radius: windows saw the place that have a landmark within
-        it [m].
+    seen_by: the landmarks of each window. radius [m]: a window with a landmark within it saw the
+    place.
     """
     x, y = points.T
     near = elementwise.hypot(x[:, None] - x, y[:, None] - y) < radius

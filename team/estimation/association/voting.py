@@ -1,8 +1,8 @@
 """Alignments of two sets of points from their shapes alone, by votes of pairs of points.
 
 Two points of one side at the distance of two points of the other propose a rigid motion (a Hough
-transform over SE(2)); motions that many pairs propose are refined by nearest neighbours. All places
-are searched: an alignment that is not proposed could not be counted as a rival.
+transform over SE(2)); motions with many votes are refined by nearest neighbours. All places are
+searched: an alignment that is not proposed could not be counted as a rival.
 """
 
 from collections.abc import Sequence
@@ -14,21 +14,19 @@ from jaxtyping import Bool, Float, Int64
 from team.estimation import dense, elementary, elementwise
 
 MOST_BINS = 60
-"""Number of motions, those with the most votes, that are refined."""
+"""Number of refined motions, those with the most votes."""
 ANGLE_BIN = np.radians(6.0)
 """Width of a bin of rotations [rad]; bins of translations are three tolerances wide."""
 REFINEMENTS = 4
 """Number of steps of nearest neighbours."""
 MOST_HYPOTHESES = 100_000
-"""Number of pairs of baselines that vote: those of the longest baselines, which determine the
-heading best.
-"""
+"""Most pairs of baselines that vote: the longest, which determine the heading best."""
 MOST_OF_PART = 16
 """Number of a part's motions that are refined on all points."""
 MOST_COUNTED = 4_000_000
 """Number of cells up to which votes are counted cell by cell."""
 MOST_DISTANCES = 2_000_000
-"""Number of distances between points that are in memory at once."""
+"""Number of distances between points in memory at once."""
 
 
 class PointSet(NamedTuple):
@@ -53,13 +51,12 @@ def propose_alignments(
     longest: float,
     parts: Sequence[Int64[np.ndarray, " _"]] = (),
 ) -> list[Vote]:
-    """Propose distinct rigid motions of a onto b, in descending number of matched points.
+    """Propose distinct rigid motions of a onto b, by decreasing number of matched points.
 
-    tolerance: largest distance of matched points [m].
-    longest: largest distance [m] of two points that vote together, since maps are not rigid over
-        any distance.
-    parts: subsets of a that vote by themselves as well: where two maps share a small place far from
-        the centroid of a, the votes of all points scatter.
+    tolerance: largest distance of matched points [m]. longest: largest distance [m] of two points
+    that vote together, since maps are not rigid over any distance. parts: subsets of a that vote by
+    themselves as well: where two maps share a small place far from the centroid of a, the votes of
+    all points scatter.
     """
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
@@ -84,9 +81,7 @@ def propose_alignments(
 
 
 def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
-    """Drop the votes that are variants of one with more matched points; sort by that number,
-    descending.
-    """
+    """Drop variants of votes with more matched points; sort by that number, descending."""
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
     paired = np.full((len(found), points), -1)
@@ -135,7 +130,6 @@ def _propose_motions(
 def _list_baselines(
     points: Float[np.ndarray, "n 2"], shortest: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """List the pairs of points with a distance in this interval, and their distances."""
     i, j = np.triu_indices(len(points), 1)
     length = elementwise.hypot(*(points[i] - points[j]).T)
     chosen = (length >= shortest) & (length <= longest)
@@ -170,7 +164,7 @@ def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np
 def _rank_codes(
     codes: Int64[np.ndarray, " v"], beyond: int
 ) -> tuple[Int64[np.ndarray, " v"], Int64[np.ndarray, " _"]]:
-    """Rank each code among the distinct ones, and count how often each of these occurs.
+    """Rank each code among the distinct ones, and count the occurrences of these.
 
     beyond: all codes are smaller. Codes of a small range are counted, which is faster than sorting.
     """
@@ -189,9 +183,8 @@ def _refine(
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """Refine the motions by nearest neighbours, with a tolerance that narrows to `tolerance`.
-
-    Motions that no two points confirm are left out.
+    """Refine the motions by nearest neighbours, with a tolerance that narrows to `tolerance`; drop
+    those that no two points confirm.
     """
     local = a.mean - centre
     size = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
@@ -223,9 +216,7 @@ def _find_neighbours(
     b: Float[np.ndarray, "m 2"],
     reach: float,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Find for each point the nearest one of b, and whether the two are mutually nearest and within
-    reach.
-    """
+    """Find the nearest point of b for each point; mark those mutually nearest and within reach."""
     s, c = elementwise.sin_and_cos(motions[:, 2:])
     x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
     y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]

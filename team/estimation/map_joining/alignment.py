@@ -1,9 +1,8 @@
-"""Aligns two maps: where one lies in the frame of the other, from the points that both contain.
+"""Align two maps: estimate the pose of one in the frame of the other from their common points.
 
 Weighted Procrustes alignment by singular values gives the first guess (Downs' thesis on map
 joining; Arun, Huang & Blostein 1987); Gauss-Newton in the metric of both joint covariances refines
-it. Whether the two maps agree is tested on the joint cost, which is not linearised about a drifted
-map.
+it. Agreement is tested on the joint cost, which is not linearised about a drifted map.
 """
 
 from typing import NamedTuple
@@ -26,10 +25,10 @@ class Alignment(NamedTuple):
     residuals.
 
     dof: degrees of freedom of `chi2`: 2 per shared landmark less the 3 of the motion.
-    heading_sigma: standard deviation [rad] of the heading that the shape of the shared landmarks
-        gives. Unlike `covariance` it leaves out how far each map may be rotated as a whole: with
-        the difference's covariance S and the projection Π off the rigid motions it is √(tr(Π S
-        Π)/dof / Σ‖bᵢ − b̄‖²), which is σ/√Σ‖bᵢ − b̄‖² for independent landmarks.
+    heading_sigma: standard deviation [rad] of the heading from the shape of the shared landmarks.
+    Unlike `covariance` it leaves out how far each map may be rotated as a whole: with the
+    difference's covariance S and the projection Π off the rigid motions it is √(tr(Π S Π)/dof /
+    Σ‖bᵢ − b̄‖²), which is σ/√Σ‖bᵢ − b̄‖² for independent landmarks.
     """
 
     a_from_b: Float[np.ndarray, "3"]
@@ -61,14 +60,14 @@ def aligned(
     in_b: Float[np.ndarray, "n 2"],
     covariance_b: Float[np.ndarray, "m m"],
 ) -> Alignment:
-    """The most likely a_from_b, given two independent Gaussian maps of the same n ≥ 2 landmarks.
+    """Estimate the most likely a_from_b of two independent Gaussian maps of the same n ≥ 2
+    landmarks.
 
     Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate. The
-    motion is solved about the points' centroids, a − ā = R (b − b̄) + t', so that neither the
-    rounding nor the conditioning depends on how far the points lie from either origin; then
-    t = ā + t' − R b̄. Points that all lie at one place leave the heading free: `heading_sigma` is
-    infinite and the motion that of heading 0.
-    Raises NotACovarianceError where the covariance of the differences is none.
+    motion is solved about the centroids, a − ā = R (b − b̄) + t', then t = ā + t' − R b̄: rounding
+    and conditioning do not depend on the distance to either origin. Points that all lie at one
+    place leave the heading free: `heading_sigma` is infinite and the heading 0. Raises
+    NotACovarianceError where the covariance of the differences is none.
     """
     n = len(in_a)
     variances = np.diag(covariance_a) + np.diag(covariance_b)
@@ -101,7 +100,6 @@ def aligned(
 
 
 def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
-    """Aligns points that all lie at one place: they determine the translation and no heading."""
     unknown = np.full((3, 3), np.inf)
     return Alignment(np.array([*shift, 0.0]), unknown, np.inf, 2 * n - 3, np.inf)
 
@@ -113,7 +111,7 @@ def at_heading(
     covariance_b: Float[np.ndarray, "m m"],
     heading: float,
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """The translation [m] of a_from_b that fits best at this heading, and its χ²."""
+    """Fit the translation [m] of a_from_b at a given heading; return it with its χ²."""
     pose = np.array([0.0, 0.0, heading])
     residual, metric, jacobian = _linearised(pose, in_a, covariance_a, in_b, covariance_b)
     J = jacobian[:, :2]
@@ -146,9 +144,7 @@ def _linearised(
     in_b: Float[np.ndarray, "n 2"],
     covariance_b: Float[np.ndarray, "m m"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
-    """The differences d, their information (P_a + R P_b Rᵀ)⁻¹ and the Jacobian ∂(R b + t)/∂(t,
-    θ).
-    """
+    """Return the differences d, (P_a + R P_b Rᵀ)⁻¹ and the Jacobian ∂(R b + t)/∂(t, θ)."""
     n = len(in_a)
     s, c = elementwise.sin_and_cos(a_from_b[2])
     rotation = np.array([[c, -s], [s, c]])
@@ -165,9 +161,7 @@ def _linearised(
 
 
 class SharedPoints(NamedTuple):
-    """Numbers of points that two maps share: landmarks, and teammates observed from one of the
-    maps.
-    """
+    """Numbers of shared points: landmarks, and teammates observed from one of the maps."""
 
     landmarks: int
     sightings: int = 0
@@ -180,9 +174,9 @@ class SharedPoints(NamedTuple):
 
 
 def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: float) -> str | None:
-    """Says why the shared points can not place one map in the other; None if they can.
+    """Give the reason why the shared points cannot place one map in the other; None if they can.
 
-    `alignment` is None where there are fewer than NEEDED points.
+    alignment: None with fewer than NEEDED points.
     """
     if alignment is None:
         return f"{shared}, {NEEDED} needed"
@@ -197,12 +191,12 @@ def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: fl
 
 
 def disagreement(shared: SharedPoints, chi2: float, confidence: float) -> str | None:
-    """Says why two maps that share these points can not show the same place; None if they can.
+    """Give the reason why two maps with these shared points cannot be of one place; None if they
+    can.
 
-    chi2: the rise of the joint cost when the shared landmarks are made one and the inter-robot
-        measurements are added. For maps that agree it is χ²-distributed with 2 degrees of freedom
-        per point less the 3 of the motion; `confidence` is the quantile above which it counts as a
-        disagreement.
+    chi2: rise of the joint cost when the shared landmarks are made one and the inter-robot
+    measurements are added; for maps that agree χ² with 2 degrees of freedom per point less the 3 of
+    the motion. confidence: its quantile above which the maps disagree.
     """
     limit = chi2_limit(2 * sum(shared) - 3, 1.0 - confidence)
     if chi2 > limit:

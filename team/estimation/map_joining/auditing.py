@@ -1,10 +1,10 @@
-"""Folds a tick, and takes back a closure that later submaps contradict.
+"""Fold a tick, and undo a closure that later submaps contradict.
 
-For some ticks after a closure, or after a merge of robots, the share of the landmarks near its
-places that both sides have observed is computed again. Where it falls below the bound of the
-settings, the same ticks are folded again without the closure, from the state before it; the result
-is the fold that there would be had the closure never been accepted. The fold before a closure and
-the ticks since are part of the fold, so the outcome depends on the set of submaps alone.
+For some ticks after a closure, or a merge of robots, the share of matched landmarks among those
+near its places that both sides observed is computed again. Where it falls below the bound of the
+settings, the same ticks are folded again without the closure, from the state before it, as if it
+had never been accepted. The fold before a closure and the ticks since are part of the fold, so the
+outcome depends on the set of submaps alone.
 """
 
 from dataclasses import replace
@@ -47,7 +47,6 @@ def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings)
 
 
 def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSettings) -> Fold:
-    """Fold the ticks since a closure again, without the closure."""
     opened = audit.opened
     words = f"share {share:.2f} < {settings.association.undone_below:g} after {len(audit.ticks)}"
     stamp_ns = max((each.end_ns for each in after.contributions[-1:]), default=0)
@@ -63,9 +62,7 @@ def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSetting
 
 
 def share_now(fold: Fold, opened: Opened) -> float | None:
-    """Share of the landmarks near a closure's places that both sides have observed; None without
-    any.
-    """
+    """Share of the landmarks near a closure's places that both sides observed; None without any."""
     places = {fold.landmarks.identity(one) for one, _ in opened.pairs}
     if not places:
         return None

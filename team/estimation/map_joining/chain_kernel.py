@@ -1,8 +1,8 @@
-"""Compiled kernel of a prior and the submaps behind it: one small problem of least squares.
+"""Compiled kernel of a prior and the submaps after it: one small least-squares problem.
 
-A pose for each submap and the landmarks are the unknowns, a few tens of numbers, and most factors
-contain most of them: the matrix is dense. The unknowns that are asked for stand last, so that their
-covariance is the inverse of the last block of the factor.
+The unknowns are a pose per submap and the landmarks, a few tens of numbers; most factors contain
+most of them, so the matrix is dense. The requested unknowns stand last: their covariance is the
+inverse of the last block of the factor.
 """
 
 import math
@@ -34,11 +34,11 @@ Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
 UNDETERMINED, NO_COVARIANCE = 1, 2
-"""Why there is no solution: an unknown is not determined, or a covariance is none."""
+"""Faults: an undetermined unknown, or a matrix that is no covariance."""
 
 
 class Chain(NamedTuple):
-    """Local maps one behind the other, each beginning where the one before it ends, in flat arrays.
+    """Consecutive local maps, each beginning at the end of the one before, in flat arrays.
 
     ids: of their landmarks, ascending in each; those of map k begin at id_start[k]. mean: (end
     pose, landmarks) of each, from mean_start[k] on; covariance: row by row.
@@ -54,10 +54,10 @@ class Chain(NamedTuple):
 class SolvedChain(NamedTuple):
     """The solution of a chain. fault: 0, UNDETERMINED or NO_COVARIANCE; then at map `of`.
 
-    ids: all landmarks, ascending. mean, covariance: of the last end pose and of these.
-    cost: χ² of all maps, in `dof` degrees of freedom. known: of each map behind the first how many
-    of its landmarks another map has, too. beyond: of each landmark of each map behind the first
-    whether its χ² by itself is beyond the gate.
+    ids: all landmarks, ascending. mean, covariance: of the last end pose and of these. cost: χ² of
+    all maps, in `dof` degrees of freedom. known: for each map after the first, the number of its
+    landmarks that another map has, too. beyond: for each landmark of these maps, whether its own χ²
+    is beyond the gate.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -73,9 +73,8 @@ class SolvedChain(NamedTuple):
 
 @compiled
 def solved_chain(chain: Chain, gate: float, iterations: int, tolerance: float) -> SolvedChain:
-    """Least squares over all poses and landmarks, as `gauss_newton.settled` has it without robust
-    losses: full steps, shorter or damped ones where the cost rises, until none is longer than the
-    tolerance [m, rad].
+    """Minimise over all poses and landmarks, as `gauss_newton.settled` without robust losses: full,
+    shorter or damped steps until none exceeds the tolerance [m, rad].
     """
     ids = np.unique(chain.ids)
     slots = np.searchsorted(ids, chain.ids)
@@ -126,8 +125,8 @@ def _without_solution(ids: UInt32[np.ndarray, " L"], fault: int, of: int) -> Sol
 
 @compiled
 def _factors(chain: Chain, slots: Indices) -> tuple[SubmapFactors, int]:
-    """The maps as factors between the origin (node 0), the end poses (1, 2, …) and the landmarks,
-    and the first map without a covariance; −1: there is none.
+    """Make factors between the origin (node 0), the end poses (1, 2, …) and the landmarks; return
+    also the first map without a covariance, or −1.
     """
     maps = len(chain.id_start) - 1
     member = np.empty(2 * maps + len(slots), np.int64)
@@ -178,7 +177,7 @@ def _factors(chain: Chain, slots: Indices) -> tuple[SubmapFactors, int]:
 
 @compiled
 def _guess(chain: Chain, slots: Indices, landmarks: int) -> Values:
-    """Each map placed behind the one before it, each landmark by the first map that has it."""
+    """Place each map after the one before, each landmark by the first map that has it."""
     maps = len(chain.id_start) - 1
     state = np.zeros(3 * (maps + 1) + 2 * landmarks)
     is_placed = np.zeros(landmarks, np.bool_)
@@ -232,8 +231,8 @@ def _normal_equations(
 def _iterated(
     state: Values, offset: Indices, factors: SubmapFactors, damping: float
 ) -> tuple[Values, float, float]:
-    """One step of `gauss_newton.take_step`: the next state, the damping for the step after it and
-    the largest change of the full step; NaN where an unknown is not determined.
+    """Take one step of `gauss_newton.take_step`; return the next state, the next damping and the
+    largest change of the full step; NaN where an unknown is undetermined.
     """
     H, gradient = _normal_equations(state, offset, factors)
     before = costs(state, offset, factors, 1.0).sum()
@@ -262,7 +261,6 @@ def _iterated(
 
 @compiled
 def _moved(state: Values, offset: Indices, step: Float[np.ndarray, "n 1"], share: float) -> Values:
-    """A share of a step farther, headings wrapped."""
     moved = state.copy()
     for i in range(len(state)):
         moved[i] += share * step[i, 0]
@@ -274,7 +272,7 @@ def _moved(state: Values, offset: Indices, step: Float[np.ndarray, "n 1"], share
 
 @compiled
 def _shared(chain: Chain, slots: Indices, landmarks: int) -> Indices:
-    """Of each map behind the first how many of its landmarks another map has, too."""
+    """Count, for each map after the first, its landmarks that another map has, too."""
     counts = np.zeros(landmarks, np.int64)
     for slot in slots:
         counts[slot] += 1

@@ -1,6 +1,6 @@
 """The condensed factor: old submaps as one quadratic cost over the nodes that remain in the graph.
 
-Linearised at the state `at` that the nodes had when the submaps were condensed,
+Linearised at the state `at` of the nodes when the submaps were condensed,
 
     cost(x) = cost + 2 slopeᵀ d + dᵀ information d,   d = x − at (headings wrapped),
 
@@ -32,11 +32,10 @@ PATH_BLOCK = 64
 
 
 class SubmapCost(NamedTuple):
-    """How well one submap agrees with the rest of the map: χ² should be close to dof.
+    """Agreement of one submap with the rest of the map: χ² should be close to dof.
 
-    chi2: unweighted χ² of the submap, without discounting any landmark.
-    dof: dim − w tr(JᵀP⁻¹J Σ), the part of the submap's dimension that the solution does not absorb
-        (its redundancy, Baarda 1968).
+    chi2: unweighted χ² of the submap, no landmark discounted. dof: dim − w tr(JᵀP⁻¹J Σ), the part
+    of the submap's dimension that the solution does not absorb (its redundancy, Baarda 1968).
     weight: the robust weight w; 1 without a robust loss.
     """
 
@@ -48,11 +47,11 @@ class SubmapCost(NamedTuple):
 
 
 class EliminatedPath(NamedTuple):
-    """The eliminated poses of a stream, first to last, at the state in which they were eliminated.
+    """The eliminated poses of a stream, first to last, at the state of their elimination.
 
-    blocks: runs of them. All but the last have PATH_BLOCK poses, and every later path of the stream
-        has the same arrays, so that a checkpoint does not store them again.
-    is_fixed: whether the first pose is a constant.
+    blocks: runs of them. All but the last have PATH_BLOCK poses and are shared with every later
+    path of the stream, so that checkpoints store them once. is_fixed: whether the first pose is a
+    constant.
     """
 
     blocks: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -64,7 +63,7 @@ class EliminatedPath(NamedTuple):
         return np.concatenate([np.zeros((0, 3)), *self.blocks])
 
     def longer(self, poses: Float[np.ndarray, "K 3"]) -> "EliminatedPath":
-        """The path with more poses behind it."""
+        """Append poses to the path."""
         whole = [each for each in self.blocks if len(each) == PATH_BLOCK]
         rest = np.concatenate([np.zeros((0, 3)), *self.blocks[len(whole) :], poses])
         runs = (rest[k : k + PATH_BLOCK].copy() for k in range(0, len(rest), PATH_BLOCK))
@@ -72,12 +71,11 @@ class EliminatedPath(NamedTuple):
 
 
 class Departed(NamedTuple):
-    """Statistics of the factors that were condensed, as they were at that moment.
+    """Statistics of the condensed factors, as of their condensing.
 
-    robots: Σ w χ² and Σ dof of each robot.
-    submaps: costs of the newest condensed submaps of each stream, oldest first.
-    believed: for each landmark the number of believed submaps that contain it.
-    paths: the eliminated poses, from which the submaps are linearised again.
+    robots: Σ w χ² and Σ dof of each robot. submaps: costs of the newest condensed submaps of each
+    stream, oldest first. believed: for each landmark the number of believed submaps that contain
+    it. paths: the eliminated poses, from which the submaps are linearised again.
     """
 
     robots: Mapping[str, tuple[float, float]]
@@ -87,7 +85,7 @@ class Departed(NamedTuple):
 
 
 def newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
-    """The costs of the last HISTORY submaps of each stream, in their order."""
+    """Select the costs of the last HISTORY submaps of each stream, in order."""
     counts = Counter(stream for stream, *_ in submaps)
     older = {stream: count - HISTORY for stream, count in counts.items() if count > HISTORY}
     found = []
@@ -106,11 +104,11 @@ NOBODY = Departed({}, (), {}, {})
 class Resting:
     """Landmarks that no raw submap contains, given the nodes of the condensed factor.
 
-    x ~ N(means + gain d, covariance), d as in `Condensed`: what eliminating them leaves besides the
-    quadratic over the other nodes. They are no nodes of the graph until a submap observes them.
+    x ~ N(means + gain d, covariance), d as in `Condensed`: the result of their elimination besides
+    the quadratic over the other nodes. They are no nodes of the graph until a submap observes them.
 
-    ids: in the order in which they came to rest; two numbers each in the other arrays.
-    covariance: its upper triangle, as a square matrix or packed (`packed`); `upper` has the square.
+    ids: in the order in which they came to rest; two numbers each in the other arrays. covariance:
+    its upper triangle, as a square matrix or packed (`packed`); `upper` has the square.
     """
 
     ids: Indices
@@ -120,7 +118,7 @@ class Resting:
 
     @cached_property
     def upper(self) -> Float[np.ndarray, "r r"]:
-        """The upper triangle as a square matrix; what is below the diagonal is not read."""
+        """The upper triangle as a square matrix; entries below the diagonal are not read."""
         if self.covariance.ndim == 2:
             return self.covariance
         return unpacked_of(self.covariance, len(self.means))
@@ -138,7 +136,7 @@ class Resting:
 
 
 def nobody_rests(numbers: int) -> Resting:
-    """No landmark at rest, beside a condensed factor of so many numbers."""
+    """Make an empty `Resting` beside a condensed factor with this many numbers."""
     none = np.zeros(0)
     return Resting(none.astype(np.int64), none, np.zeros((0, numbers)), np.zeros((0, 0)))
 
@@ -149,10 +147,9 @@ class Condensed:
 
     Its methods take the indices in the state of the numbers of these nodes (`Graph.boundary`).
 
-    headings: which of its numbers are headings.
-    submaps: the number of submaps that it replaces.
-    redundancy: the number of measured quantities less the number of eliminated unknowns.
-    resting: landmarks given these nodes; None: there have never been any.
+    headings: which of its numbers are headings. submaps: number of submaps that it replaces.
+    redundancy: number of measured quantities less that of eliminated unknowns. resting: landmarks
+    given these nodes; None: there have never been any.
     """
 
     nodes: Indices
@@ -172,16 +169,14 @@ class Condensed:
         return self if self.resting is None else replace(self, resting=self.resting.packed)
 
     def moved(self, state: Values, numbers: Indices) -> Values:
-        """Difference d = state − at, headings wrapped: the distance from the linearisation
-        point.
-        """
+        """Difference d = state − at, headings wrapped."""
         d: Values = state[numbers] - self.at
         turn = d[self.headings]
         d[self.headings] = turn + 2.0 * np.pi * np.floor((np.pi - turn) / (2.0 * np.pi))
         return d
 
     def at_state(self, state: Values, numbers: Indices) -> tuple[float, Values]:
-        """cost(x) and half of its derivative, slope + information d."""
+        """Evaluate cost(x) and half of its derivative, slope + information d."""
         d = self.moved(state, numbers)
         pulled = dense.product(self.information, d)
         cost = self.cost + float(2.0 * (dense.product(self.slope, d)) + dense.product(d, pulled))
@@ -199,10 +194,10 @@ def places(offset: Indices, nodes: Indices) -> Indices:
 def tied_nodes(
     old: Condensed, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]
 ) -> Condensed:
-    """The factor after landmarks have become one node, exactly: the same cost where they are equal.
+    """Merge landmarks of the factor into one node, exactly: the same cost where they are equal.
 
-    sizes: how many numbers each node has had; node_of: its new node. becomes: the new number of
-    each landmark that gets one. Of those that become one the first one's linearisation point stays.
+    sizes: numbers of each former node; node_of: its new node. becomes: the new number of each
+    renumbered landmark. The linearisation point is that of the first merged landmark.
     """
     departed = old.departed
     if any(id_ in departed.believed for id_ in becomes):

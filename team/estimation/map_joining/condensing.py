@@ -1,15 +1,14 @@
-"""The bounded fold: old submaps are condensed into one quadratic, by sequence numbers only.
+"""The bounded fold: old submaps are condensed into one quadratic, selected by sequence number only.
 
-The last `lag` submaps of each stream of the main island stay as factors of their own. Older ones
-are linearised at the state that the fold has when they are condensed, with their robust weights at
-that moment, and become one quadratic over landmarks, biases and the pose at each stream's boundary
-(`condensed_factor`); their other poses are eliminated. The cost of a tick therefore depends on the
-number of landmarks and robots, not on the duration of the run. A fold stays a pure function of its
-ticks.
+The last `lag` submaps of each stream of the main island stay factors of their own. Older ones are
+linearised at the current state, with their current robust weights, and become one quadratic over
+landmarks, biases and the pose at each stream's boundary (`condensed_factor`); their other poses are
+eliminated. The cost of a tick therefore depends on the number of landmarks and robots, not on the
+duration of the run. A fold stays a pure function of its ticks.
 
 No submap is condensed before the fold has `begin` submaps, nor before the submap's robust scale has
-reached its final value. Islands that are not merged yet are not condensed, since their frame will
-still be transformed.
+reached its final value. Unmerged islands are not condensed, since their frame will still be
+transformed.
 """
 
 from collections import defaultdict
@@ -51,7 +50,7 @@ ALL_AWAKE = 2**62
 class Limits(NamedTuple):
     """The sizes by which a fold is condensed.
 
-    begin: a fold of up to so many submaps is raw. lag: number of submaps of each stream that are
+    begin: largest number of submaps of a raw fold. lag: number of submaps of each stream that are
     never condensed. first: number of landmarks without a raw submap from which landmarks come to
     rest.
     """
@@ -67,10 +66,10 @@ LIMITS = Limits()
 def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     """Condense the old submaps of the fold's main island; return the same fold if there are none.
 
-    Submaps whose poses cannot be eliminated stay raw. Unnamed landmarks stay nodes: nothing is
-    condensed while a team that has some has fewer submaps than landmarks. Association keeps the
-    observations of condensed submaps (`memory`), all of them until the last closure can no longer
-    be undone; landmarks that few submaps confirm are given up.
+    Submaps whose poses cannot be eliminated stay raw. Unnamed landmarks stay nodes: a team that has
+    some condenses only once it has as many submaps as landmarks. Association keeps the observations
+    of condensed submaps (`memory`), all of them until the last closure can no longer be undone;
+    landmarks that few submaps confirm are dropped.
     """
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:
@@ -109,8 +108,8 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
 
 
 def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[Memory, Indices]:
-    """The graph's memory with the submaps that leave, and the landmarks that are given up: none
-    while a closure is audited, and none that an operator has judged.
+    """Extend the graph's memory by the condensed submaps; return also the dropped landmarks: none
+    during the audit of a closure, and none that an operator has judged.
     """
     counts, stays = np.zeros(len(graph.fixed), np.int64), np.zeros(len(graph.fixed), np.bool_)
     before = {} if graph.condensed is None else graph.condensed.departed.believed
@@ -133,7 +132,7 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
 
 
 def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
-    """The condensed island with this memory, which has the nodes of the graph before."""
+    """Attach the memory, numbered as in the graph before, to the condensed island."""
     graph = smaller.graph
     node_of = np.full(len(before.fixed), -1, np.int64)
     for id_, node in before.landmarks.items():
@@ -145,7 +144,7 @@ def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: boo
 
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
-    """Marks the submaps to be condensed: more than `lag` behind their stream's last, at their final
+    """Mark the submaps to condense: more than `lag` before their stream's last, at their final
     robust scale.
     """
     graph, c = island.graph, island.settings.robust_c
@@ -215,7 +214,7 @@ def _condensed(
 
 
 def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
-    """Marks the nodes that no later factor can contain: poses of old submaps but the last one."""
+    """Mark the nodes that no later factor can contain: poses of old submaps but the last one."""
     eliminated = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(leaving):
         contribution, nodes, *_ = graph.submaps[f]

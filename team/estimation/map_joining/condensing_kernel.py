@@ -1,6 +1,4 @@
-"""Compiled kernels of condensing: add submaps to a dense quadratic, and a dense quadratic to a
-pattern.
-"""
+"""Compiled kernels of condensing: add submaps to a dense quadratic, and that to a block pattern."""
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -25,9 +23,9 @@ def add_submaps(
     chosen: Indices,
     weights: Values,
 ) -> None:
-    """Adds w JᵀP⁻¹J to H and w JᵀP⁻¹r to g for the chosen submaps.
+    """Add w JᵀP⁻¹J to H and w JᵀP⁻¹r to g for the chosen submaps.
 
-    place: for each node its first row in H, −1 for a constant.
+    place: first row in H of each node, −1 for a constant.
     """
     for f in chosen:
         nodes, at, mean, information, sensitivity = kernel.submap_of(offset, factors, f)
@@ -59,9 +57,7 @@ def add_blocks(
     entry: Indices,
     value_start: Indices,
 ) -> None:
-    """Adds the blocks of a dense information matrix over some nodes to the values of a block
-    pattern.
-    """
+    """Add the blocks of a dense information matrix over some nodes to the values of a pattern."""
     count = len(sizes)
     row = 0
     for a in range(count):

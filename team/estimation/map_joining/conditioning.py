@@ -1,16 +1,15 @@
-"""A robot's pose in the team's map: the broadcast prior times the robot's own later submaps.
+"""Estimate a robot's pose in the team's map: the broadcast prior times the robot's later submaps.
 
 The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
 that it does not contain are independent, so their product is exact; the errors that all submaps of
-a robot share are corrected first by the centre's estimates of them. The product is one
-least-squares problem: the centre's own, with the prior in the place of all earlier submaps. It is
-solved at once, so that every submap is linearised where all of them agree; joined one after the
-other, the first one would be linearised at the pose of a poor prior (decision 21).
+a robot share are first corrected by the centre's estimates. The product is the centre's
+least-squares problem, with the prior in place of all earlier submaps. It is solved at once, so that
+every submap is linearised where all of them agree; joined one by one, the first would be linearised
+at the pose of a poor prior (decision 21).
 
-A landmark observation of a submap that everything else contradicts (a misread barcode) is left out
-of that submap, for this solution only; the next submap and the next prior judge all of them anew,
-so that no landmark is excluded for good. The result is for display and control; it never enters a
-message that is fused.
+A submap's observation of a landmark that everything else contradicts (a misread barcode) is left
+out, for this solution only; the next submap and prior judge all of them anew. The result is for
+display and control; it never enters a message that is fused.
 """
 
 import math
@@ -47,25 +46,19 @@ from team.estimation.submap import LocalMap
 GATE = 18.420680744107813
 """99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`.
 
-χ² beyond which a submap's observation of a landmark is attributed to another landmark. Some
-twenty are tested for each pose, and a correct one that is left out costs little.
+χ² beyond which a submap's observation of a landmark is attributed to another landmark. Some twenty
+are tested for each pose, and leaving out a correct one costs little.
 """
 CONTRADICTED = 1e-6
-"""Probability below which the cost of a prior and submaps counts as a contradiction, not as
-chance.
-"""
+"""Probability below which the cost of a prior and submaps counts as a contradiction."""
 TRUSTING = JoinSettings()
 """Settings of plain least squares."""
 DOUBTING = JoinSettings(robust_c=1e3, landmark_gate=GATE)
-"""Settings that discount each landmark of a submap beyond the gate, which narrows; no submap as a
-whole.
-"""
+"""Settings that discount landmarks beyond a narrowing gate, but no submap as a whole."""
 DISPUTED = JoinSettings(robust_c=2.0, landmark_gate=GATE)
-"""Settings for contradictory input: a whole submap, or the map, may be wrong and is
-down-weighted.
-"""
+"""Settings for contradictory input: a whole submap, or the map, may be down-weighted."""
 FEWEST = 2
-"""Number of rejected landmarks from which a submap as a whole is in doubt; a single one was
+"""Number of rejected landmarks from which a submap as a whole is in doubt; a single one is a
 misread.
 """
 SELF = ("self", 0)
@@ -75,19 +68,17 @@ SELF = ("self", 0)
 class SubmapCorrection(NamedTuple):
     """The centre's corrections of a robot's submaps: a covariance factor f, and the shared biases.
 
-    biases: for each shared error b its name, the centre's estimate of it and the standard
-        deviation.
+    biases: name, estimate and standard deviation of each shared error b.
     """
 
     covariance_factor: float = 1.0
     biases: tuple[tuple[Bias, float, float], ...] = ()
 
     def taken(self, local: LocalMap) -> LocalMap:
-        """The corrected submap N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S) with the submap's sensitivity S.
+        """Correct a submap: N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S) with the submap's sensitivity S.
 
-        The remaining uncertainty of b is taken as independent of the map. In truth the map is
-        correlated with it in the sense that makes this covariance rather too large than too small.
-        A bias without an estimate is zero.
+        The remaining uncertainty of b is taken as independent of the map; the true correlation
+        makes this covariance rather too large than too small. A bias without an estimate is zero.
         """
         known = [each for each in self.biases if each[0] in local.biases]
         if not known and self.covariance_factor == 1.0 and not local.biases:
@@ -117,7 +108,7 @@ def _shifted(
     columns: Float[np.ndarray, "B n"],
     estimates: Float[np.ndarray, "B 2"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """The mean + Sᵀ b and f P + Sᵀ diag(σ²) S of biases (b, σ) with the columns S."""
+    """Compute mean + Sᵀ b and f P + Sᵀ diag(σ²) S of biases (b, σ) with the columns S."""
     shifted, total = mean.copy(), factor * covariance
     for k in range(len(columns)):
         variance = estimates[k, 1] * estimates[k, 1]
@@ -131,9 +122,8 @@ def _shifted(
 class RobotPrior(NamedTuple):
     """A robot's last joined end pose and landmarks: the joint covariance of (x, y, θ, x₁, y₁, …).
 
-    In the frame of the robot's island [m, rad], landmark ids ascending. A row of zeros is a known
-    constant.
-    shared: corrections of the submaps that the prior contains, and of those that it does not.
+    In the frame of the robot's island [m, rad], landmark ids ascending; a row of zeros is a known
+    constant. shared: corrections of all the robot's submaps, those in the prior included.
     """
 
     pose: Float[np.ndarray, "3"]
@@ -149,14 +139,13 @@ class RobotPrior(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """A robot's map after its later submaps, and how well they agree.
+    """A robot's map after its later submaps, with their agreement.
 
-    known: for each submap the number of its landmarks that the map or another submap contains, too.
-    refused: how many of those everything else contradicts.
-    cost: χ² of the least squares over the map and the submaps without the refused landmarks, in
-        `dof` degrees of freedom.
-    disputed: whether that χ² is too large, or most of a submap would be refused: something larger
-        than a single landmark is wrong.
+    known: for each submap, the number of its landmarks that the map or another submap contains,
+    too. refused: the number of those that everything else contradicts. cost: χ² of the least
+    squares over map and submaps without the refused landmarks, in `dof` degrees of freedom.
+    disputed: that χ² is too large, or most of a submap would be refused: the error is larger than a
+    single landmark.
     """
 
     whole: WholeMap
@@ -168,9 +157,7 @@ class Followed(NamedTuple):
 
 
 class Posed(NamedTuple):
-    """N(pose, covariance); of the window's landmarks, how many the map contains and how many it
-    refuses.
-    """
+    """N(pose, covariance); numbers of the window's landmarks that the map contains, and refuses."""
 
     pose: PoseGaussian
     known: int = 0
@@ -178,15 +165,14 @@ class Posed(NamedTuple):
 
 
 def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
-    """A robot's map times the submaps that follow the map's pose, in their order.
+    """Join the submaps that follow the map's pose, in order, by least squares.
 
-    Of the team's prior and the submaps that are not in it, this is the robot's team map. It is
-    solved by least squares. If a landmark of a submap then lies beyond the gate, the landmarks are
-    discounted one by one as the gate narrows, those that end beyond it are left out, and the rest
-    is solved again. Where most of a submap would be left out, or the rest is contradictory still,
-    no single landmark is at fault: Cauchy's loss on whole submaps and on the map, with all
-    landmarks, finds the factor that is, and the covariance is that of its weights.
-    Raises NotACovarianceError, or NotDeterminedError where the normal equations can not be solved.
+    If a landmark of a submap lies beyond the gate, the landmarks are discounted one by one as the
+    gate narrows, those that end beyond it are left out, and the rest is solved again. Where most of
+    a submap would be left out, or the rest is still contradictory, no single landmark is at fault:
+    Cauchy's loss on whole submaps and on the map, with all landmarks, finds the factor that is, and
+    the covariance is that of its weights. Raises NotACovarianceError, or NotDeterminedError where
+    the normal equations cannot be solved.
     """
     submaps = [each.without_nodes for each in pending]
     if not submaps:
@@ -209,7 +195,7 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
 
 
 def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> SolvedChain:
-    """The map and the submaps by plain least squares, with all their landmarks.
+    """Solve plain least squares of the map and the submaps, with all landmarks.
 
     Raises NotACovarianceError, NotDeterminedError.
     """
@@ -233,12 +219,11 @@ def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> SolvedChain:
 
 
 def _starts(parts: Sequence[np.ndarray]) -> Int64[np.ndarray, " _"]:
-    """Where each of these rows begins in all of them, and where the last one ends."""
     return np.cumsum([0, *map(len, parts)], dtype=np.int64)
 
 
 def _disputed(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
-    """The map after submaps, of which one as a whole may be wrong, or the map itself."""
+    """Join submaps robustly: one as a whole may be wrong, or the map itself."""
     island, _, _ = settled(_island(whole, submaps, DISPUTED))
     graph = island.graph
     ids = sorted(graph.landmarks)
@@ -252,14 +237,11 @@ def is_majority(refused: int, known: int) -> bool:
 
 
 def _most(dof: int) -> float:
-    """The cost above which a map and submaps contradict each other: the χ² quantile of
-    CONTRADICTED.
-    """
     return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
 
 
 def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
-    """The island of the map, as a submap that begins at its frame's origin, and of the submaps."""
+    """Make the island of the map, as a submap that begins at its origin, and the submaps."""
     chain = [LocalMap(whole.ids, whole.mean, whole.covariance), *submaps]
     taken = [Contribution(*SELF, k, k, each) for k, each in enumerate(chain)]
     graph, state = extended(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
@@ -267,7 +249,6 @@ def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings
 
 
 def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
-    """Marks the landmarks of each submap that lie beyond the gate, by their own covariance."""
     factors = island.graph.factors
     beyond = landmark_chi2(island.state, island.graph.offset, factors, 1.0) > GATE
     return np.split(beyond, factors.block_start[1:-1])[1:]
@@ -280,10 +261,9 @@ def _without(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
 
 
 def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
-    """N(pose, covariance) of the robot: a map's pose composed with the window in progress.
+    """Compose a map's pose with the window in progress: N(pose, covariance) of the robot.
 
-    Only the marginal of the landmarks that the window observes is taken from the map, which is
-    exact.
+    Only the marginal of the window's landmarks is taken from the map, which is exact.
     """
     if open_window is None:
         return Posed(PoseGaussian(whole.mean[:3], whole.covariance[:3, :3]))

@@ -1,8 +1,7 @@
 """Landmarks that a final map leaves out: placed by an uncertain heading, or missed by most submaps
-that look there; and the streams that were lost.
+that look there; and streams that were lost.
 
-Those that may be one with another landmark are found by
-`team.estimation.association.verification.find_possible_duplicates`.
+`team.estimation.association.verification.find_possible_duplicates` finds duplicates.
 """
 
 import math
@@ -20,9 +19,9 @@ from team.estimation.map_joining.nonlinearity import heading_sigma
 def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
     """Find the landmarks among these that only submaps of an uncertain heading have, ascending.
 
-    A covariance is linear in the heading. A place at a distance d that turns by an error θ moves by
-    d (1 − cos θ) in a direction that the linearised covariance takes for certain: d/3 at the limit
-    for a rigid alignment (`alignment_heading_sigma`) and three standard deviations.
+    A covariance is linear in the heading. A point at distance d turned by an error θ moves by d (1
+    − cos θ) in a direction that the linearised covariance takes as certain: d/3 at the limit for a
+    rigid alignment (`alignment_heading_sigma`) and three standard deviations.
     """
     best: dict[int, float] = {}
     for submap in island.graph.submaps:
@@ -65,8 +64,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
 
 
 def find_lost_streams(island: Island) -> dict[Stream, float]:
-    """Find the streams with a heading whose standard deviation exceeds `alignment_heading_sigma`;
-    returns the largest one [rad] of each.
+    """Find the streams with a heading standard deviation above `alignment_heading_sigma`; return
+    the largest one [rad] of each.
     """
     worst = {
         stream: max(heading_sigma(island, node) for node in nodes)

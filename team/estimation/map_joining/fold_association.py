@@ -1,8 +1,7 @@
 """Data association applied to the fold: merges landmarks, closures and islands in its graph.
 
-The decisions are those of `team.estimation.association`; here they are applied. Each step is a
-function of the fold alone, and the fold is a function of the set of submaps in its canonical order;
-so are the decisions.
+The decisions are those of `team.estimation.association`. Each step is a function of the fold alone,
+which is a function of the set of submaps in canonical order; so are the decisions.
 """
 
 from collections.abc import Sequence
@@ -100,7 +99,6 @@ class _IslandViews:
 
 
 def _track_island(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> Fold:
-    """Track, compare and sweep the landmarks of the new submaps of one island."""
     view = view_island(fold.islands[key], fold.landmarks)
     order = {each.observation[:2]: k for k, each in enumerate(view.submaps)}
     present = [
@@ -130,7 +128,6 @@ def _apply_merges(fold: Fold, key: Stream, view: IslandView) -> Fold:
 
 
 def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> Fold:
-    """Close a loop of the stream's last submaps inside their island, if there is one."""
     key = fold.home[stream]
     view = views.view(fold, key)
     found = search_island(view, stream, last)
@@ -155,7 +152,6 @@ def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> F
 def _join_island(
     fold: Fold, stream: Stream, last: int, other_key: Stream, views: _IslandViews
 ) -> Fold:
-    """Merge the stream's island with another one, if the stream's last submaps are found there."""
     key = fold.home[stream]
     mine, theirs = views.view(fold, key), views.view(fold, other_key)
     found = search_other_island(mine, theirs, stream, last)
@@ -246,10 +242,10 @@ def _merge_islands(
     second_from_first: Float[np.ndarray, "3"],
     decision: Decision,
 ) -> Fold:
-    """Merge two islands to one, in the team's frame if one of them has it, else in that of the
-    smallest stream; search the streams that change their frame for closures.
+    """Merge two islands; search the streams that change their frame for closures.
 
-    The fold is unchanged where the merged island has no solution.
+    The frame is the team's if one island has it, else that of the smallest stream. The fold is
+    unchanged where the merged island has no solution.
     """
     landmarks, becomes = merge_sets(fold.landmarks, ties)
     renamed = {}

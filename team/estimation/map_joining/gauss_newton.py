@@ -1,14 +1,15 @@
-"""The solution of a submap graph: Gauss-Newton, shortened or damped where the cost would rise.
+"""The solution of a submap graph: Gauss-Newton, with shorter or damped steps where the cost would
+rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
 prior), where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting.
 A robust factor enters with a wide scale that narrows with each iteration since it was added, so
 that a true loop closure is not taken for an outlier before the chain has adapted to it.
 
-With a robust loss each landmark of a submap has a weight of its own as well, so that a landmark
-that was mistaken for another does not break the robot's chain: beyond the gate g its χ² counts g (1
-+ log(χ²/g)), whose slope, the weight, is g/χ². The weight enters as additional variance of that
-landmark alone (`joining_kernel.discounted_information`).
+With a robust loss each landmark of a submap has a weight of its own as well, so that a mistaken
+landmark does not break the robot's chain: beyond the gate g its χ² counts g (1 + log(χ²/g)), whose
+slope, the weight, is g/χ². The weight enters as additional variance of that landmark alone
+(`joining_kernel.discounted_information`).
 """
 
 import math
@@ -45,37 +46,33 @@ from team.estimation.sparse_cholesky import sparse
 LEAST_WEIGHT = 1e-6
 """Lower bound of a landmark's weight, so that each landmark stays determined."""
 STILL = 1e-3
-"""Squared length, in standard deviations and per raw submap, of a step that a running map can do
-without: it is a tenth of what condensing moves the map by (docs/decisions/25)."""
+"""Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
+tenth of the shift by condensing (docs/decisions/25).
+"""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
 
 @dataclass(frozen=True)
 class JoinSettings:
-    """How submaps are joined.
+    """Settings of map joining.
 
-    iterations_per_tick: Gauss-Newton iterations of `folded`.
-    robust_c: Cauchy's scale on √(χ²/dim) of a factor; None for least squares. The scale begins at
-        robust_start · c and is multiplied by robust_decay with each iteration until it is c.
-    landmark_gate: χ² of two numbers from which a submap's landmark is discounted by itself, when
-        there is a robust loss; it narrows with the scale.
-    covariance_factor: factor on every submap's covariance.
-    max_iterations, step_tolerance: a full solve ends when no unknown changes by more than
-        step_tolerance [m, rad], or after max_iterations.
-    alignment_confidence: quantile of the χ² test that an island must pass before it is merged.
-    alignment_heading_sigma: largest standard deviation [rad] of the heading that the shape of the
-        shared landmarks gives; islands with a larger one are not merged.
-    bias_sigma: prior standard deviation of each error that a robot's submaps share.
-    common_bias_sigma: the same for errors that all robots share, as of a calibration of their kind;
-        they add to each robot's own. "marker": the share of the range by which all robots measure
-        one landmark too far, for each landmark by itself.
-    joined_ranges: whether errors of ranges are proportional to the range in the joined map
-        (`joining_kernel.with_joined_ranges`).
-    landmark_sigma: standard deviation [m], in each direction, of the point that sensors measure
-        about the landmark's place, the same point for all robots: part of a map's covariance, not
-        of what the robots' measurements weigh.
-    association: when landmarks without names count as one.
+    iterations_per_tick: Gauss-Newton iterations of `folded`. robust_c: Cauchy's scale on √(χ²/dim)
+    of a factor; None for least squares. The scale begins at robust_start · c and is multiplied by
+    robust_decay with each iteration until it is c. landmark_gate: χ² of two numbers from which a
+    submap's landmark is discounted by itself, with a robust loss; it narrows with the scale.
+    covariance_factor: factor on every submap's covariance. max_iterations, step_tolerance: a full
+    solve ends when no unknown changes by more than step_tolerance [m, rad], or after
+    max_iterations. alignment_confidence: quantile of the χ² test that an island must pass before it
+    is merged. alignment_heading_sigma: largest standard deviation [rad] of the heading from the
+    shape of the shared landmarks for a merge of islands. bias_sigma: prior standard deviation of
+    each error that a robot's submaps share. common_bias_sigma: the same for errors that all robots
+    share, in addition to each robot's own. "marker": the share of the range by which all robots
+    measure one landmark too far, for each landmark by itself. joined_ranges: whether errors of
+    ranges are proportional to the range in the joined map (`joining_kernel.with_joined_ranges`).
+    landmark_sigma: standard deviation [m], per direction, of the measured point, the same for all
+    robots, about the landmark's place: part of a map's covariance, not of the measurements'
+    weights. association: thresholds for unnamed landmarks.
     """
 
     iterations_per_tick: int = 2
@@ -104,15 +101,15 @@ class NotDeterminedError(ValueError):
 
 
 UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
-"""What a solve raises where the numbers allow no solution: a case to decide on, not a defect."""
+"""Exceptions of a solve where the numbers allow no solution: a case to decide on, not a defect."""
 
 
 @dataclass(frozen=True, eq=False)
 class Island:
     """One frame: its graph, the state (poses and landmarks by node) and the ages of the factors.
 
-    age, sighting_age: number of iterations since each submap and each inter-robot measurement was
-        added; the robust scale follows from it.
+    age, sighting_age: number of iterations since each submap and inter-robot measurement was added;
+    the robust scale follows from it.
     """
 
     graph: Graph
@@ -123,12 +120,12 @@ class Island:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
-        """The robust scale c of each submap at its age."""
+        """Robust scale c of each submap at its age."""
         return self._scale_at(self.age)
 
     @cached_property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
-        """The robust scale c of each inter-robot measurement at its age."""
+        """Robust scale c of each inter-robot measurement at its age."""
         return self._scale_at(self.sighting_age)
 
     def _scale_at(self, age: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
@@ -137,7 +134,6 @@ class Island:
 
     @cached_property
     def _submaps(self) -> kernel.SubmapFactors:
-        """The submaps, with their noise taken at this state."""
         factors = self.graph.factors
         if not self.settings.joined_ranges:
             return factors
@@ -145,7 +141,6 @@ class Island:
 
     @cached_property
     def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
-        """χ² of each landmark of each submap by itself, and the gate of each."""
         factors, settings = self._submaps, self.settings
         if settings.robust_c is None:
             return np.zeros(len(factors.block)), np.ones(len(factors.block))
@@ -157,7 +152,7 @@ class Island:
 
     @cached_property
     def landmark_weight(self) -> Float[np.ndarray, " B"]:
-        """The weight of each landmark of each submap: 1 up to its gate, 1 without a robust loss."""
+        """Weight of each landmark of each submap: 1 up to its gate, 1 without a robust loss."""
         chi2, gate = self._landmark_chi2_and_gate
         weight, beyond = np.ones(len(chi2)), chi2 > gate
         weight[beyond] = np.maximum(gate[beyond] / chi2[beyond], LEAST_WEIGHT)
@@ -200,8 +195,8 @@ class Island:
     def counted_chi2(self) -> Float[np.ndarray, " F"]:
         """χ² of each submap in which each landmark's share w χ² counts w times.
 
-        `dimensions` counts its numbers by the same weight: down-weighted terms are left out of the
-        agreement test.
+        `dimensions` counts its numbers by the same weight: the agreement test leaves out
+        down-weighted terms.
         """
         if self.factors is self._submaps:
             return self.chi2
@@ -242,10 +237,10 @@ class Island:
     def prior_weight(self) -> Float[np.ndarray, " priors"]:
         """Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.
 
-        A sensor that was changed since its calibration is one robot's: its prior is an outlier, and
-        must not draw the other robots' biases away from theirs through the errors in common.
-        Markers are not changed; the error of a marker that is seen from one side only is
-        distinguished from its landmark's position by its prior alone.
+        A sensor changed since its calibration is one robot's: its prior is an outlier, and must not
+        draw the other robots' biases away through the common errors. Markers do not change; the
+        error of a marker seen from one side only is distinguished from its landmark's position by
+        its prior alone.
         """
         if self.settings.robust_c is None:
             return np.ones(len(self.graph.priors))
@@ -254,10 +249,10 @@ class Island:
         return np.where(of_bias, weight, 1.0)
 
     def cost_of(self, other: "Island") -> float:
-        """The cost Σ w χ² of another state with the weights and the noise of this one: the quantity
-        that an iteration lowers.
+        """Evaluate Σ w χ² of another state with the weights and noise of this one, which an
+        iteration lowers.
 
-        Where it falls the robust cost falls too, since each loss lies below its parabola.
+        The robust cost then falls too, since each loss lies below its parabola.
         """
         settings = self.settings
         if other is self or (settings.robust_c is None and not settings.joined_ranges):
@@ -272,7 +267,7 @@ class Island:
 
     @cached_property
     def cost(self) -> float:
-        """The cost that is minimised, at the present robust scales."""
+        """The minimised cost, at the present robust scales."""
         graph = self.graph
         sizes = len(self.age), len(self.sighting_age), len(graph.priors)
         submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
@@ -290,7 +285,7 @@ class Island:
         sightings: Bool[np.ndarray, " S"],
         priors: Bool[np.ndarray, " priors"],
     ) -> float:
-        """The cost of the marked factors."""
+        """Sum the cost of the marked factors."""
         if self.settings.robust_c is None:
             chi2 = float(self.chi2[submaps].sum() + self.prior_chi2[priors].sum())
             return chi2 + float(self.sighting_chi2[sightings].sum())
@@ -307,7 +302,6 @@ class Island:
         )
 
     def _prior_cost(self, chosen: Bool[np.ndarray, " priors"]) -> float:
-        """Cauchy's loss of the biases' priors, χ² of the others."""
         c2 = 1.0 if self.settings.robust_c is None else elementary.squared(self.settings.robust_c)
         of_bias = (self.prior_weight < 1.0) & chosen
         robust = float((c2 * elementwise.log1p(self.prior_chi2[of_bias] / c2)).sum())
@@ -362,15 +356,15 @@ class Island:
         return self.factorised(self.normal_equations[0])
 
     def factorised(self, values: Values) -> sparse.Cholesky:
-        """Cholesky factor of a matrix in the layout of the graph's pattern."""
+        """Factorise a matrix in the layout of the graph's pattern."""
         try:
             return sparse.factorised(self.graph.analysis, values)
         except sparse.NotPositiveDefiniteError as error:
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
     def moved(self, step: Values, older: int = 1) -> "Island":
-        """The island with `step` added to its state, headings wrapped to (−π, π], and every factor
-        so many iterations older.
+        """Add `step` to the state, headings wrapped to (−π, π], and `older` iterations to every
+        factor.
         """
         state = self.state + step
         headings = state[self.graph.headings]
@@ -408,7 +402,9 @@ class Island:
 
     @cached_property
     def resting_spread(self) -> Float[np.ndarray, "r n"]:
-        """G R of the landmarks at rest, with their gain G and R Rᵀ of what they depend on."""
+        """G R of the landmarks at rest, with their gain G and R Rᵀ of the nodes that they depend
+        on.
+        """
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -427,7 +423,7 @@ class Island:
 
 
 def aged(island: Island, iterations: int | None) -> Island:
-    """The island with every factor so many iterations older; None: every factor begins anew."""
+    """Add iterations to the age of every factor; None: every factor begins anew."""
     if iterations is None:
         age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
     else:
@@ -436,7 +432,7 @@ def aged(island: Island, iterations: int | None) -> Island:
 
 
 def final_cost(island: Island) -> float:
-    """The cost with every robust scale at its final value, so that islands can be compared."""
+    """Evaluate the cost with every robust scale at its final value, for comparison of islands."""
     return aged(island, FULL_AGE).cost
 
 
@@ -457,11 +453,11 @@ def is_solvable(island: Island) -> bool:
 
 
 def iterated(island: Island) -> Island:
-    """The island after the iterations of one tick.
+    """Apply the iterations of one tick.
 
-    Where old submaps are condensed, an iteration after the first is left out whose step is shorter
-    than STILL: the decision is a function of the state, and the map is as far from its minimum as
-    condensing puts it anyway. A robust scale that still narrows goes on at the next tick.
+    With condensed submaps, iterations after the first are omitted whose step is shorter than STILL:
+    a function of the state, and condensing displaces the map by more. A robust scale that still
+    narrows continues at the next tick.
     """
     damping = 0.0
     bounded = island.graph.condensed is not None
@@ -479,16 +475,14 @@ def _stands_still(island: Island) -> bool:
 
 
 class Iteration(NamedTuple):
-    """The outcome of one step: the damping for the next one (or STUCK), the full step's largest
-    change.
-    """
+    """The outcome of one step: the next damping (or STUCK), and the full step's largest change."""
 
     damping: float
     change: float
 
 
 def _iteration(island: Island, damping: float) -> tuple[Island, Iteration]:
-    """One iteration; the island is one iteration older even where no step lowers the cost."""
+    """Take one step; the island ages by one even where no step lowers the cost."""
     after, outcome = take_step(island, _eased(damping))
     return aged(island, 1) if after is island else after, outcome
 
@@ -525,15 +519,16 @@ def _largest(step: Values) -> float:
 
 
 def _eased(damping: float) -> float:
-    """The damping with which the next iteration begins: the next robust scale changes the cost."""
+    """Reduce the damping for the next iteration, whose robust scale changes the cost."""
     return 0.0 if damping == STUCK else damping
 
 
 def settled(island: Island) -> tuple[Island, int, float]:
-    """The full solution from this state, the number of iterations and the last change [m, rad].
+    """Solve in full from this state; return also the number of iterations and the last change [m,
+    rad].
 
     The robust scale of every factor is annealed anew. The solve ends when converged, after
-    `max_iterations`, or where no step lowers the cost; the last change tells whether it converged.
+    `max_iterations`, or where no step lowers the cost; the last change shows whether it converged.
     """
     settings = island.settings
     island = aged(island, None)
@@ -551,10 +546,10 @@ def settled(island: Island) -> tuple[Island, int, float]:
 def solved_with_fixed(
     island: Island, unknown: int, by: float, iterations: int, *, shortest: float = 0.0
 ) -> Island:
-    """Moves one number of the state by `by` and solves for all others given that.
+    """Move one number of the state by `by` and solve for all others given that.
 
     With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose
-    component along w is what remains to be moved: the point on the constraint with the least cost
+    component along w is the remaining displacement: the point on the constraint with the least cost
     to second order. An iteration whose squared length (p + λ q)ᵀ A (p + λ q), in standard
     deviations, is below `shortest` is the last one.
     """
@@ -574,9 +569,7 @@ def solved_with_fixed(
 
 
 def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Mean and joint covariance of some nodes, in the order of `nodes`; a fixed node has covariance
-    0.
-    """
+    """Compute mean and joint covariance of `nodes`, in order; a fixed node has covariance 0."""
     graph = island.graph
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
     unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])

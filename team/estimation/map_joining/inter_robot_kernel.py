@@ -25,12 +25,10 @@ Values = Float[np.ndarray, " _"]
 
 
 class InterRobotFactors(NamedTuple):
-    """All inter-robot measurements of a graph in flat arrays, in the order in which they were
-    added.
+    """All inter-robot measurements of a graph in flat arrays, in the order of their addition.
 
-    nodes: pose nodes of the observer and of the teammate.
-    first_pair: where the pairs of members of these factors begin in the pattern's entries; each
-        factor has 2 × 2.
+    nodes: pose nodes of the observer and of the teammate. first_pair: first of the 2 × 2 member
+    pairs of each factor in the pattern's entries.
     """
 
     nodes: Int64[np.ndarray, "S 2"]
@@ -43,7 +41,7 @@ class InterRobotFactors(NamedTuple):
 def sighting_residual(
     observer: Values, teammate: Values, measurement: Values
 ) -> tuple[Values, Float[np.ndarray, "2 6"]]:
-    """Residual r and its Jacobian over (observer's pose, teammate's pose)."""
+    """Compute the residual r and its Jacobian over (observer's pose, teammate's pose)."""
     vx, vy = teammate[0] - observer[0], teammate[1] - observer[1]
     distance = max(math.sqrt(vx * vx + vy * vy), NEAREST_M)
     residual = np.empty(2)
@@ -61,7 +59,7 @@ def sighting_residual(
 
 @compiled
 def sighting_costs(state: Values, offset: Indices, sightings: InterRobotFactors) -> Values:
-    """χ² = rᵀR⁻¹r of each inter-robot measurement."""
+    """Compute χ² = rᵀR⁻¹r of each inter-robot measurement."""
     result = np.empty(len(sightings.nodes))
     for f in range(len(result)):
         a, b = offset[sightings.nodes[f, 0]], offset[sightings.nodes[f, 1]]
@@ -99,7 +97,7 @@ def add_sightings(
     entry: Indices,
     value_start: Indices,
 ) -> None:
-    """Adds Σ w JᵀR⁻¹J to the pattern's values and Σ w JᵀR⁻¹r to the gradient; scale: robust c of
+    """Add Σ w JᵀR⁻¹J to the pattern's values and Σ w JᵀR⁻¹r to the gradient; scale: robust c of
     each.
     """
     pair = sightings.first_pair
@@ -139,7 +137,7 @@ def explained_by_sightings(
     value_start: Indices,
     inverse: Values,
 ) -> Values:
-    """tr(JᵀR⁻¹J Σ) of each factor: the part of its 2 numbers that the solution absorbs."""
+    """Compute tr(JᵀR⁻¹J Σ) of each factor: the part of its 2 numbers that the solution absorbs."""
     result = np.zeros(len(sightings.nodes))
     pair = sightings.first_pair
     for f in range(len(result)):

@@ -1,8 +1,8 @@
-"""The points that are known in the frames of two islands, and the alignments that they allow.
+"""Points known in the frames of two islands, and the alignments that they allow.
 
-A shared landmark is such a point. So is a teammate that is observed from a pose node: in the
-observer's island it lies at pose ∘ (range, bearing), in its own island at its pose node. An
-inter-robot measurement and the reverse one are two points.
+Such a point is a shared landmark, or a teammate observed from a pose node: in the observer's island
+it lies at pose ∘ (range, bearing), in its own island at its pose node. An inter-robot measurement
+and the reverse one are two points.
 """
 
 import math
@@ -23,20 +23,18 @@ JointPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""
 HEADINGS = 24
 MOST_POINTS = 24
-"""With more points than this only the best heading is tried: so many points do not fit at two
+"""Most points for which more than the best heading is tried: more points do not fit at two
 headings, and would make the search slow.
 """
 HOPELESS = 100.0
-"""Headings whose χ² exceeds the best one's by more than this are not tried."""
+"""Rise of χ² above the best heading's beyond which a heading is not tried."""
 
 
 class SharedPoint(NamedTuple):
-    """One point: its node in the main island and in the other one, and the measurement that ties
-    them.
+    """One point: its node in the main island and in the other, and the measurement that ties them.
 
-    seen: the inter-robot measurement; None for a shared landmark.
-    from_main: whether the observer is in the main island; that island's node is then the
-        observer's.
+    seen: the inter-robot measurement; None for a shared landmark. from_main: the observer is in the
+    main island, whose node is then the observer's.
     """
 
     main: int
@@ -46,7 +44,7 @@ class SharedPoint(NamedTuple):
 
 
 def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> list[SharedPoint]:
-    """The shared landmarks by id, then the inter-robot measurements between the islands in their
+    """List the shared landmarks by id, then the inter-robot measurements between the islands in
     order.
     """
     shared = sorted(main.landmarks.keys() & other.landmarks.keys())
@@ -64,7 +62,7 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
 def aligned_by(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> alignment.Alignment | None:
-    """Where the other island lies in the main one; None where the points do not suffice."""
+    """Align the other island with the main one; None where the points do not suffice."""
     if len(tied) < alignment.NEEDED:
         return None
     in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
@@ -73,7 +71,7 @@ def aligned_by(
 
 
 def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None]]) -> JointPoints:
-    """The positions of nodes, or of the teammates measured from them, with their joint
+    """Return the positions of nodes, or of the teammates measured from them, with joint
     covariance.
     """
     mean, covariance = joint_marginal(island, [node for node, _ in at])
@@ -101,11 +99,11 @@ def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None]]) -
 def headings_that_fit(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> list[Float[np.ndarray, "3"]]:
-    """Every main_from_other whose heading is a local minimum of the χ² of the shared points.
+    """Find every main_from_other whose heading is a local minimum of the shared points' χ².
 
     The best translation at each heading of a grid follows in closed form from the joint covariance
-    of the points. Headings that are worse by more than HOPELESS are left out; with more than
-    MOST_POINTS points only the best one is returned.
+    of the points. Headings worse by more than HOPELESS are left out; with more than MOST_POINTS
+    points only the best one is returned.
     """
     if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
         return []

@@ -24,10 +24,10 @@ def joined_by_id(
     local_mean: Float[np.ndarray, " m"],
     local_covariance: Float[np.ndarray, "m m"],
 ) -> Joined:
-    """Ids, mean and covariance of the joined map, landmarks by ascending id; and the fault.
+    """Join two maps: ids, mean and covariance, landmarks by ascending id; and the fault.
 
-    With the update by the constraints Δ = P Hᵀ S⁻¹ H P of (whole, local), and G the Jacobian of
-    what is made of (pose, local): the new pose and the new landmarks.
+    Updates (whole, local) by the constraints, Δ = P Hᵀ S⁻¹ H P, with G the Jacobian of the new pose
+    and the new landmarks by (pose, local).
     """
     found = agreed(
         whole_ids, whole_mean, whole_covariance, ids, local_mean, local_covariance, math.inf
@@ -91,7 +91,6 @@ def _columns(
 
 @compiled
 def _others(count: int, indices: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " f"]:
-    """The numbers below `count` that are not among the ascending indices."""
     others, k = np.empty(count - len(indices), np.int64), 0
     for i in range(count):
         if k < len(indices) and indices[k] == i:
@@ -130,7 +129,6 @@ def _in_order(
     covariance: Float[np.ndarray, "p p"],
     order: Int64[np.ndarray, " L"],
 ) -> Joined:
-    """The map with its landmarks in this order, its covariance exactly symmetric."""
     place, n = coordinates(order, 3, 3), len(mean)
     sorted_mean, P = np.empty(n), np.empty((n, n))
     for i in range(n):

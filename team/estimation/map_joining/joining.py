@@ -3,8 +3,8 @@
 Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over all submaps of
 all robots, and over the inter-robot measurements between their pose nodes. The fold takes the
 submaps by ticks, each with the inter-robot measurements from it; it is a pure function of their
-order and of the ticks' boundaries. A stream whose initial pose in the common frame is unknown is an
-island of its own until shared landmarks and inter-robot measurements tie it to the main island.
+order and of the ticks' boundaries. A stream with an unknown initial pose is an island of its own
+until shared landmarks and inter-robot measurements tie it to the main island.
 """
 
 import math
@@ -72,13 +72,13 @@ __all__ = [
 ]
 
 NAMED = 10
-"""Most robots of an island that are named when it is merged."""
+"""Most robots named in the record of a merge."""
 PATIENCE = 1.1
-"""A failed search is repeated once the number of submaps has grown by this factor."""
+"""Growth of the number of submaps after which a failed search is repeated."""
 
 
 class NotCanonicalError(ValueError):
-    """A submap is not behind the ones before it in the canonical order."""
+    """A submap does not follow the ones before it in the canonical order."""
 
     def __init__(self, contribution: Contribution) -> None:
         super().__init__(
@@ -101,7 +101,7 @@ class GapError(ValueError):
 
 
 class LateStartError(ValueError):
-    """An initial pose was given for a stream of which the fold already contains submaps."""
+    """An initial pose was given for a stream with folded submaps."""
 
     def __init__(self, start: InitialPoseFactor) -> None:
         super().__init__(
@@ -115,13 +115,10 @@ class LateStartError(ValueError):
 class Tick:
     """The contents of one tick, in canonical order.
 
-    contributions: the submaps.
-    sightings: the inter-robot measurements from the poses of those submaps.
-    starts: the initial poses of the streams whose first submap is among them.
-    outside: for a submap that is refused before it is tried, the reason (it exceeds a sensible
-        bound).
-    set_aside: messages about everything else that was refused before.
-    verdicts: an operator's decisions on landmarks of these submaps or of earlier ones.
+    contributions: the submaps. sightings: the inter-robot measurements from their poses. starts:
+    the initial poses of the streams whose first submap is among them. outside: reason for each
+    submap refused in advance (beyond a bound). set_aside: messages about other refusals. verdicts:
+    an operator's decisions on landmarks of these submaps or of earlier ones.
     """
 
     contributions: Sequence[Contribution]
@@ -147,25 +144,19 @@ class Audit:
 class Fold:
     """The state of the fold: the islands solved so far, and the bookkeeping of their submaps.
 
-    home: island (a key of `islands`) of each stream.
-    reasons: why an island other than the main one is not merged, by its frame.
-    joined: how an island was merged into another one and how certain that is, by its former frame.
-    warnings: the signs of another minimum that the full solution found, in words.
-    waiting: inter-robot measurements whose pose nodes are not both in one island, in canonical
-        order.
-    judged: number of submaps of two islands at their last failed merge attempt, and the reason for
-        the failure.
-    searched_at: number of submaps of an island at its last failed search for a lower minimum.
-    iterations, change: the number of iterations and the last step [m, rad] of the main island's
-        last full solution.
-    refused: submaps that were received and are not in the map, in canonical order, with the reason
-        (`refusal`).
-    motion_only: submaps of which only the motion is in the map, not the landmarks.
-    left_out: inter-robot measurements with which the map has no solution.
-    set_aside: everything refused besides submaps, in words: initial poses, inter-robot
-        measurements, and landmarks of submaps.
-    landmarks: which unnamed landmarks of which submaps are one, with the evidence (`associating`).
-    audits: closures that may still be undone (`auditing`).
+    home: island (a key of `islands`) of each stream. reasons: why an island other than the main one
+    is not merged, by its frame. joined: record of each merge and its certainty, by the former
+    frame. warnings: signs of another minimum that the full solution found. waiting: inter-robot
+    measurements whose pose nodes are not both in one island, in canonical order. judged: number of
+    submaps of two islands at their last failed merge attempt, and its reason. searched_at: number
+    of submaps of an island at its last failed search for a lower minimum. iterations, change: the
+    number of iterations and the last step [m, rad] of the main island's last full solution.
+    refused: submaps that are not in the map, in canonical order, with the reason (`refusal`).
+    motion_only: submaps of which only the motion is in the map. left_out: inter-robot measurements
+    with which the map has no solution. set_aside: other refusals in words: initial poses,
+    inter-robot measurements, landmarks of submaps. landmarks: which unnamed landmarks of which
+    submaps are one, with the evidence (`associating`). audits: closures that may still be undone
+    (`auditing`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -208,7 +199,7 @@ class Fold:
 
     @property
     def main(self) -> Island:
-        """The island whose map is the team's. Raises KeyError before the first submap."""
+        """The island of the team's map. Raises KeyError before the first submap."""
         if self.main_key is None:
             raise KeyError("no submap has come yet")
         return self.islands[self.main_key]
@@ -218,7 +209,7 @@ class Fold:
         """The stream whose start fixes the main island's frame; None before any submap.
 
         It is the smallest one with a known initial pose, else the smallest one of the island. All
-        known initial poses are given in one frame, so each of them fixes the same.
+        known initial poses are given in one frame.
         """
         if self.main_key is None:
             return None
@@ -226,11 +217,11 @@ class Fold:
         return min(started or self.main.graph.streams)
 
     def island(self, robot: str, incarnation: int) -> Island:
-        """The island of a stream. Raises KeyError for a stream without submaps."""
+        """Return the island of a stream. Raises KeyError for a stream without submaps."""
         return self.islands[self.home[(robot, incarnation)]]
 
     def next_sequence(self, stream: Stream) -> int:
-        """Sequence number of the next submap that the fold takes from a stream."""
+        """Sequence number of a stream's next submap in the fold."""
         if stream not in self.home:
             return 0
         return self.islands[self.home[stream]].graph.next_sequence(stream)
@@ -240,7 +231,7 @@ EMPTY_FOLD = Fold((), {}, {}, {}, {})
 
 
 def started(fold: Fold, start: InitialPoseFactor) -> Fold:
-    """The fold with a stream's initial pose; to be called before the stream's first submap."""
+    """Add a stream's initial pose, before the stream's first submap."""
     if start.stream in fold.home:
         raise LateStartError(start)
     return replace(fold, starts={**fold.starts, start.stream: start})
@@ -252,14 +243,13 @@ def folded(
     settings: JoinSettings,
     sightings: Sequence[InterRobotFactor] = (),
 ) -> Fold:
-    """Takes one tick: adds the submaps, places new landmarks, iterates, and merges islands where
+    """Fold one tick: add the submaps, place new landmarks, iterate, and merge islands where
     possible.
 
-    contributions: submaps in canonical order, behind all that the fold contains and without a gap
-        in a stream; else NotCanonicalError or GapError is raised. Islands without new submaps keep
-        their state.
-    sightings: the inter-robot measurements from the submaps of this tick; each is a factor from the
-        tick on in which both of its pose nodes are in one island.
+    contributions: submaps in canonical order, after all folded ones and without a gap in a stream;
+    else NotCanonicalError or GapError is raised. Islands without new submaps keep their state.
+    sightings: the inter-robot measurements from these submaps; each is a factor from the tick on in
+    which both of its pose nodes are in one island.
     """
     _check(fold, contributions)
     home = dict(fold.home)
@@ -302,10 +292,10 @@ def folded(
 
 
 def compacted(fold: Fold) -> Fold:
-    """The same fold without the values that can be computed again from it: a checkpoint to store.
+    """Drop the values of a fold that can be computed again from it, for a checkpoint.
 
     It shares the submaps with the folds before and after it. Of its own it has the state, the
-    graph's nodes and what is condensed, whose symmetric matrices are packed.
+    graph's nodes and the condensed factor, whose symmetric matrices are packed.
     """
     islands = {}
     for key, island in fold.islands.items():
@@ -316,10 +306,10 @@ def compacted(fold: Fold) -> Fold:
 
 
 def converged(fold: Fold, settings: JoinSettings) -> Fold:
-    """The full solution of every island; `iterations` and `change` describe how it ended.
+    """Solve every island in full; `iterations` and `change` describe the end of the solve.
 
-    Other minima are searched for and reported in `warnings`. An island that has no full solution
-    keeps the state of the last tick, and `warnings` reports that.
+    `warnings` reports other minima, and islands without a full solution, which keep the state of
+    the last tick.
     """
     if fold.main_key is None:
         return fold
@@ -356,7 +346,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
 
 
 def _search(island: Island) -> Search:
-    """The search for the island's full solution; where there is none, the island unchanged."""
+    """Search the island's full solution; where there is none, the island is unchanged."""
     with suppress(*UNSOLVABLE):
         found = searched([island])
         if is_solvable(found.best.island):
@@ -378,7 +368,7 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
 
 
 def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
-    """Merges islands while any two can be merged, into the one with known initial poses or the
+    """Merge islands while any two can be merged, into the one with known initial poses or the
     smallest frame.
 
     A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
@@ -411,9 +401,7 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
 
 
 def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
-    """The fold with two islands merged; the record of the merge, who joined whom and when, is
-    filed under the frame that is gone.
-    """
+    """Merge two islands; the record of the merge is filed under the vanished frame."""
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
     islands[key] = found.best.island
     streams = sorted(fold.islands[other_key].graph.streams)
@@ -434,7 +422,7 @@ def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> 
 
 
 def _with_searches(fold: Fold) -> Fold:
-    """Searches islands of suspicious cost for a lower minimum, each time they have grown by
+    """Search islands of suspicious cost for a lower minimum, each time they have grown by
     PATIENCE.
     """
     islands, searched_at = dict(fold.islands), dict(fold.searched_at)

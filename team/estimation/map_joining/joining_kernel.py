@@ -22,22 +22,21 @@ LARGEST_RATIO = 1.25
 A landmark beyond it is an outlier, whose covariance must not grow with the distance.
 """
 LARGEST_TURN_RAD = 0.2
-"""Largest angle between a landmark's direction in the joined map and the measured one; a landmark
-beyond it is an outlier.
+"""Largest angle between a landmark's direction in the joined map and the measured one, else it is
+an outlier.
 """
 NO_POWER = -1
 
 
 class SubmapFactors(NamedTuple):
-    """All submaps of a graph in flat arrays, in the order in which they were added.
+    """All submaps of a graph in flat arrays, in the order of their addition.
 
     member[member_start[f] : member_start[f + 1]] are the nodes of submap f: start pose, end pose,
     pose nodes by stamp, landmarks by id, biases. mean, information (P⁻¹, row-major) and sensitivity
-    (a row per bias) begin likewise at mean_start, information_start and sensitivity_start.
-    block: each landmark's own covariance (xx, xy, yy); those of submap f begin at block_start[f].
+    (a row per bias) begin likewise at mean_start, information_start and sensitivity_start. block:
+    each landmark's own covariance (xx, xy, yy); those of submap f begin at block_start[f].
     range_power: for each row of the sensitivities, beginning at row_start[f], the power of a
-        landmark's range with which the bias moves that landmark, along or across; NO_POWER:
-        neither.
+    landmark's range with which the bias moves that landmark, along or across; NO_POWER: neither.
     """
 
     member: Indices
@@ -58,7 +57,7 @@ class SubmapFactors(NamedTuple):
 def _pairs(
     fixed: Bool[np.ndarray, " _"], member: Indices, member_start: Indices
 ) -> tuple[Indices, Indices]:
-    """Row and column block of each pair of members, factor by factor; −1 where there is none."""
+    """Row and column block of each pair of members, factor by factor; −1 for none."""
     pairs = 0
     for f in range(len(member_start) - 1):
         pairs += (member_start[f + 1] - member_start[f]) ** 2
@@ -79,7 +78,7 @@ def _pairs(
 def block_pattern(
     fixed: Bool[np.ndarray, " _"], member: Indices, member_start: Indices
 ) -> tuple[Indices, Indices, Indices]:
-    """Pattern of Σ JᵀP⁻¹J, and the entry of it to which each pair of members of each factor adds.
+    """Build the pattern of Σ JᵀP⁻¹J, and its entry for each pair of members of each factor.
 
     Returns column_start and rows (as in `sparse.Pattern`) and, factor by factor, a k × k table over
     the members: the entry for (a, b) if node a ≥ node b, else −1; also −1 if one of them is fixed.
@@ -132,21 +131,19 @@ def _places(offset: Indices, nodes: Indices) -> Indices:
 
 @compiled
 def _turn_and_stretch(values: Values, i: int, j: int, c: float, s: float, stretch: float) -> None:
-    """Rotates the point stored at indices i and j, and scales it by `stretch`, in place."""
     x, y = values[i], values[j]
     values[i], values[j] = stretch * (c * x - s * y), stretch * (s * x + c * y)
 
 
 @compiled
 def with_joined_ranges(state: Values, offset: Indices, factors: SubmapFactors) -> SubmapFactors:
-    """The submaps, with their noise recomputed at the ranges of the joined map.
+    """Recompute the submaps' noise at the ranges of the joined map.
 
-    For errors proportional to the range: q is the distance of a landmark, in the state, from where
-    its submap saw it (the middle of the submap's poses), over the distance that the submap
-    measured, and φ the angle between the two. The landmark's errors are rotated by φ and multiplied
-    by q, P' = T P Tᵀ with T = blkdiag(1, …, q R(φ), …), and its derivatives by the sensor's errors
-    are those at the place that the map gives it: S' = qᵏ R(φ) S with k = 0 for an offset of ranges
-    and 1 for their scale.
+    For errors proportional to the range: q is the distance of a landmark, in the state, from its
+    submap's viewpoint (the middle of the submap's poses), over the measured distance, and φ the
+    angle between the two. The landmark's errors are rotated by φ and multiplied by q, P' = T P Tᵀ
+    with T = blkdiag(1, …, q R(φ), …), and its derivatives by the sensor's errors are those at its
+    place in the map: S' = qᵏ R(φ) S with k = 0 for an offset of ranges and 1 for their scale.
 
     With the noise of the measured distance d(1 + e) instead, a measurement that came out short
     weighs more, by (1 + e)⁻² (Peelle's puzzle); and where the scale b of the ranges is a state, the
@@ -219,7 +216,7 @@ def with_joined_ranges(state: Values, offset: Indices, factors: SubmapFactors) -
 def landmark_chi2(
     state: Values, offset: Indices, factors: SubmapFactors, covariance_factor: float
 ) -> Values:
-    """r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap."""
+    """Compute r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap."""
     result = np.empty(len(factors.block))
     for f in range(len(factors.member_start) - 1):
         at = _places(offset, factors.member[factors.member_start[f] : factors.member_start[f + 1]])
@@ -242,7 +239,7 @@ def landmark_chi2(
 
 @compiled
 def discounted_information(factors: SubmapFactors, weight: Values) -> Values:
-    """(P + blkdiag(0, (1/w_l − 1) P_ll))⁻¹ of each submap, in the layout of `information`.
+    """Compute (P + blkdiag(0, (1/w_l − 1) P_ll))⁻¹ of each submap, in the layout of `information`.
 
     A landmark with weight w_l counts as if its own covariance were that much larger; the rest of
     the submap keeps its information. By Woodbury's identity, one landmark after the other.
@@ -290,7 +287,7 @@ def _sensitivity(factors: SubmapFactors, f: int, n: int) -> Float[np.ndarray, "B
 def submap_of(
     offset: Indices, factors: SubmapFactors, f: int
 ) -> tuple[Indices, Indices, Values, Float[np.ndarray, "n n"], Float[np.ndarray, "B n"]]:
-    """Submap f: its nodes, their indices in the state, its mean, its P⁻¹ and its sensitivity."""
+    """Return submap f: nodes, their indices in the state, mean, P⁻¹ and sensitivity."""
     nodes = factors.member[factors.member_start[f] : factors.member_start[f + 1]]
     mean = factors.mean[factors.mean_start[f] : factors.mean_start[f + 1]]
     n, begin = len(mean), factors.information_start[f]
@@ -302,7 +299,7 @@ def submap_of(
 def costs(
     state: Values, offset: Indices, factors: SubmapFactors, covariance_factor: float
 ) -> Values:
-    """χ² of each submap in the metric (covariance_factor · P)⁻¹."""
+    """Compute χ² of each submap in the metric (covariance_factor · P)⁻¹."""
     result = np.empty(len(factors.member_start) - 1)
     for f in range(len(result)):
         _, at, mean, information, sensitivity = submap_of(offset, factors, f)
@@ -339,10 +336,10 @@ def normal_equations(
     column_start: Indices,
     value_start: Indices,
 ) -> tuple[Values, Values, Values]:
-    """Σ w JᵀP⁻¹J on the pattern, Σ w JᵀP⁻¹r, and the unweighted χ² of each submap.
+    """Sum Σ w JᵀP⁻¹J on the pattern and Σ w JᵀP⁻¹r; return also the unweighted χ² of each submap.
 
     scale: the robust c of each submap. A fixed node has an identity block without couplings and a
-        zero gradient, so that its step is zero.
+    zero gradient, so that its step is zero.
     """
     values = np.zeros(value_start[-1])
     gradient = np.zeros(offset[-1])
@@ -388,10 +385,10 @@ def explained(
     value_start: Indices,
     inverse: Values,
 ) -> Values:
-    """tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.
+    """Compute tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.
 
     inverse: the entries of Σ on the pattern. For a solution with these weights the sum over all
-        factors is the number of unknowns.
+    factors is the number of unknowns.
     """
     result = np.zeros(len(factors.member_start) - 1)
     pair = 0

@@ -1,8 +1,8 @@
-"""Landmarks of an island as they are asked for: by their ids, nodes and those at rest alike.
+"""Landmarks of an island by id, nodes and those at rest alike.
 
-Of a landmark at rest, x = means + gain d + e with e ~ N(0, C): its mean follows from the state of
-the condensed factor's nodes, its covariances from theirs, Cov(x, z) = gain Cov(d, z) and
-Cov(x, x') = C + gain Cov(d, d) gainᵀ.
+For a landmark at rest, x = means + gain d + e with e ~ N(0, C): its mean follows from the state of
+the condensed factor's nodes, its covariances from theirs, Cov(x, z) = gain Cov(d, z) and Cov(x, x')
+= C + gain Cov(d, d) gainᵀ.
 """
 
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def known(island: Island) -> list[int]:
-    """The ids of all landmarks, ascending."""
+    """List the ids of all landmarks, ascending."""
     return sorted([*island.graph.landmarks, *resting_of(island).ids.tolist()])
 
 
 def resting_of(island: Island) -> Resting:
-    """The landmarks at rest; none where nothing is condensed."""
+    """Return the landmarks at rest; none where nothing is condensed."""
     old = island.graph.condensed
     if old is None:
         return nobody_rests(0)
@@ -35,7 +35,7 @@ def resting_of(island: Island) -> Resting:
 
 
 def points_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2"]:
-    """The positions [m] of these landmarks."""
+    """Return the positions [m] of landmarks."""
     points = np.empty((len(ids), 2))
     awake, nodes, at = _sorted_out(island, ids)
     points[awake] = island.state[places(island.graph.offset, nodes)].reshape(-1, 2)
@@ -45,7 +45,7 @@ def points_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2"]:
 
 
 def blocks_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2 2"]:
-    """The covariance [m²] of each of these landmarks by itself."""
+    """Return the own covariance [m²] of each landmark."""
     blocks = np.empty((len(ids), 2, 2))
     awake, nodes, at = _sorted_out(island, ids)
     pattern = island.graph.pattern
@@ -61,14 +61,14 @@ def blocks_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2 2"]:
 def joint(
     island: Island, nodes: Sequence[int], ids: Sequence[int]
 ) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Mean and joint covariance of some nodes and of these landmarks, in this order."""
+    """Compute mean and joint covariance of nodes and landmarks, in this order."""
     return joints(island, [(nodes, ids)])[0]
 
 
 def joints(
     island: Island, groups: Sequence[tuple[Sequence[int], Sequence[int]]]
 ) -> list[tuple[Values, Float[np.ndarray, "n n"]]]:
-    """`joint` of each of several groups, with one solution for all their nodes."""
+    """Compute `joint` of several groups, with one solution for all their nodes."""
     parts = [_sorted_out(island, ids) for _, ids in groups]
     members = [
         np.concatenate([np.array(nodes, np.int64), own])
@@ -102,7 +102,7 @@ def joints(
 def _with_resting(
     island: Island, covariance: Matrix, with_boundary: Float[np.ndarray, "n b"], at: Indices
 ) -> Float[np.ndarray, "m m"]:
-    """The joint covariance of some numbers, extended by landmarks at rest.
+    """Extend the joint covariance of some numbers by landmarks at rest.
 
     with_boundary: their covariance with the nodes of the condensed factor.
     """
@@ -115,9 +115,9 @@ def _with_resting(
 
 
 def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.ndarray, "n b"]]:
-    """Joint covariance of some nodes, and theirs with the nodes of the condensed factor.
+    """Compute the joint covariance of nodes, and that with the condensed factor's nodes.
 
-    Among the latter it is known from the selected inverse; only other nodes take a solution each.
+    It is known from the selected inverse among the latter; other nodes take a solution each.
     """
     graph, old = island.graph, island.graph.condensed
     assert old is not None
@@ -141,9 +141,9 @@ def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.n
 def _sorted_out(
     island: Island, ids: Sequence[int]
 ) -> tuple[Bool[np.ndarray, " L"], Indices, Indices]:
-    """Which landmarks are nodes; the nodes of those, and the places of the others at rest.
+    """Split landmarks: marks of those that are nodes, their nodes, and the others' places at rest.
 
-    Raises KeyError for an id that the island has not.
+    Raises KeyError for an unknown id.
     """
     landmarks = island.graph.landmarks
     found = np.array([landmarks.get(id_, -1) for id_ in ids], np.int64)

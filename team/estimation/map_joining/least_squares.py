@@ -1,8 +1,8 @@
-"""Nonlinear least squares: how a step is shortened or damped, and how a robust scale narrows.
+"""Nonlinear least squares: shortening and damping of steps, and narrowing of robust scales.
 
 Robust losses enter by iterated re-weighting: a point's cost is quadratic in the residuals, with the
-weights of that same point. A robust scale begins wide and narrows with the number of iterations
-since its factor was added, so that a residual that is large at first is not taken for an outlier.
+weights of that same point. A robust scale begins wide and narrows with the iterations since its
+factor was added, so that a residual that is large at first is not taken for an outlier.
 """
 
 import math
@@ -13,19 +13,19 @@ from jaxtyping import Float, Int64
 
 Values = Float[np.ndarray, " _"]
 SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
-"""Shares of an undamped step that are tried before damping: odometry makes long curved valleys, in
-which damped steps are very short.
+"""Shares of an undamped step that are tried before damping: in the long curved valleys of odometry
+damped steps are very short.
 """
 LEAST_DAMPING = 1e-4
 MOST_DAMPING = 1e8
 STUCK = math.inf
-"""The damping of a point from which no step lowers the cost."""
+"""Damping of a point from which no step lowers the cost."""
 ROUNDING = 1e-10
-"""Relative rise of the cost that is accepted: rounding near the minimum is no reason to damp."""
+"""Relative rise of the cost accepted as rounding near the minimum."""
 
 
 def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Powers by products of repeated squares: a C library's differ from processor to processor."""
+    """Compute powers by repeated squares: a C library's differ from processor to processor."""
     powers, rest = np.ones(len(exponents)), exponents
     while rest.any():
         powers = np.where(rest & 1, powers * base, powers)

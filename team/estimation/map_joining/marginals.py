@@ -1,6 +1,6 @@
-"""Marginals of a joined map: means and covariances, and how well its submaps agree.
+"""Marginals of a joined map: means and covariances, and the agreement of its submaps.
 
-All values are in the frame of an island: the main one, or the one that a stream is in.
+All values are in the frame of an island: the main one, or the one of a stream.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.landmark_view import blocks_of, joint, joints, known, points_of
 
 BELIEVED = 0.5
-"""A submap is believed as to a landmark whose weight in it is at least this."""
+"""Least weight of a landmark in a submap for the submap to be believed about it."""
 
 
 class LandmarkMap(NamedTuple):
@@ -50,10 +50,10 @@ class Trajectory(NamedTuple):
 
 
 class EndPoses(NamedTuple):
-    """End poses of a stream's submaps in their order, each with its covariance.
+    """End poses of a stream's submaps in order, each with its covariance.
 
-    start, start_covariance: the start pose of the first submap.
-    crosses: covariance of each pose with the pose before it, of the first one with the start.
+    start, start_covariance: the start pose of the first submap. crosses: covariance of each pose
+    with the one before it, of the first one with the start.
     """
 
     poses: Float[np.ndarray, "K 3"]
@@ -78,7 +78,7 @@ class Agreement(NamedTuple):
     An inter-robot measurement counts for its observer, a discounted landmark by its weight. Without
     a robust loss the total dof is the sum of the dimensions of submaps, inter-robot measurements
     and priors less the number of unknowns. A chi2/dof that stays above 1.1 is a warning; above 1.3
-    the covariances can not be trusted.
+    the covariances cannot be trusted.
     """
 
     chi2: float
@@ -88,16 +88,15 @@ class Agreement(NamedTuple):
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
-    """The estimates of the errors that each stream's submaps share, in the island that the stream
-    is in.
+    """Estimate the errors that each stream's submaps share, in the stream's island.
 
-    Each is the sum of the robot's own error and of the one that the team has in common.
+    Each is the sum of the robot's own error and the team's common one.
     """
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
 
 _BIASES: WeakKeyDictionary[Island, list[BiasEstimate]] = WeakKeyDictionary()
-"""The biases of islands that are still there: a map's message and its priors ask for the same."""
+"""Cache of the biases of present islands: a map's message and its priors use the same."""
 
 
 def _biases_in(island: Island) -> list[BiasEstimate]:
@@ -108,7 +107,6 @@ def _biases_in(island: Island) -> list[BiasEstimate]:
 
 
 def _found_biases(island: Island) -> list[BiasEstimate]:
-    """The biases of an island, from one joint covariance with those that the team has in common."""
     common = island.graph.common
     own = sorted(island.graph.biases.items())
     joined = [(node, common[bias]) for (_, bias), node in own if bias in common]
@@ -130,11 +128,11 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
-    """Ids of the main island's landmarks that `submaps` believed submaps or more contain; of
-    unnamed landmarks as many as the larger of `submaps` and `unnamed`.
+    """List the main island's landmarks in at least `submaps` believed submaps; for unnamed ones, in
+    the larger of `submaps` and `unnamed`.
 
     A submap is believed where the robust loss does not discount its landmark below BELIEVED: of two
-    contradictory observations only one is believed, and nothing confirms it.
+    contradictory observations at most one is believed, and neither confirms the other.
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
@@ -154,8 +152,8 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
-    """The main island's landmarks (all, or those with the given ids) with their joint
-    covariance, `landmark_sigma` included.
+    """Return the main island's landmarks (all, or those given) with joint covariance,
+    `landmark_sigma` included.
     """
     chosen = known(fold.main) if ids is None else sorted(ids)
     mean, covariance = joint(fold.main, [], chosen)
@@ -164,10 +162,8 @@ def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
 
 
 def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
-    """The main island's landmarks (all, or those with the given ids), each with its own covariance,
-    `landmark_sigma` included.
-
-    By selected inversion of the information matrix.
+    """Return the main island's landmarks (all, or those given), each with its own covariance,
+    `landmark_sigma` included, by selected inversion of the information matrix.
     """
     island = fold.main
     own = island.settings.landmark_sigma**2 * np.eye(2)
@@ -179,16 +175,14 @@ def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlo
 def prior_for(
     fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
 ) -> RobotPrior:
-    """The prior with which a robot computes its pose: its last end pose and the landmarks,
-    jointly.
-    """
+    """Make a robot's prior: its last end pose and the landmarks, jointly."""
     stream, island = (robot, incarnation), fold.island(robot, incarnation)
     chosen = known(island) if ids is None else sorted(ids)
     return _priors_in(island, {stream: chosen})[stream]
 
 
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
-    """The end pose of the stream's last submap, in the frame of its island."""
+    """Return the end pose of the stream's last submap, in the frame of its island."""
     island = fold.islands[fold.home[stream]]
     return _mean(island, island.graph.streams[stream][-1])
 
@@ -199,12 +193,11 @@ def main_priors(
     most: int | None = None,
     chosen: Sequence[int] | None = None,
 ) -> dict[Stream, RobotPrior]:
-    """The priors (`prior_for`) of some streams of the main island.
+    """Make the priors (`prior_for`) of some streams of the main island.
 
-    chosen: the landmarks by ascending id; None: all.
-    most: largest number of landmarks of a prior, which are then those nearest to its pose. A
-        landmark that is not in a robot's prior is new to the robot until the next one: its pose is
-        less accurate, and as consistent.
+    chosen: the landmarks by ascending id; None: all. most: largest number of landmarks of a prior,
+    those nearest to its pose. A landmark outside a robot's prior is new to the robot until the next
+    one: its pose is less accurate, and as consistent.
     """
     island = fold.main
     ids = np.array(known(island) if chosen is None else chosen)
@@ -222,7 +215,6 @@ def main_priors(
 def _priors_in(
     island: Island, landmarks_of: Mapping[Stream, Sequence[int]]
 ) -> dict[Stream, RobotPrior]:
-    """A prior of each stream with the given landmarks, ascending; one solve for all of them."""
     streams = island.graph.streams
     found = joints(island, [([streams[of][-1]], ids) for of, ids in landmarks_of.items()])
     biases = _biases_in(island)
@@ -240,7 +232,7 @@ def _priors_in(
 
 
 def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
-    """The end poses of a stream's submaps, in the frame of its island."""
+    """Return the end poses of a stream's submaps, in the frame of its island."""
     island = fold.island(robot, incarnation)
     nodes = island.graph.streams[(robot, incarnation)]
     (start, start_covariance), *ends = (_own_marginal(island, node) for node in nodes)
@@ -254,7 +246,6 @@ def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
 
 
 def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
-    """Covariance between two poses that one submap connects."""
     if island.graph.fixed[row] or island.graph.fixed[column]:
         return np.zeros((3, 3))
     return island.graph.pattern.block(island.selected_covariance, row, column)
@@ -263,8 +254,8 @@ def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
 class Terms(NamedTuple):
     """The agreement of each factor, in the graph's order.
 
-    submaps: costs without discounting.
-    counted, priors, sightings: (robot, w χ², dof) as they enter the joint cost.
+    submaps: costs without discounting. counted, priors, sightings: (robot, w χ², dof) as they enter
+    the joint cost.
     """
 
     submaps: list[SubmapCost]
@@ -274,11 +265,11 @@ class Terms(NamedTuple):
 
 
 _TERMS: WeakKeyDictionary[Island, Terms] = WeakKeyDictionary()
-"""The terms of islands that are still there: a broadcast and the next tick ask for the same."""
+"""Cache of the terms of present islands, for a broadcast and the next tick."""
 
 
 def terms(island: Island) -> Terms:
-    """How well each factor of an island agrees with the rest."""
+    """Evaluate the agreement of each factor of an island with the rest."""
     found = _TERMS.get(island)
     if found is None:
         found = _TERMS[island] = _terms(island)
@@ -313,10 +304,9 @@ def _terms(island: Island) -> Terms:
 
 
 def joint_cost(fold: Fold) -> Agreement:
-    """The agreement of the main island's submaps, at the present estimate.
+    """Evaluate the agreement of the main island's submaps, at the present estimate.
 
-    Condensed submaps count with their costs at the moment of condensing; only the newest of them
-    are listed.
+    Condensed submaps count with their costs at condensing; only the newest of them are listed.
     """
     found = terms(fold.main)
     old = fold.main.graph.condensed

@@ -1,10 +1,10 @@
-"""Marker errors of landmarks without a name, as states of the full solution.
+"""Marker errors of unnamed landmarks, as states of the full solution.
 
 A sensor that derives the distance from an object's size or height measures each landmark too far by
 a constant share of the range, the same for all robots (`CommonBiasSigmas.marker`). The share
-belongs to the landmark, with or without a name. The states are added when association has ended:
-before, each part of one landmark would have an error of its own, which would weaken the evidence
-that the parts are one landmark or two.
+belongs to the landmark, named or not. The states are added after association: before, each part of
+one landmark would have an error of its own, which would weaken the evidence that the parts are one
+landmark or two.
 """
 
 from collections.abc import Mapping
@@ -19,8 +19,8 @@ from team.estimation.map_joining.submap_graph import RANGE_POWER, CommonError, J
 
 
 def add_markers(island: Island) -> Island:
-    """Add a state for the marker of each landmark without a name that has none; an island with
-    condensed submaps is unchanged.
+    """Add a marker state to each unnamed landmark without one; an island with condensed submaps is
+    unchanged.
     """
     graph, number = island.graph, _find_unmarked(island)
     if not number or graph.condensed is not None:
@@ -47,7 +47,7 @@ def add_markers(island: Island) -> Island:
 
 
 def warn_of_unmarked(island: Island) -> list[str]:
-    """Warn, in words, of landmarks whose marker error is not a state of the full solution."""
+    """Warn of landmarks whose marker error is not a state of the full solution."""
     graph, count = island.graph, len(_find_unmarked(island))
     if not count or not any(bias == "range_scale" for _, bias in graph.biases):
         return []
@@ -58,8 +58,8 @@ def warn_of_unmarked(island: Island) -> list[str]:
 
 
 def _find_unmarked(island: Island) -> dict[int, int]:
-    """Find the nodes of landmarks without a name that have no state for their marker, with their
-    numbers; none where the settings have no marker errors.
+    """Find the nodes and numbers of unnamed landmarks without a marker state; none where the
+    settings have no marker errors.
     """
     graph = island.graph
     if "marker" not in island.settings.common_bias_sigma:
@@ -72,7 +72,6 @@ def _find_unmarked(island: Island) -> dict[int, int]:
 
 
 def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
-    """List the numbers of a submap's landmarks with a new marker, in its order."""
     if "range_scale" not in submap.contribution.local.biases:
         return []
     return [number[node] for node in submap.landmarks.tolist() if node in number]

@@ -1,16 +1,15 @@
-"""What association needs of condensed submaps: landmarks seen together, places looked at.
+"""The observations of condensed submaps for association: landmarks seen together, viewed places.
 
-A condensed submap's measurements are in the quadratic. Association asks of it what no quadratic
-has: which landmarks it has, which of them a keyframe saw together, and by that where it looked. The
-newest MOST submaps of each landmark are remembered whole, and no others: how many they are depends
-on the landmarks, not on the duration of the run. Whatever counts submaps counts no farther than
-that. Of the forgotten ones the pairs of landmarks remain that they kept apart.
+A condensed submap's measurements are in the quadratic. Association also needs its landmarks, which
+of them a keyframe saw together, and thereby the viewed area. Only the newest MOST submaps of each
+landmark are stored, whole: their number depends on the landmarks, not on the duration of the run,
+and counts of submaps end there. Of older ones the pairs of landmarks that they kept apart remain.
 
-False detections found landmarks that hardly anything observes again; remembered for ever, they
-would slow a team down for as long as it runs. A landmark of n < MOST submaps is given up when every
-landmark of MOST or more, that was observed with it when it was observed last, has been observed by
-MOST n submaps since: of those that look there fewer than one in MOST have found it. What is there
-nevertheless is founded anew when it is observed.
+False detections create landmarks that hardly any submap observes again and that would slow a team
+down for good. A landmark of n < MOST submaps is dropped when every landmark of MOST or more, that
+was observed with it when it was last observed, has been observed by MOST n submaps since: fewer
+than one in MOST of the submaps that look there found it. A real landmark there is created anew when
+it is observed.
 """
 
 from collections.abc import Sequence
@@ -25,17 +24,17 @@ from team.estimation.contribution import Observation
 Indices = Int64[np.ndarray, " _"]
 
 MOST = 8
-"""Number of newest condensed submaps of each landmark that are remembered."""
+"""Number of newest condensed submaps stored for each landmark."""
 
 
 NO_COUNTS: Indices = np.zeros(0, np.int64)
 
 
 class Observed(NamedTuple):
-    """A submap, and the node of each of its landmarks; −1 for one that was given up.
+    """A submap, and the node of each of its landmarks; −1 for a dropped one.
 
-    counts: of each landmark, how many condensed submaps had it, this one included; none of a submap
-        that is not condensed.
+    counts: number of condensed submaps with each landmark, this one included; none if not
+    condensed.
     """
 
     observation: Observation
@@ -44,17 +43,16 @@ class Observed(NamedTuple):
 
     @property
     def known(self) -> Indices:
-        """The nodes of its landmarks without those that were given up."""
+        """The nodes of its landmarks without the dropped ones."""
         return self.landmarks[self.landmarks >= 0]
 
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """The condensed submaps that are remembered, and the pairs of the forgotten ones.
+    """The stored condensed submaps, and the pairs of forgotten ones.
 
-    submaps: oldest first.
-    pairs: two landmarks that one forgotten submap had, by their nodes, the smaller one first.
-    distinct: which of them are known to be two (`LocalMap.distinct`).
+    submaps: oldest first. pairs: two landmarks of one forgotten submap, by their nodes, the smaller
+    one first. distinct: which of them are known to be two (`LocalMap.distinct`).
     """
 
     submaps: tuple[Observed, ...] = ()
@@ -62,21 +60,19 @@ class Memory:
     distinct: Bool[np.ndarray, " P"] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def renumbered(self, node_of: Indices) -> "Memory":
-        """The same with other numbers of nodes, −1 for one that is given up; two landmarks that
-        become one are no pair.
-        """
+        """Renumber the nodes, −1 for a dropped one; two landmarks that become one are no pair."""
         to = np.append(node_of, -1)
         submaps = tuple(each._replace(landmarks=to[each.landmarks]) for each in self.submaps)
         return replace(_unique(to[self.pairs], self.distinct), submaps=submaps)
 
     def longer(self, submaps: Sequence[Observed]) -> "Memory":
-        """With these submaps behind the others."""
+        """Append submaps."""
         return replace(self, submaps=(*self.submaps, *submaps))
 
     def given_up(self, counts: Indices, stays: Bool[np.ndarray, " nodes"], most: int) -> Indices:
-        """The nodes of the landmarks that are given up, ascending.
+        """List the nodes of the landmarks to drop, ascending.
 
-        counts: by node, how many condensed submaps have had it. stays: which are not given up.
+        counts: number of condensed submaps by node. stays: landmarks that are not dropped.
         """
         if not self.submaps:
             return np.zeros(0, np.int64)
@@ -96,7 +92,7 @@ class Memory:
         return np.unique(node[gone])
 
     def shortened(self, nodes: int, most: int) -> "Memory":
-        """Without the submaps that are among the newest `most` of none of their landmarks.
+        """Drop the submaps that are among the newest `most` of none of their landmarks.
 
         nodes: number of nodes of the graph.
         """
@@ -124,7 +120,7 @@ NOTHING = Memory()
 
 
 def _unique(pairs: Int64[np.ndarray, "P 2"], distinct: Bool[np.ndarray, " P"]) -> Memory:
-    """Each pair once, ascending; it is distinct if it was once so."""
+    """Keep each pair once, ascending, distinct if any of its copies is."""
     if not len(pairs):
         return NOTHING
     pairs = np.sort(pairs, axis=1)

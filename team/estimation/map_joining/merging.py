@@ -1,11 +1,10 @@
-"""Merges two islands when the points that both know leave a single likely place for one in the
-other.
+"""Merge two islands when their common points leave a single likely place of one in the other.
 
 A merge is tried from every place that the shared points propose: from all of them, from the
 landmarks alone, from the inter-robot measurements alone, and at every heading at which the points
-fit well. Each attempt is solved in full, and so is a start that does not depend on any of them
-(`minima`). The solution of lowest cost is accepted if the two maps do not disagree there and no
-other place is about as likely; else the merge is deferred, with the reason.
+fit well. Each attempt is solved in full, and so is a start independent of them (`minima`). The
+solution of lowest cost is accepted if the two maps agree there and no other place is about as
+likely; else the merge is deferred, with the reason.
 """
 
 from collections.abc import Sequence
@@ -27,13 +26,11 @@ from team.estimation.map_joining.minima import Minimum, Search, minimum, searche
 from team.estimation.map_joining.submap_graph import encounter_of, merged
 
 WORTH_TELLING = 1.0
-"""Gain in χ² below which a search is not reported: it found the place of the first guess."""
+"""Least gain in χ² for which a search is reported: below, it found the place of the first guess."""
 
 
 class Merge(NamedTuple):
-    """The merged island, the inter-robot measurements that still wait, and the certainty in
-    words.
-    """
+    """The merged island, the waiting inter-robot measurements, and the certainty in words."""
 
     best: Minimum
     waiting: tuple[InterRobotFactor, ...]
@@ -41,21 +38,23 @@ class Merge(NamedTuple):
 
 
 class Waits(NamedTuple):
-    """Why two islands stay apart; after_search: whether that took a (slow) search over places."""
+    """The reason for two separate islands; after_search: whether it took a (slow) search over
+    places.
+    """
 
     why: str
     after_search: bool
 
 
 def ages(count: int) -> Int64[np.ndarray, " count"]:
-    """The ages of `count` new factors: 0."""
+    """Ages of new factors: 0."""
     return np.zeros(count, dtype=np.int64)
 
 
 def sighted(
     island: Island, waiting: Sequence[InterRobotFactor]
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """The island with the inter-robot measurements between its own pose nodes, and the remaining
+    """Add the inter-robot measurements between an island's own pose nodes; return the remaining
     ones.
     """
     candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
@@ -69,10 +68,10 @@ def sighted(
 
 
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
-    """Merges the other island into the main one's frame, or returns why that has to wait.
+    """Merge the other island into the main one's frame, or return the reason to wait.
 
-    The merge also waits where the numbers of the shared points allow no solution, and where submaps
-    of the other island are condensed, in a frame that could not be transformed.
+    The merge also waits where the shared points allow no solution, and where submaps of the other
+    island are condensed, in a frame that cannot be transformed.
     """
     if other.graph.condensed is not None:
         return Waits("its submaps are condensed in a frame of their own", after_search=False)
@@ -112,7 +111,7 @@ def placed(
     main_from_other: Float[np.ndarray, "3"],
     waiting: Sequence[InterRobotFactor],
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """Both islands as one, with every factor's robust scale at its beginning."""
+    """Join both islands, with every factor's robust scale at its beginning."""
     graph, state = merged(main.graph, main.state, other.graph, other.state, main_from_other)
     new = ages(len(graph.submaps)), ages(len(graph.sightings))
     return sighted(Island(graph, state, *new, main.settings), waiting)
@@ -121,7 +120,7 @@ def placed(
 def _places(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> list[Float[np.ndarray, "3"]]:
-    """Further places of the other island that its shared points propose."""
+    """Propose further places of the other island from its shared points."""
     by_landmarks = [tie for tie in tied if tie.seen is None]
     by_sightings = [tie for tie in tied if tie.seen is not None]
     proposed: list[Alignment | None] = []
@@ -139,7 +138,7 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
-    """The reason to defer a merge: another place is about as likely."""
+    """Word the reason to defer a merge: another place is about as likely."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
         f"{shared} leave two places {elementwise.hypot(away[0], away[1]):.1f} m apart: "
@@ -148,7 +147,7 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
 
 
 def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
-    """By what an island was merged, and how certain its place is."""
+    """Describe the ties by which an island was merged, and the certainty of its place."""
     node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
     sigma_m = deviation(covariance[0, 0] + covariance[1, 1])

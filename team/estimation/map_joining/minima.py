@@ -1,9 +1,9 @@
-"""The search for the lowest minimum: the same island solved from several starts.
+"""The search for the lowest minimum: one island solved from several starts.
 
-Headings make map joining a problem with many minima: after a long way without a landmark
-Gauss-Newton may fold a chain wrongly and stay there. A cost far above its degrees of freedom
-reveals that; so does another start that ends lower. A second minimum of about the same cost is a
-second map that the same submaps allow.
+Headings give map joining many minima: after a long way without a landmark Gauss-Newton may fold a
+chain wrongly and stay there. A cost far above its degrees of freedom reveals that; so does another
+start that ends lower. A second minimum of about the same cost is a second map that the same submaps
+allow.
 """
 
 import math
@@ -39,7 +39,7 @@ from team.estimation.sparse_cholesky import sparse_kernel
 Values = Float[np.ndarray, " _"]
 
 LIKELY = 0.999
-"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a second minimum
+"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a minimum
 unlikely.
 """
 SUSPICIOUS = 1.3
@@ -47,17 +47,17 @@ SUSPICIOUS = 1.3
 Gaussian.
 """
 SETTLED_M = 1e-3
-"""Length of the last step [m, rad] above which a solution is not a minimum yet."""
+"""Length of the last step [m, rad] above which a solution is not yet a minimum."""
 MORE_SOLUTIONS = 4
-"""Number of further solutions of the best start before it is reported that it does not settle."""
+"""Further solutions of the best start before it is reported as not settling."""
 FEW_LANDMARKS = 6
-"""Number of landmarks up to which a chain may fold wrongly at a cost that is not suspicious."""
+"""Most landmarks with which a chain may fold wrongly at an unsuspicious cost."""
 WIDE = 30.0
 """Cauchy's scale at which the annealed start begins."""
 
 
 class Minimum(NamedTuple):
-    """A full solution with its number of iterations, its last change [m, rad] and its cost."""
+    """A full solution with its number of iterations, last change [m, rad] and cost."""
 
     island: Island
     iterations: int
@@ -66,10 +66,8 @@ class Minimum(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The lowest minimum; how far it lies below that of the first start, and below a second
-    minimum.
-
-    second: None where no second minimum was found.
+    """The lowest minimum; its distance in cost below that of the first start, and below a second
+    minimum (None where none was found).
     """
 
     best: Minimum
@@ -83,7 +81,7 @@ class Search(NamedTuple):
 
 
 def minimum(island: Island) -> Minimum:
-    """The full solution from the island's state."""
+    """Solve in full from the island's state."""
     solved, iterations, change = settled(island)
     return Minimum(solved, iterations, change, final_cost(solved))
 
@@ -98,7 +96,7 @@ def degrees_of_freedom(island: Island) -> int:
 
 
 def suspicious(island: Island, cost: float) -> bool:
-    """Whether the cost is far above what its degrees of freedom allow."""
+    """Whether the cost is far above its degrees of freedom."""
     dof = degrees_of_freedom(island)
     return dof > 0 and cost > max(SUSPICIOUS * dof, _quantile(dof))
 
@@ -114,12 +112,13 @@ def likely_rise() -> float:
 
 
 def searched(starts: Sequence[Island]) -> Search:
-    """The lowest minimum from several starts of one graph, and from the relaxation of its headings.
+    """Find the lowest minimum from several starts of one graph, and from the relaxation of its
+    headings.
 
-    The first start is the one that would be used without a search. While the lowest cost is
-    suspicious, and always with few landmarks, two more kinds of starts are tried: without the
-    inter-robot measurements, and with every factor's robust scale wide. A start that leads to no
-    solution is left out; raises NotDeterminedError where none leads to one.
+    The first start is the one used without a search. While the lowest cost is suspicious, and
+    always with few landmarks, two more kinds of starts are tried: without the inter-robot
+    measurements, and with every factor's robust scale wide. A start without a solution is left out;
+    raises NotDeterminedError where none has one.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     found = list(_minima(starts))
@@ -133,9 +132,6 @@ def searched(starts: Sequence[Island]) -> Search:
 
 
 def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
-    """The minima of the starts that have a solution: a start without one does not end the
-    search.
-    """
     for start in starts:
         found = None
         with suppress(*UNSOLVABLE), np.errstate(all="ignore"):
@@ -145,7 +141,7 @@ def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
 
 
 def widened(search: Search) -> Search:
-    """The search extended by the minima next to the best one, where landmarks are few.
+    """Extend the search by the minima next to the best one, where landmarks are few.
 
     Each uncertain heading of a first or last pose is moved as far as is likely, and each stream is
     mirrored between two landmarks, since a chain may fold over to the other side of the line
@@ -164,7 +160,7 @@ def widened(search: Search) -> Search:
 
 
 def _mirrored(island: Island) -> Iterator[Island]:
-    """The island with a stream's poses mirrored at the line through two landmarks.
+    """Mirror a stream's poses at the line through two landmarks.
 
     With the line's direction α: p' = a + R(2α) conj(p − a), θ' = 2α − θ.
     """
@@ -188,8 +184,8 @@ def _mirrored(island: Island) -> Iterator[Island]:
 
 
 def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
-    """Pairs of landmarks, by their indices in the state, that a stream observes one after the
-    other.
+    """List pairs of landmarks, by their indices in the state, that a stream observes in
+    succession.
     """
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
@@ -203,9 +199,7 @@ def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
 
 
 def _lowest(found: Sequence[Minimum]) -> Search:
-    """The lowest of the minima of one graph; the first is the one of the start used without a
-    search.
-    """
+    """Select the lowest minimum of one graph; the first is from the start used without a search."""
     best = _at_rest(min(found, key=lambda each: each.cost))
     others = [each for each in found if each.change < SETTLED_M and is_another_minimum(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
@@ -213,9 +207,9 @@ def _lowest(found: Sequence[Minimum]) -> Search:
 
 
 def _further(island: Island) -> Iterator[Island]:
-    """Starts that do not depend on the island's state, the most promising first.
+    """Make starts independent of the island's state, the most promising first.
 
-    There are none where submaps are condensed, since the condensed factor depends on that state.
+    There are none with condensed submaps, whose factor depends on that state.
     """
     graph = island.graph
     if graph.condensed is not None:
@@ -238,7 +232,7 @@ def _further(island: Island) -> Iterator[Island]:
 
 
 def _at_rest(best: Minimum) -> Minimum:
-    """The minimum after further solutions from its own state, until it has settled."""
+    """Solve a minimum further from its own state, until it has settled."""
     for _ in range(MORE_SOLUTIONS):
         if best.change <= SETTLED_M:
             break
@@ -248,7 +242,7 @@ def _at_rest(best: Minimum) -> Minimum:
 
 
 def is_another_minimum(one: Minimum, best: Minimum) -> bool:
-    """Whether a minimum is another map, rather than a state that the best one's covariance allows.
+    """Whether a minimum is another map, rather than a state within the best one's covariance.
 
     With the difference d of the states and the information A at the best one, A alone predicts a
     rise of the cost by dᵀAd between them.
@@ -273,7 +267,7 @@ def _quadratic(island: Island, x: Values) -> float:
 
 
 def warnings(search: Search) -> list[str]:
-    """Warnings for the map's user about its minimum, in words; empty where it is the only one."""
+    """Warn the map's user about its minimum; empty where it is the only one."""
     island, found = search.best.island, []
     dof = degrees_of_freedom(island)
     if suspicious(island, search.best.cost):
@@ -310,7 +304,6 @@ def warnings(search: Search) -> list[str]:
 
 
 def _heading_sigmas(island: Island) -> dict[Stream, float]:
-    """For each stream the standard deviation [rad] of its best known heading."""
     return {
         stream: min(heading_sigma(island, node) for node in nodes)
         for stream, nodes in island.graph.streams.items()

@@ -1,4 +1,4 @@
-"""Finds the landmark that its submaps place most differently: moved, or two of one name."""
+"""Find the landmark that its submaps place most differently: moved, or two of one name."""
 
 from typing import NamedTuple
 
@@ -9,11 +9,11 @@ from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining.gauss_newton import Island
 
 LEAST_SUBMAPS = 4
-"""Least number of submaps of a landmark for it to be judged."""
+"""Least number of submaps of a landmark to be judged."""
 BEYOND = 5.0
 """Least cost per degree of freedom of a misfit, and least multiple of the landmarks' median.
 
-Of LEAST_SUBMAPS right submaps the mean is as large with probability P(χ²₈ ≥ 40) = 3·10⁻⁶.
+The mean of LEAST_SUBMAPS sound submaps exceeds it with probability P(χ²₈ ≥ 40) = 3·10⁻⁶.
 """
 FAR = 30.0
 """χ² of two numbers from which a submap has the landmark elsewhere, in units of the median cost
@@ -21,10 +21,9 @@ where that is above 1: P(χ²₂ ≥ 30) = 3·10⁻⁷.
 """
 LEAST_FAR = 2
 STRAY = 0.1
-"""A landmark is a misfit where at least LEAST_FAR of its submaps, and this share, have it
-elsewhere: of fewer a misread detection is the likelier cause, and the landmark is where the map has
-it. Markers that are misread easily have up to 6 of 177 submaps elsewhere (UTIAS set 2, landmark 15,
-whose place is right to 2 mm).
+"""Share of a misfit's submaps, LEAST_FAR at least, that have it elsewhere. With fewer a misread
+detection is likelier, and the landmark's place is right: markers that are misread easily have up to
+6 of 177 submaps elsewhere (UTIAS set 2, landmark 15, whose place is right to 2 mm).
 """
 
 
@@ -37,12 +36,11 @@ class Misfit(NamedTuple):
 
 
 def worst_landmark(island: Island) -> Misfit | None:
-    """The named landmark with the largest cost per degree of freedom, where it stands out.
+    """Find the named landmark with the largest cost per degree of freedom, where it stands out.
 
-    The cost of landmark l is the mean over its submaps of rᵀ(f P_ll)⁻¹r/2, without discounting. All
-    landmarks that misfit alike are a matter of the sensor's noise, not of one of them. A share of
-    its submaps must have it elsewhere (FAR), so that a misread detection, which costs as much, is
-    not taken for it.
+    The cost of landmark l is the mean over its submaps of rᵀ(f P_ll)⁻¹r/2, without discounting.
+    Landmarks that all misfit alike point to the sensor's noise. A share of its submaps must have it
+    elsewhere (FAR), to exclude a misread detection, which costs as much.
     """
     graph = island.graph
     if not graph.submaps:

@@ -1,10 +1,10 @@
-"""Detects a pose covariance that understates the uncertainty: a curved valley of the cost.
+"""Detect a pose covariance that understates the uncertainty: a curved valley of the cost.
 
-One heading is moved away from its best value and everything else is solved for given that: the
+One heading is displaced from its best value and everything else is solved for given that: the
 profile of the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise equals the χ² of
 the displacement by the pose's own covariance. After a long way without a landmark that χ² may be
-ten times the rise: the robot may well be at a place that its covariance excludes, though the
-minimum is right.
+ten times the rise: the robot may be at a place that its covariance excludes, though the minimum is
+right.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,9 @@ STEPS = (1.0, 2.0, 3.0)
 """Displacements of a heading, in its standard deviations."""
 ITERATIONS = 4
 SHORTEST = 0.01
-"""Squared length in standard deviations of a step that is the last one: the cost, whose rises are
-reported to a tenth, changes by less behind it."""
+"""Squared length, in standard deviations, of the last step: shorter ones change the cost, whose
+rises are reported to a tenth, by less.
+"""
 STRAIGHT_RAD = 0.1
 """Standard deviation [rad] of a heading below which the cost is taken as quadratic."""
 BENT = 4.0
@@ -37,16 +38,13 @@ BENT = 4.0
 by half.
 """
 UNLIKELY = 10.8275661707
-"""Rise of the cost beyond which a place is not considered: 99.9 % quantile of χ² of 1.
-
-`chi2_limit(1, 1e-3)`; a robot needs none of the library that would compute it.
+"""Rise of the cost beyond which a place is not considered: `chi2_limit(1, 1e-3)`, the 99.9 %
+quantile of χ² of 1.
 """
 
 
 class UnderstatedUncertainty(NamedTuple):
-    """A displacement [m] of a pose with the rise of the cost there, and the χ² by the pose's
-    covariance.
-    """
+    """A displacement [m] of a pose, the rise of the cost there, and χ² by the pose's covariance."""
 
     distance: float
     rise: float
@@ -59,7 +57,7 @@ class UnderstatedUncertainty(NamedTuple):
 
 
 def heading_sigma(island: Island, node: int) -> float:
-    """The standard deviation [rad] of a pose's heading; 0 of a pose that is given."""
+    """Standard deviation [rad] of a pose's heading; 0 for a given pose."""
     graph = island.graph
     if graph.fixed[node]:
         return 0.0
@@ -67,7 +65,7 @@ def heading_sigma(island: Island, node: int) -> float:
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
-    """The likely islands with one pose's heading displaced, each with the rise of its cost.
+    """Profile the cost: likely islands with one pose's heading displaced, and the rise of each.
 
     Empty where the heading is known too well for a curved valley.
     """
@@ -89,7 +87,7 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
 
 
 def ends(island: Island) -> list[tuple[Stream, str, int]]:
-    """First and last pose of every stream that are not given, each with the word for it."""
+    """List the first and last pose of every stream unless given, each with the word for it."""
     return [
         (stream, where, nodes[k])
         for stream, nodes in sorted(island.graph.streams.items())
@@ -99,9 +97,8 @@ def ends(island: Island) -> list[tuple[Stream, str, int]]:
 
 
 def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty | None:
-    """The likely place of a pose that its covariance underrates most, for an island at its minimum.
-
-    None where the covariance allows for all of them.
+    """Find the likely place of a pose that its covariance underrates most, for an island at its
+    minimum; None where the covariance allows for all of them.
     """
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
@@ -125,9 +122,9 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
 
 
 def nonlinearity_warnings(island: Island) -> list[str]:
-    """Warns where the covariance of a first or last pose understates its uncertainty.
+    """Warn where the covariance of a first or last pose understates its uncertainty.
 
-    Examines every stream without a given initial pose: profile cost against chi-square.
+    Examines every stream without a given initial pose.
     """
     texts = []
     for stream, where, node in ends(island):

@@ -1,10 +1,9 @@
 """The quadratic of factors at the present state, with the old poses eliminated run by run.
 
 A stream's old poses are a chain: a run of them is connected with the landmarks seen along it and
-with the poses at its ends. Runs are therefore eliminated one after the other, each from a dense
-quadratic over what it is connected with, and what is left of one run is a factor of the next
-(George 1973, SIAM J. Numer. Anal. 10(2), by blocks). All at once the same elimination would be of a
-dense matrix of all poses and landmarks.
+the poses at its ends. Runs are therefore eliminated one after the other, each from a dense
+quadratic over its neighbours, and the rest of one run is a factor of the next (George 1973, SIAM J.
+Numer. Anal. 10(2), by blocks). At once it would take a dense matrix of all poses and landmarks.
 """
 
 from collections import defaultdict
@@ -39,7 +38,7 @@ class MarkedFactors(NamedTuple):
 
 
 class Left(NamedTuple):
-    """A quadratic over some nodes, ascending: what eliminating others has left."""
+    """A quadratic over some nodes, ascending, left by the elimination of others."""
 
     nodes: Indices
     information: Matrix
@@ -51,7 +50,7 @@ def quadratic(
     union: Indices,
     factors: MarkedFactors,
 ) -> tuple[Matrix, Values, float]:
-    """Matrix A, half the gradient and the cost of these factors and of the condensed one, over the
+    """Sum these factors and the condensed one to matrix A, half the gradient and the cost, over the
     union of their nodes.
     """
     leaving, seen, prior = factors
@@ -105,11 +104,10 @@ def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) 
 def without_paths(
     island: Island, union: Indices, factors: MarkedFactors, eliminated: Bool[np.ndarray, " _"]
 ) -> tuple[Indices, Matrix, Values, float]:
-    """The quadratic of the factors without the eliminated poses: its nodes, A, half the gradient
-    and the cost, less what the poses' elimination lowers it by. Nothing is condensed yet.
+    """Eliminate poses from the factors' quadratic; return its nodes, A, half the gradient and the
+    cost, lowered by the elimination. The graph must have no condensed factor.
 
-    union: the factors' nodes, but for constants. eliminated: marks of nodes; of these, landmarks
-        stay.
+    union: the factors' nodes, but for constants. eliminated: marks of nodes; landmarks stay.
     """
     graph = island.graph
     sizes, total = np.diff(graph.offset), 0.0
@@ -140,7 +138,6 @@ def without_paths(
 
 
 def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]]:
-    """The marked submaps of each stream, by runs."""
     streams: dict[Stream, list[int]] = defaultdict(list)
     for f in np.flatnonzero(leaving).tolist():
         streams[island.graph.submaps[f].contribution.stream].append(f)
@@ -152,7 +149,6 @@ def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]
 def _of_run(
     island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: MarkedFactors
 ) -> MarkedFactors:
-    """A run's submaps, and what else contains one of its eliminated poses."""
     graph = island.graph
     submaps = np.zeros(len(graph.submaps), np.bool_)
     submaps[run] = True
@@ -162,7 +158,7 @@ def _of_run(
 
 
 def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) -> Indices:
-    """The nodes of factors, and `others`, ascending, but for constants."""
+    """List the nodes of factors, and `others`, ascending, but for constants."""
     graph = island.graph
     touched = [*others]
     touched += [graph.submaps[f].nodes for f in np.flatnonzero(factors.submaps)]
@@ -174,7 +170,7 @@ def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) 
 
 
 def _add(H: Matrix, g: Values, sizes: Indices, nodes: Indices, left: list[Left]) -> None:
-    """Adds quadratics over parts of these nodes."""
+    """Add quadratics over parts of these nodes."""
     first = np.concatenate([[0], np.cumsum(sizes[nodes])])
     for each in left:
         within = places(first, np.searchsorted(nodes, each.nodes))

@@ -1,4 +1,4 @@
-"""The priors of a graph, of poses and of biases, all in one compiled call."""
+"""Compiled kernels of the priors of a graph, of poses and of biases."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from team.estimation.geometry import wrapped
 
 class PriorFactors(NamedTuple):
     """The priors N(mean, information⁻¹) of the numbers begin … begin + size − 1 of the state: a
-    pose (x, y, theta) or one number, those of a node. Means and matrices are padded with zeros.
+    pose (x, y, theta) or one number. Means and matrices are padded with zeros.
     """
 
     node: Int64[np.ndarray, " priors"]
@@ -25,7 +25,7 @@ class PriorFactors(NamedTuple):
 def prior_terms(
     state: Float[np.ndarray, " n"], priors: PriorFactors
 ) -> tuple[Float[np.ndarray, "priors 3"], Float[np.ndarray, " priors"]]:
-    """P⁻¹r and rᵀP⁻¹r of each prior; the slope of one of fewer numbers ends in zeros."""
+    """Compute P⁻¹r and rᵀP⁻¹r of each prior, padded with zeros."""
     slopes, chi2 = np.zeros((len(priors.begin), 3)), np.zeros(len(priors.begin))
     r = np.zeros(3)
     for k in range(len(priors.begin)):
@@ -50,8 +50,9 @@ def add_priors(
     weights: Float[np.ndarray, " priors"],
     at: Int64[np.ndarray, " priors"],
 ) -> None:
-    """Adds each prior, times its weight, to half the gradient and to the values of a block pattern;
-    at: where its node's own block begins. slopes: of `prior_terms`.
+    """Add each prior, times its weight, to half the gradient and to the values of a block pattern.
+
+    at: index of its node's diagonal block. slopes: of `prior_terms`.
     """
     for k in range(len(weights)):
         size = priors.size[k]

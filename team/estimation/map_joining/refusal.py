@@ -1,15 +1,14 @@
-"""Adds the members of a tick to a fold; those that allow no solution are refused with a reason.
+"""Add the members of a tick to a fold; refuse those that allow no solution, with a reason.
 
-Whether the normal equations of a set can be solved is not known before it is tried. A tick is
-therefore added as a whole; only if that has no solution are its members added one after the other
-in canonical order, and those that make it unsolvable are left out. The outcome depends on the fold
-before and on the tick's members alone, hence on the set (law 2): any order of arrival gives the
-same refusals.
+Only a trial shows whether the normal equations of a set can be solved. A tick is therefore added as
+a whole; if that has no solution its members are added one by one in canonical order, and those that
+make it unsolvable are left out. The outcome depends on the fold before and on the tick's members
+alone, hence on the set (law 2).
 
-If a submap as a whole allows no solution, its motion alone is tried, the marginal of its end pose,
-so that the robot's later submaps keep their place. Where that fails too, the robot's chain ends:
-later submaps have no place in any frame and are not in the map. An initial pose that allows no
-solution is treated as unknown; an inter-robot measurement is left out.
+If a whole submap allows no solution, its motion alone is tried, the marginal of its end pose, so
+that the robot's later submaps keep their place. Where that fails too, the robot's chain ends: later
+submaps have no place in any frame and are not in the map. An initial pose that allows no solution
+is treated as unknown; an inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,7 +28,7 @@ T = TypeVar("T")
 
 def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
     """Add the tick's members; `refused`, `motion_only`, `left_out` and `set_aside` of the fold list
-    the others.
+    the exceptions.
     """
     fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
     fold, members = _in_reach(fold, tick.contributions, tick.outside)
@@ -44,7 +43,7 @@ def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def refusals(fold: Fold) -> list[str]:
-    """Messages: for each chain the submap at which it ended and how many follow it, then all other
+    """Describe, for each chain, the submap at which it ended and how many follow, then other
     refusals.
     """
     ended: dict[Stream, list[int]] = {}
@@ -62,9 +61,7 @@ def refusals(fold: Fold) -> list[str]:
 def _in_reach(
     fold: Fold, contributions: Sequence[Contribution], outside: Mapping[Key, str]
 ) -> tuple[Fold, list[Contribution]]:
-    """The submaps to be tried; those out of bounds, and those that follow a refused one, are
-    refused.
-    """
+    """Select the submaps to try; refuse those out of bounds, or after a refused one."""
     refused = dict(fold.refused)
     ended = {(robot, incarnation) for _, robot, incarnation, _ in refused}
     members = []
@@ -79,7 +76,6 @@ def _in_reach(
 
 
 def _of_members(sightings: Iterable[InterRobotFactor], fold: Fold) -> list[InterRobotFactor]:
-    """The inter-robot measurements whose submaps are not refused."""
     gone = {key[1:] for key in fold.refused}
     return [each for each in sightings if (*each.stream, each.sequence) not in gone]
 
@@ -91,7 +87,6 @@ def _attempt(
     sightings: Sequence[InterRobotFactor],
     settings: JoinSettings,
 ) -> Fold | None:
-    """The fold after one tick with these members; None where it has no solution."""
     for start in starts:
         fold = started(fold, start)
     try:
@@ -108,9 +103,8 @@ def _attempt(
 
 
 class _Selection:
-    """The members of a tick with which a fold has a solution, found one by one in canonical order.
-
-    The tick as a whole has none.
+    """Selects the members with which a fold has a solution, one by one in canonical order, from a
+    tick that has none as a whole.
     """
 
     def __init__(
@@ -179,9 +173,7 @@ class _Selection:
             self._grow_by_less(fold, block[0])
 
     def _grow_by_less(self, fold: Fold, whole: Contribution) -> None:
-        """Add a part of one submap: without its initial pose, then its motion alone, else
-        nothing.
-        """
+        """Add a part of one submap: without its initial pose, then its motion alone, else none."""
         start = self._starts.pop(whole.stream, None) if whole.sequence == 0 else None
         if start is not None and self._solves(fold, [*self._members, whole]):
             self._members.append(whole)
@@ -205,9 +197,7 @@ class _Selection:
 
 
 def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple[list[T], list[T]]:
-    """Add items one after the other while `works`, by halves; return the accepted and the
-    rejected ones.
-    """
+    """Add items while `works`, by halves; return the accepted and the rejected ones."""
     accepted: list[T] = []
     bad: list[T] = []
 

@@ -1,4 +1,4 @@
-"""A first guess of a whole graph that needs no earlier guess: headings as free vectors.
+"""A first guess of a whole graph without an earlier one: headings as free vectors.
 
 With (c, s) = (cos θ, sin θ) of each pose as two free numbers, a submap's equations are linear,
 
@@ -41,7 +41,7 @@ class _Rows(NamedTuple):
 
 
 def relaxed(graph: Graph, state: Values) -> Values | None:
-    """A state of the graph, in which fixed nodes and biases keep their values; None where
+    """Relax the graph to a new state; fixed nodes and biases keep their values; None if
     undetermined.
     """
     sizes = np.diff(graph.offset).tolist()
@@ -72,7 +72,7 @@ def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
 def _least_squares(
     rows: Sequence[_Rows], numbers: Values, free: Bool[np.ndarray, " _"]
 ) -> Values | None:
-    """The free numbers that minimise the weighted residuals, given the other numbers; None:
+    """Minimise the weighted residuals over the free numbers, given the others; None if
     undetermined.
     """
     from scipy.sparse import csc_array, tril  # slow to import, and no robot uses it
@@ -102,8 +102,8 @@ def _least_squares(
 
 
 def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
-    """The equations of submaps, inter-robot measurements and priors; `at`: first number of each
-    node.
+    """List the equations of submaps, inter-robot measurements and priors; `at`: first number of
+    each node.
     """
     for contribution, nodes, *_ in graph.submaps:
         local, start = contribution.local, int(at[nodes[0]])
@@ -139,7 +139,6 @@ def _points(
     places: Float[np.ndarray, "n 2"],
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
-    """The equations of points with these coordinates in the frame of a start pose."""
     n = len(points)
     numbers = np.empty((2 * n, 4), dtype=np.int64)
     numbers[0::2, 0], numbers[1::2, 0] = points, points + 1
@@ -158,7 +157,6 @@ def _turns(
     angles: Float[np.ndarray, " n"],
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
-    """The equations of headings of these poses relative to a start pose's."""
     n = len(poses)
     s, c = elementwise.sin_and_cos(angles)
     numbers = np.empty((2 * n, 3), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Restores condensed submaps: at a few sizes of the fold, and where a tick contradicts them.
+"""Restore condensed submaps: at a few sizes of the fold, and where a tick contradicts them.
 
 While poses are uncertain, headings still change, and submaps that were linearised at different
 headings contradict each other: the map becomes overconfident. At begin · GROWTH^k submaps, up to
@@ -36,13 +36,11 @@ GROWTH = 1.5
 SETTLED = 1000
 """Number of submaps above which the fold is not linearised again."""
 SOLVED = 3
-"""Number of times that the iterations of a tick are repeated for a fold that is linearised
-again.
-"""
+"""Repetitions of a tick's iterations for a fold that is linearised again."""
 
 
 def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
-    """Return whether the fold passes a size at which all of it is linearised again."""
+    """Whether the fold passes a size at which all of it is linearised again."""
     size = begin * GROWTH
     while size <= min(after, SETTLED):
         if before < size:
@@ -52,7 +50,7 @@ def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
 
 
 def is_contradicted(before: Fold, after: Fold) -> bool:
-    """Return whether a tick changes the condensed submaps by more than their linearisation allows.
+    """Whether a tick changes the condensed submaps by more than their linearisation allows.
 
     That is a closure of unnamed landmarks, the first unnamed landmarks (which may be landmarks of
     condensed submaps), and a new main island, into whose frame the former one will be transformed.
@@ -69,8 +67,8 @@ def restore_submaps(
 ) -> Fold:
     """Restore the condensed submaps as factors, and solve their islands from the present state.
 
-    contributions, sightings: all of the fold's members in canonical order, refused ones included.
-    An island that has no solution then stays as it is.
+    contributions, sightings: all members of the fold in canonical order, refused ones included. An
+    island without a solution then is unchanged.
     """
     for key, island in fold.islands.items():
         old = island.graph.condensed
@@ -130,9 +128,7 @@ def _raw(
     paths: Mapping[Stream, EliminatedPath],
     numbers: Mapping[Key, Sequence[int]],
 ) -> Island:
-    """The graph of all submaps, each node at its state in the island or where it was when
-    condensed.
-    """
+    """Build the graph of all submaps, each node at its state in the island or at condensing."""
     graph, settings = island.graph, island.settings
     full, state = extended(
         EMPTY_GRAPH,

@@ -1,12 +1,12 @@
 """Repetitions: parts of a map that repeat another part, as a copy or in a building that repeats.
 
-A robot that is carried off, or whose odometry slips by metres, maps the mapped landmarks a second
-time, elsewhere. Nothing in the set contradicts it: from there on its submaps share landmarks with
-each other alone, and only odometry connects them with the rest. The shape of the copy remains. For
-each boundary between two submaps of a stream beyond which it observes hardly any landmark of the
-rest, the landmarks that it observes there for the first time are aligned with all others by a rigid
-motion (`voting`). With n of them, N others in an area A, and points that match within r, the
-expected number of motions that match m or more by chance is
+A robot that is carried off, or whose odometry slips by metres, maps mapped landmarks a second time,
+elsewhere. The set contains no contradiction: from there on its submaps share landmarks with each
+other alone, and only odometry connects them with the rest. The shape of the copy remains. For each
+boundary between two submaps of a stream beyond which it observes hardly any landmark of the rest,
+the landmarks first observed beyond it are aligned with all others by a rigid motion (`voting`).
+With n of them, N others in an area A, and points that match within r, the expected number of
+motions that match m or more by chance is
 
     E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
@@ -32,7 +32,7 @@ LEAST_PAIRS = 6
 LEAST_SHARE = 0.5
 """Least share of the landmarks beyond the boundary that repeat others."""
 MOST_SHARED = 0.25
-"""Largest share of the landmarks of the submaps beyond the boundary that the rest has, too."""
+"""Largest share of these submaps' landmarks that the rest has, too."""
 BY_CHANCE = -14.0
 """Largest ln E: one in a million."""
 FARTHER = 4.0
@@ -40,16 +40,16 @@ FARTHER = 4.0
 MOST_POINTS = 400
 """Larger maps are not searched: voting would take seconds."""
 TRIED = 4
-"""Most boundaries of a stream that are examined, those with the smallest shared part first."""
+"""Most boundaries of a stream that are examined, by least shared part."""
 
 
 class Repetition(NamedTuple):
     """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
 
-    ids: all landmarks that only these submaps have. pairs: of them those that match another one.
+    ids: all landmarks that only these submaps have. pairs: those of them that match another one.
     begin_ns, end_ns: the end of the last submap before the boundary, and of the stream's last one.
-    place: of the stream at the boundary (x, y) [m]. displacement: from there to its place if the
-    pairs were one landmark each (x, y) [m], and the turn [rad].
+    place: of the stream at the boundary (x, y) [m]. displacement: the move (x, y) [m] and turn
+    [rad] of that place if the pairs were one landmark each.
     """
 
     stream: Stream
@@ -92,7 +92,6 @@ def _find_in_stream(
     points: Float[np.ndarray, "n 2"],
     ids: list[int],
 ) -> Repetition | None:
-    """Find the repetition of a stream with the smallest shared part; None if there is none."""
     rows = np.flatnonzero(own)
     elsewhere = sees[~own].any(axis=0)
     candidates = []
@@ -134,7 +133,6 @@ def _find_in_stream(
 def _align_beyond_chance(
     own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
 ) -> Vote | None:
-    """Find the motion that matches most points with others; None where chance explains it."""
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
@@ -164,5 +162,4 @@ def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius
 
 
 def _log_choose(n: int, k: int) -> float:
-    """Compute ln of the binomial coefficient."""
     return elementary.log(float(math.comb(n, k)))

@@ -1,10 +1,10 @@
-"""Landmarks come to rest, and wake where a submap observes them.
+"""Landmarks come to rest, and become nodes again where a submap observes them.
 
 A landmark that no raw submap contains occurs in the condensed factor only. Given the factor's other
-nodes it has a Gaussian that later submaps of other places can not change (`Resting`), so it is
+nodes it has a Gaussian that later submaps of other places cannot change (`Resting`), so it is
 eliminated from the quadratic like an old pose; the cost of a tick then depends on the landmarks
-near the robots, not on all of them. What wakes it is the inverse, exactly: with e = x − means −
-gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹ e, and the others that rest are conditioned on it.
+near the robots, not on all of them. The inverse is exact: with e = x − means − gain d ~ N(0, C),
+the quadratic gains eᵀ C⁻¹ e, and the other resting landmarks are conditioned on it.
 """
 
 from collections.abc import Collection
@@ -29,7 +29,8 @@ Matrix = Float[np.ndarray, "n n"]
 
 FIRST = 64
 """Number of landmarks without a raw submap from which landmarks come to rest: fewer cost less as
-nodes."""
+nodes.
+"""
 
 
 class Split(NamedTuple):
@@ -48,7 +49,7 @@ class Split(NamedTuple):
 
 
 def split(H: Matrix, g: Values, out: Marks) -> Split:
-    """Eliminates some numbers from a quadratic (Schur complement)."""
+    """Eliminate some numbers from a quadratic (Schur complement)."""
     remaining = ~out
     if not out.any():
         none = np.zeros((0, 0))
@@ -64,10 +65,10 @@ def split(H: Matrix, g: Values, out: Marks) -> Split:
 
 
 def idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indices:
-    """The nodes of landmarks that come to rest, ascending: no submap that stays contains them, nor
+    """List the nodes of landmarks that come to rest, ascending: in no submap that stays, nor in
     another island, whose landmarks are `apart`.
 
-    None, while nothing rests yet and there are fewer than `first`.
+    None, while no landmark rests yet and there are fewer than `first`.
     """
     seen = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(stays):
@@ -78,8 +79,8 @@ def idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indi
 
 
 def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Resting | None:
-    """The landmarks at rest given the nodes of `union` that remain, with the landmarks `nodes`,
-    which are among those that are eliminated; None if there are none.
+    """Make the resting landmarks given the nodes of `union` that remain, with the eliminated
+    landmarks `nodes`; None if there are none.
     """
     graph, old = island.graph, island.graph.condensed
     if not len(nodes) and (old is None or old.resting is None):
@@ -117,7 +118,7 @@ def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Rest
 
 
 def woken(island: Island, ids: Collection[int]) -> Island:
-    """The island with those of these landmarks that are at rest as nodes again."""
+    """Turn those of these landmarks that are at rest into nodes again."""
     graph = island.graph
     old = graph.condensed
     if old is None or old.resting is None:

@@ -1,4 +1,4 @@
-"""Compiled kernels of landmarks at rest: of their covariance the upper triangle is stored."""
+"""Compiled kernels of resting landmarks, whose covariance is stored as an upper triangle."""
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -12,7 +12,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 @compiled
 def upper_of(upper: Matrix, chosen: Indices, size: int) -> Matrix:
-    """The upper triangle among these ascending numbers, at the corner of a larger matrix."""
+    """Return the upper triangle among these ascending numbers, at the corner of a larger matrix."""
     result = np.zeros((size, size))
     for a in range(len(chosen)):
         source, target = upper[chosen[a]], result[a]
@@ -23,7 +23,7 @@ def upper_of(upper: Matrix, chosen: Indices, size: int) -> Matrix:
 
 @compiled
 def packed_of(upper: Matrix) -> Float[np.ndarray, " _"]:
-    """The upper triangle, row after row."""
+    """Pack the upper triangle, row after row."""
     n = len(upper)
     result = np.empty(n * (n + 1) // 2)
     at = 0
@@ -36,7 +36,7 @@ def packed_of(upper: Matrix) -> Float[np.ndarray, " _"]:
 
 @compiled
 def unpacked_of(packed: Float[np.ndarray, " _"], size: int) -> Matrix:
-    """The square matrix with this upper triangle, and zeros below."""
+    """Unpack to a square matrix with zeros below the diagonal."""
     result = np.zeros((size, size))
     at = 0
     for a in range(size):
@@ -48,8 +48,8 @@ def unpacked_of(packed: Float[np.ndarray, " _"], size: int) -> Matrix:
 
 @compiled
 def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:
-    """The entries of these rows and columns of a symmetric matrix of which the upper triangle is
-    there.
+    """Return the entries of these rows and columns of a symmetric matrix stored as upper
+    triangle.
     """
     result = np.empty((len(rows), len(columns)))
     for a in range(len(rows)):
@@ -67,7 +67,7 @@ def symmetric_of(
     value_start: Indices,
     numbers: int,
 ) -> Matrix:
-    """The dense symmetric matrix over some nodes, from the values of a block pattern.
+    """Make the dense symmetric matrix over some nodes, from the values of a block pattern.
 
     entry: the pattern's entries of each pair of nodes, −1 where the first is the smaller one.
     """
@@ -92,7 +92,7 @@ def symmetric_of(
 
 @compiled
 def own_blocks(upper: Matrix, spread: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "L 2 2"]:
-    """The 2 × 2 diagonal blocks of C + S Sᵀ."""
+    """Return the 2 × 2 diagonal blocks of C + S Sᵀ."""
     result = np.empty((len(spread) // 2, 2, 2))
     for k in range(len(result)):
         x, y = spread[2 * k], spread[2 * k + 1]

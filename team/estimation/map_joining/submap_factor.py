@@ -30,7 +30,7 @@ Values = Float[np.ndarray, " _"]
 
 @compiled
 def poses_of(points: int, numbers: int) -> int:
-    """How many of a submap's points are poses: a pose has 3 numbers, every other point 2."""
+    """Count the poses among a submap's points: a pose has 3 numbers, every other point 2."""
     return numbers - 2 * points
 
 
@@ -38,10 +38,10 @@ def poses_of(points: int, numbers: int) -> int:
 def submap_residual(
     state: Values, at: Indices, mean: Values
 ) -> tuple[Values, Float[np.ndarray, "n 2"]]:
-    """The residual r' in the map frame, and v = p − p_s of each point (end pose first).
+    """Compute the residual r' in the map frame, and v = p − p_s of each point (end pose first).
 
     at: index in `state` of the first number of the start pose, of the other poses and of each
-        landmark.
+    landmark.
     """
     start = at[0]
     poses = poses_of(len(at) - 1, len(mean))
@@ -64,7 +64,7 @@ def submap_residual(
 def rotated_information(
     information: Float[np.ndarray, "n n"], heading: float, poses: int
 ) -> Float[np.ndarray, "n n"]:
-    """M = T P⁻¹ Tᵀ: the information of a submap with `poses` poses, rotated into the map frame."""
+    """Rotate the information of a submap with `poses` poses into the map frame: M = T P⁻¹ Tᵀ."""
     s, c = elementary.sin_and_cos(heading)
     turned = information.copy()
     n = len(information)
@@ -89,7 +89,9 @@ def rotated_information(
 def submap_normal(
     state: Values, at: Indices, mean: Values, information: Float[np.ndarray, "n n"]
 ) -> tuple[Float[np.ndarray, "m m"], Values, float]:
-    """JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r of one submap over (start pose, other poses, landmarks)."""
+    """Compute JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r of a submap over (start pose, other poses,
+    landmarks).
+    """
     n = len(mean)
     poses = poses_of(len(at) - 1, n)
     residual, offsets = submap_residual(state, at, mean)
@@ -130,7 +132,7 @@ def submap_normal(
 def shifted_mean(
     state: Values, at: Indices, mean: Values, sensitivity: Float[np.ndarray, "B n"]
 ) -> Values:
-    """The mean given the biases, mean + Sᵀ b: `at` ends with the indices of the biases."""
+    """Compute mean + Sᵀ b given the biases, whose indices are last in `at`."""
     shifted = mean.copy()
     first = len(at) - len(sensitivity)
     for b in range(len(sensitivity)):
@@ -148,7 +150,7 @@ def biased_normal(
     information: Float[np.ndarray, "n n"],
     sensitivity: Float[np.ndarray, "B n"],
 ) -> tuple[Float[np.ndarray, "m m"], Values, float]:
-    """`submap_normal` over (start pose, other poses, landmarks, biases)."""
+    """Compute `submap_normal` over (start pose, other poses, landmarks, biases)."""
     biases = len(sensitivity)
     members = at[: len(at) - biases]
     if biases == 0:

@@ -1,8 +1,8 @@
 """The factor graph of one frame: poses, landmarks and biases; submaps, inter-robot measurements and
 priors.
 
-A `Graph` is the structure; it is the same while the state changes. Every function returns new
-values. The value of an added node is composed from the nodes that are in the graph already.
+A `Graph` is the structure, independent of the state. Every function returns new values. The value
+of an added node is composed from the nodes already in the graph.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ Values = Float[np.ndarray, " _"]
 CommonBias = Bias | Literal["marker"]
 """Errors that the team has in common: those of all sensors, and those of each landmark's marker."""
 CommonError = Bias | int
-"""One error in common: a bias of all sensors, or, by a landmark's number, the share of the range by
+"""A common error: a bias of all sensors, or, by a landmark's number, the share of the range by
 which all robots measure that landmark too far.
 """
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
@@ -63,11 +63,10 @@ class Prior(NamedTuple):
 class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
 
-    biases: the error of each row of `sensitivity`; those with a node of the whole team stand last:
-        of its biases, and of its landmarks' markers. range_power: of each, `RANGE_POWER`.
-    sensitivity: ∂mean/∂b, one row for each bias node: a robot's own error and the team's common one
-        add up. The row of a marker is that of the scale of the ranges, restricted to that marker's
-        landmark.
+    biases: the error of each row of `sensitivity`; those with a node of the whole team stand last.
+    range_power: of each, `RANGE_POWER`. sensitivity: ∂mean/∂b, one row for each bias node: a
+    robot's own error and the team's common one add up. The row of a marker is that of the scale of
+    the ranges, restricted to that marker's landmark.
     """
 
     contribution: Contribution
@@ -80,14 +79,14 @@ class Joined(NamedTuple):
     def of(
         cls, contribution: Contribution, nodes: Indices, common: tuple[CommonError, ...]
     ) -> "Joined":
-        """A submap whose `common` errors have a node of the whole team."""
+        """Make a submap whose `common` errors have a node of the whole team."""
         biases = (*contribution.local.biases, *common)
         powers = np.array([RANGE_POWER[_scaling(each)] for each in biases], np.int64)
         return cls(contribution, nodes, biases, powers, _sensitivity(contribution.local, biases))
 
     @property
     def landmarks(self) -> Indices:
-        """The node of each of the submap's landmarks, in its order."""
+        """The nodes of the submap's landmarks, in its order."""
         local = self.contribution.local
         first = 2 + len(local.node_stamps)
         return self.nodes[first : first + len(local.ids)]
@@ -119,19 +118,17 @@ class Encounter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """The nodes in the order in which they were added, and the factors between them.
+    """The nodes in the order of their addition, and the factors between them.
 
-    streams: nodes of each stream: its start, then the end pose of submap 0, 1, …
-    landmarks: node of each landmark id.
-    poses: node of each further pose, by (stream, stamp).
-    biases: node of each error that the submaps of a stream share.
-    common: node of each error that all streams share; these and `biases` have one number.
-    offset: index in the state of each node's first number; the last entry is the state's length.
-    fixed: nodes that are constants (exactly known initial poses, the gauge).
-    submaps, sightings: in the order in which they were added.
-    condensed: the quadratic that replaces older submaps, if some are condensed (`condensing`).
-    gone: number of a stream's submaps that are in `condensed`; `streams` begins after them.
-    memory: what data association needs of the condensed submaps, where landmarks have no names.
+    streams: nodes of each stream: its start, then the end pose of submap 0, 1, … landmarks: node of
+    each landmark id. poses: node of each further pose, by (stream, stamp). biases: node of each
+    error that the submaps of a stream share. common: node of each error that all streams share;
+    these and `biases` have one number. offset: index in the state of each node's first number; the
+    last entry is the state's length. fixed: nodes that are constants (exactly known initial poses,
+    the gauge). submaps, sightings: in the order of their addition. condensed: the quadratic that
+    replaces older submaps, if any (`condensing`). gone: number of a stream's submaps in
+    `condensed`; `streams` begins after them. memory: observations of the condensed submaps for data
+    association, where landmarks have no names.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -150,9 +147,7 @@ class Graph:
 
     @cached_property
     def observed(self) -> tuple[Observed, ...]:
-        """The submaps that data association examines: the condensed ones that are remembered, then
-        the others.
-        """
+        """The submaps for data association: stored condensed ones, then the others."""
         own = (
             Observed(each.contribution.observation, each.landmarks, NO_COUNTS)
             for each in self.submaps
@@ -161,7 +156,7 @@ class Graph:
 
     @cached_property
     def factors(self) -> SubmapFactors:
-        """The submaps in flat arrays, for the kernels."""
+        """The submaps in flat arrays."""
         submaps = [each.contribution for each in self.submaps]
         return SubmapFactors(
             member=np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
@@ -186,7 +181,7 @@ class Graph:
 
     @cached_property
     def prior_factors(self) -> PriorFactors:
-        """The priors in flat arrays, for the kernel."""
+        """The priors in flat arrays."""
         sizes = np.array([len(each.mean) for each in self.priors], np.int64)
         nodes = np.array([each.node for each in self.priors], np.int64)
         means, information = np.zeros((len(sizes), 3)), np.zeros((len(sizes), 3, 3))
@@ -196,8 +191,8 @@ class Graph:
 
     @cached_property
     def sighting_factors(self) -> InterRobotFactors:
-        """The inter-robot measurements in flat arrays, for the kernels; their entries follow those
-        of the submaps.
+        """The inter-robot measurements in flat arrays; their entries follow those of the
+        submaps.
         """
         return InterRobotFactors(
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
@@ -226,7 +221,7 @@ class Graph:
 
     @property
     def entry(self) -> Indices:
-        """Entry of the pattern for each pair of members of each factor (see `block_pattern`)."""
+        """Entry of the pattern for each pair of members of each factor (`block_pattern`)."""
         return self._pattern_and_entry[1]
 
     @cached_property
@@ -253,9 +248,7 @@ class Graph:
 
     @cached_property
     def of_bias(self) -> Bool[np.ndarray, " priors"]:
-        """Marks the priors of single robots' biases, as opposed to those of poses and of common
-        errors.
-        """
+        """Marks the priors of single robots' biases."""
         common = set(self.common.values())
         return np.array(
             [len(each.mean) == 1 and each.node not in common for each in self.priors], np.bool_
@@ -282,7 +275,7 @@ class Graph:
         return int(np.diff(self.offset)[~self.fixed].sum())
 
     def name(self, node: int) -> str:
-        """Names a node, for messages."""
+        """Name a node in messages."""
         for stream, nodes in self.streams.items():
             if node == nodes[0]:
                 return f"the start of {named(stream)}"
@@ -316,12 +309,12 @@ EMPTY_GRAPH = Graph(
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
-    """The offsets at which consecutive pieces of these lengths begin; the last entry is the end."""
+    """Return the offsets of consecutive pieces of these lengths, and the end."""
     return np.cumsum(np.array([0, *lengths], dtype=np.int64))
 
 
 class _Growth:
-    """The nodes that are being added to a graph, with their values; used inside `extended` only."""
+    """The nodes being added to a graph, with their values; used inside `extended` only."""
 
     def __init__(self, graph: Graph, state: Values) -> None:
         self.streams = dict(graph.streams)
@@ -357,14 +350,12 @@ def extended(
     common_bias_sigma: Mapping[CommonBias, float] = NONE_IN_COMMON,
     numbers: Mapping[Key, Sequence[int]] = NO_NUMBERS,
 ) -> tuple[Graph, Values]:
-    """The graph with more submaps, in the given order; a stream without an initial pose begins at
-    0.
+    """Add submaps to a graph, in the given order; a stream without an initial pose begins at 0.
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
     first submap that observes it. A stream without an initial pose is fixed at (0, 0, 0): the gauge
-    of its frame. A bias is N(0, bias_sigma²), an error in common N(0, common_bias_sigma²).
-    numbers: for submaps with unnamed landmarks, the team's number of each of their landmarks; all
-        other submaps contain the numbers themselves.
+    of its frame. A bias is N(0, bias_sigma²), a common error N(0, common_bias_sigma²). numbers: for
+    submaps with unnamed landmarks, the team's number of each landmark; other submaps contain them.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -425,8 +416,7 @@ def extended(
 def _in_common(
     local: LocalMap, common_bias_sigma: Mapping[CommonBias, float]
 ) -> dict[CommonError, float]:
-    """The errors of a submap that the whole team has in common, each with its sigma, in their
-    order.
+    """Return the common errors of a submap with their sigmas, in order.
 
     The markers of unnamed landmarks are states of the full solution alone (`markers`).
     """
@@ -446,8 +436,8 @@ def without_nodes(
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
 ) -> tuple[Graph, Indices]:
-    """The graph without the eliminated poses and landmarks, with the factors that stay, and each
-    node's new number.
+    """Remove eliminated poses and landmarks, keep the marked factors; return each node's new
+    number.
 
     The eliminated poses of a stream are its first ones. Condensed factors are left out.
     """
@@ -472,10 +462,10 @@ def without_nodes(
 
 
 def _renumbered(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
-    """The graph with other numbers of its nodes, some of which it no longer has or become one.
+    """Renumber the nodes of a graph; some are removed or become one.
 
-    node_of: the new number of each node. stays: the nodes that the new ones stem from, ascending.
-    Condensed factors keep their numbers.
+    node_of: new number of each node. stays: origins of the new nodes, ascending. Condensed factors
+    keep their numbers.
     """
     return replace(
         graph,
@@ -497,7 +487,7 @@ def _renumbered(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -
 
 
 def with_landmarks(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
-    """The graph with landmarks that no factor contains yet, and their nodes."""
+    """Add landmarks that no factor contains yet; return their nodes."""
     first = len(graph.fixed)
     nodes = range(first, first + len(ids))
     grown = replace(
@@ -510,8 +500,8 @@ def with_landmarks(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
-    """The robot's pose node at this stamp, in its first incarnation that has one; None if there is
-    none.
+    """Return the robot's pose node at this stamp, in its first incarnation that has one, or
+    None.
     """
     incarnations = sorted(incarnation for name, incarnation in graph.streams if name == robot)
     found = (graph.poses.get(((robot, incarnation), stamp_ns)) for incarnation in incarnations)
@@ -519,9 +509,7 @@ def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
 
 
 def encounter_of(graph: Graph, sighting: InterRobotFactor) -> Encounter | None:
-    """The inter-robot measurement between its pose nodes; None while the graph lacks one of
-    them.
-    """
+    """Make the inter-robot measurement between its pose nodes; None while the graph lacks one."""
     observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
     teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
     return None if observer is None or teammate is None else Encounter(sighting, observer, teammate)
@@ -538,7 +526,7 @@ def merged(
     other_state: Values,
     main_from_other: Float[np.ndarray, "3"],
 ) -> tuple[Graph, Values]:
-    """Both graphs in the main frame; landmarks with equal ids become one, at the main graph's
+    """Join both graphs in the main frame; landmarks with equal ids become one, at the main graph's
     value.
 
     The other frame's fixed nodes (its gauge) become free, so none of its submaps may be condensed.
@@ -583,10 +571,10 @@ def merged(
 
 
 def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
-    """The graph with landmarks renumbered; landmarks with the same new number become one node.
+    """Renumber landmarks; those with the same new number become one node, at the value of the
+    first.
 
-    becomes: the new number of each landmark that gets one. Landmarks with one number become the
-        node of the first of them, at its value.
+    becomes: the new number of each renumbered landmark.
     """
     first: dict[int, int] = {}
     remaining = np.ones(len(graph.fixed), np.bool_)
@@ -606,7 +594,7 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
 
 
 def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
-    """A node's value in the main frame: of a pose, a landmark, or a bias, which has no frame."""
+    """Transform a node's value into the main frame; a bias has no frame."""
     if len(value) == 3:
         return compose(main_from_other, value)
     return transformed(main_from_other, value) if len(value) == 2 else value

@@ -38,10 +38,10 @@ def tied(
     seen_covariance: Float[np.ndarray, "m m"],
     iterations: int,
 ) -> tuple[Constraints, bool]:
-    """The iterated EKF update by the constraints; returns also whether S is positive definite.
+    """Iterate the EKF update by the constraints; return also whether S is positive definite.
 
     mean: (t, θ, a₁, a₂, …), a map's pose and the landmarks; seen: (b₁, b₂, …), the same landmarks
-        in the frame of that pose, independent of the map. m = 2k, p = 3 + m.
+    in the frame of that pose, independent of the map. m = 2k, p = 3 + m.
     """
     m = len(seen)
     state, local = mean.copy(), seen.copy()
@@ -77,17 +77,17 @@ def tied(
 
 ITERATIONS = 3
 INDEFINITE, SINGULAR = 1, 2
-"""Why there are no constraints: the covariance of their innovation is not positive definite, or
-that of one of them is singular.
+"""Faults: the covariance of the innovation is not positive definite, or that of one constraint is
+singular.
 """
 
 
 class Agreed(NamedTuple):
-    """The landmarks that a map and a local map share, without those that the gate leaves out.
+    """The landmarks that a map and a local map share, without those beyond the gate.
 
     mean, covariance: of the map's pose and of these landmarks. in_whole, in_local: their indices in
     both maps; sights: the indices of their coordinates in the local mean. known: number of shared
-    landmarks, also of those left out. fault: 0, INDEFINITE or SINGULAR.
+    landmarks, also beyond the gate. fault: 0, INDEFINITE or SINGULAR.
     """
 
     in_whole: Int64[np.ndarray, " k"]
@@ -110,7 +110,7 @@ def agreed(
     local_covariance: Float[np.ndarray, "q q"],
     gate: float,
 ) -> Agreed:
-    """The constraints of two maps, of which the worst is left out until all are within the gate.
+    """Constrain two maps, and drop the worst constraint until all are within the gate.
 
     Ids ascend; landmarks are the last entries of a mean.
     """
@@ -135,7 +135,6 @@ def agreed(
 def _shared(
     one: UInt32[np.ndarray, " L"], other: UInt32[np.ndarray, " K"]
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-    """The indices of the numbers that two ascending rows share."""
     first, second = np.empty(len(other), np.int64), np.empty(len(other), np.int64)
     i, k = 0, 0
     for j in range(len(other)):
@@ -151,7 +150,9 @@ def _shared(
 def coordinates(
     index: Int64[np.ndarray, " k"], behind: int, before: int
 ) -> Int64[np.ndarray, " m"]:
-    """The entries 0 … before − 1 and those of the points with these indices, behind `behind`."""
+    """Return the entries 0 … before − 1 and those of the points with these indices, after
+    `behind`.
+    """
     entries = np.empty(before + 2 * len(index), np.int64)
     for j in range(before):
         entries[j] = j
@@ -167,7 +168,6 @@ def _part(
     covariance: Float[np.ndarray, "n n"],
     entries: Int64[np.ndarray, " m"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
-    """The marginal over these entries."""
     m = len(entries)
     of_mean, of_covariance = np.empty(m), np.empty((m, m))
     for i in range(m):
@@ -179,8 +179,8 @@ def _part(
 
 @compiled
 def _worst(tie: Constraints, gate: float) -> tuple[int, int]:
-    """Index of the constraint that the others contradict most, −1 where all are within the gate;
-    and the fault.
+    """Return the constraint that the others contradict most, −1 where all are within the gate; and
+    the fault.
     """
     z, worst, most = tie.multiplier, -1, gate
     for k in range(len(z) // 2):
@@ -198,8 +198,8 @@ def _worst(tie: Constraints, gate: float) -> tuple[int, int]:
 
 
 class TiedPose(NamedTuple):
-    """N(pose, covariance) of `tied_pose`; known, refused: numbers of shared landmarks, and of
-    those among them that the gate left out; fault: as `Agreed`.
+    """N(pose, covariance) of `tied_pose`. known, refused: numbers of shared landmarks, and of those
+    beyond the gate. fault: as `Agreed`.
     """
 
     pose: Float[np.ndarray, "3"]
@@ -219,7 +219,7 @@ def end_pose_of(
     local_covariance: Float[np.ndarray, "q q"],
     gate: float,
 ) -> TiedPose:
-    """The end pose of a local map on a map, in one call: `agreed`, then `tied_pose`."""
+    """Compute the end pose of a local map on a map: `agreed`, then `tied_pose`."""
     found = agreed(whole_ids, whole_mean, whole_covariance, ids, local_mean, local_covariance, gate)
     refused = found.known - len(found.in_whole)
     if found.fault:
@@ -240,7 +240,7 @@ def end_pose_of(
 def of_map(
     covariance: Float[np.ndarray, "q p"], lever: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "q m"]:
-    """Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ."""
+    """Multiply rows of the map's covariance (columns: pose, then the landmarks) by Hᵀ."""
     U = np.empty((len(covariance), 2 * len(lever)))
     for row in range(len(covariance)):
         x, y, turn = covariance[row, 0], covariance[row, 1], covariance[row, 2]
@@ -253,7 +253,7 @@ def of_map(
 
 @compiled
 def of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[np.ndarray, "q m"]:
-    """Rows of the local map's covariance (columns: the landmarks) times Hᵀ."""
+    """Multiply rows of the local map's covariance (columns: the landmarks) by Hᵀ."""
     V = np.empty_like(covariance)
     for row in range(len(covariance)):
         for i in range(0, covariance.shape[1], 2):
@@ -266,7 +266,6 @@ def of_seen(covariance: Float[np.ndarray, "q m"], c: float, s: float) -> Float[n
 def _multiply(
     A: Float[np.ndarray, "q m"], x: Float[np.ndarray, " m"], out: Float[np.ndarray, " q"]
 ) -> None:
-    """Writes A x into `out`."""
     for row in range(len(A)):
         total = 0.0
         for column in range(len(x)):
@@ -281,7 +280,7 @@ def moved_by(
     z: Float[np.ndarray, " m"],
     out: Float[np.ndarray, " q"],
 ) -> None:
-    """Writes mean − gain z into `out`."""
+    """Write mean − gain z into `out`."""
     _multiply(gain, z, out)
     for row in range(len(mean)):
         out[row] = mean[row] - out[row]
@@ -296,10 +295,11 @@ def tied_pose(
     end_covariance: Float[np.ndarray, "3 3"],
     end_of_seen: Float[np.ndarray, "3 m"],
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """(pose ∘ end pose) of the tied maps and its covariance; mean and covariance as in `tied`.
+    """Compute pose ∘ end pose of the tied maps and its covariance; mean and covariance as in
+    `tied`.
 
     end: N(end pose, covariance) in the frame of the map's pose; end_of_seen: its covariance with
-        the observed landmarks.
+    the observed landmarks.
     """
     gain = np.concatenate(
         (of_map(covariance[:3], tie.lever), of_seen(end_of_seen, tie.cos, tie.sin))
@@ -332,7 +332,7 @@ def tied_pose(
 
 @compiled
 def _invert(S: Float[np.ndarray, "m m"]) -> bool:
-    """S ← S⁻¹ by Cholesky, exactly symmetric; returns whether S is positive definite."""
+    """S ← S⁻¹ by Cholesky, exactly symmetric; return whether S is positive definite."""
     m = len(S)
     for k in range(m):
         for j in range(k):

@@ -1,8 +1,8 @@
-"""The Gaussian back end of one robot: submaps joined one after the other into one Gaussian.
+"""The Gaussian back end of one robot: submaps joined one by one into one Gaussian.
 
 Hybrid-SLAM's map joining (Brooks & Bailey 2008, "HybridSLAM"), with the constraints of Williams'
 constrained local submap filter (2001): the whole map and the local map are independent Gaussians,
-and "these two landmarks are the same" is an observation without noise. Earlier submaps are not
+and the identity of two landmarks is an observation without noise. Earlier submaps are not
 linearised again, so the map is overconfident after many joins.
 """
 
@@ -42,13 +42,13 @@ class WholeMap:
 def initial_map(
     pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | None
 ) -> WholeMap:
-    """A map with a pose only; covariance None: the pose is exactly known."""
+    """Make a map with a pose only; covariance None: the pose is exactly known."""
     spread = np.zeros((3, 3)) if covariance is None else covariance
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
 
 
 def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
-    """The local map composed onto the current pose: known landmarks fused, new ones added.
+    """Compose the local map onto the current pose: known landmarks fused, new ones added.
 
     With s = (whole, local) and the constraint h(s) = pose ∘ local landmark − whole landmark = 0 for
     each known landmark: the iterated EKF update of s, then (pose ∘ end pose, landmarks, pose ∘ new
@@ -63,13 +63,13 @@ def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
 def end_pose(
     whole: WholeMap, local: LocalMap, gate: float = math.inf
 ) -> tuple[PoseGaussian, int, int]:
-    """The pose of `joined`, without the landmarks; the number of landmarks that both maps have,
-    and of those among them that the gate left out.
+    """Compute the pose of `joined` alone; return the numbers of common landmarks and of refused
+    ones.
 
-    gate: the known landmarks whose constraints the others contradict by more than this are left out
-        of the local map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹
-        zₗ with the multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is
-        χ²-distributed with two degrees of freedom.
+    gate: known landmarks whose constraints the others contradict by more are left out of the local
+    map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with the
+    multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is χ²-distributed with
+    two degrees of freedom.
     """
     pose, covariance, known, refused, fault = end_pose_of(*_parts(whole, local), gate)
     _refuse(fault)
@@ -77,7 +77,7 @@ def end_pose(
 
 
 def _parts(whole: WholeMap, local: LocalMap) -> Maps:
-    """Both maps as the kernels take them: one layout, since each would be a form of its own."""
+    """Lay both maps out alike: each layout would compile kernels of its own."""
     parts = (
         whole.ids, whole.mean, whole.covariance, local.ids, local.mean, local.covariance
     )  # fmt: skip
@@ -88,7 +88,6 @@ def _parts(whole: WholeMap, local: LocalMap) -> Maps:
 
 
 def _refuse(fault: int) -> None:
-    """Raise NotACovarianceError where there is a fault."""
     if fault == INDEFINITE:
         raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
     if fault == SINGULAR:
@@ -96,7 +95,7 @@ def _refuse(fault: int) -> None:
 
 
 def without(local: LocalMap, place: int) -> LocalMap:
-    """The local map without its landmark at this index."""
+    """Remove the landmark at this index from the local map."""
     rows = np.delete(np.arange(len(local.mean)), _sights(local, np.array([place])))
     ids = np.delete(local.ids, place)
     covariance = local.covariance[np.ix_(rows, rows)]
@@ -109,11 +108,11 @@ def absorbed(
     means: Float[np.ndarray, "K 2"],
     covariance: Float[np.ndarray, "k k"],
 ) -> WholeMap:
-    """Replaces the marginal of the landmarks by the fused map; pose and other landmarks are updated
-    by regression.
+    """Replace the marginal of the landmarks by the fused map; update pose and other landmarks by
+    regression (`carried_along`).
 
-    See `carried_along` for the regression. Landmarks that were unknown are added. The fused map
-    contains this robot's own measurements: they are counted twice if the result is sent for fusion.
+    Unknown landmarks are added. The fused map contains this robot's own measurements: they are
+    counted twice if the result is sent for fusion.
     """
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
     mean, joint = carried_along(
@@ -130,17 +129,15 @@ def absorbed(
 
 
 def _sights(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Indices of the coordinates of some of a submap's landmarks, behind its poses."""
+    """Indices of the coordinates of landmarks in a submap's mean, after its poses."""
     return len(local.mean) - 2 * len(local.ids) + _points(index)
 
 
 def _entries(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Indices of the pose's numbers and of those of the landmarks with these indices."""
     return np.concatenate([np.arange(3), 3 + _points(index)])
 
 
 def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Indices of the coordinates of the points with these indices."""
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 

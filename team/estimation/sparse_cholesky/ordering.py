@@ -1,11 +1,10 @@
 """A fill-reducing elimination order for a block-sparse symmetric matrix: minimum degree.
 
 The graph has a vertex per block variable (a pose: 3 unknowns, a landmark: 2) and an edge per
-non-zero block. Eliminating a vertex makes its neighbours adjacent to each other; the vertex to be
-eliminated next is the one whose neighbours have the fewest unknowns, the smallest index among
-equals (George & Liu 1989, without its approximations). The neighbours at that moment are the
-structure of the vertex's column in the Cholesky factor, so the order comes with the symbolic
-factorisation.
+non-zero block. Eliminating a vertex makes its neighbours adjacent to each other; next is the vertex
+whose neighbours have the fewest unknowns, the smallest index among equals (George & Liu 1989,
+without its approximations). The neighbours at that moment are the structure of the vertex's column
+in the Cholesky factor, so the order comes with the symbolic factorisation.
 """
 
 from typing import NamedTuple
@@ -23,10 +22,9 @@ Bits = UInt64[np.ndarray, "_ _"]
 class Elimination(NamedTuple):
     """The elimination order and the structure of the factor; arrays indexed by step of elimination.
 
-    order: block eliminated at each step.
-    parent: step at which the first of its column's rows is eliminated; −1 at a root.
-    start: column of step k has the rows `structure[start[k] : start[k + 1]]`.
-    structure: steps at which those rows are eliminated, ascending; without the diagonal.
+    order: block eliminated at each step. parent: step at which the first of its column's rows is
+    eliminated; −1 at a root. start: column of step k has the rows `structure[start[k] : start[k +
+    1]]`. structure: steps at which those rows are eliminated, ascending; without the diagonal.
     """
 
     order: Indices
@@ -47,7 +45,6 @@ def minimum_degree(sizes: Indices, column_start: Indices, rows: Indices) -> Elim
 
 @compiled
 def _tie(adjacent: Bits, degree: Indices, sizes: Indices, i: int, j: int) -> None:
-    """Make i ≠ j neighbours; `degree` counts the unknowns of the neighbours."""
     bit = np.uint64(1) << np.uint64(j & 63)
     if not adjacent[i, j >> 6] & bit:
         adjacent[i, j >> 6] |= bit
@@ -58,7 +55,7 @@ def _tie(adjacent: Bits, degree: Indices, sizes: Indices, i: int, j: int) -> Non
 
 @compiled
 def _join(adjacent: Bits, degree: Indices, sizes: Indices, i: int, v: int) -> None:
-    """Makes i a neighbour of all other neighbours of v, 64 vertices at a time."""
+    """Make i a neighbour of all other neighbours of v, 64 vertices at a time."""
     for word in range(adjacent.shape[1]):
         new = adjacent[v, word] & ~adjacent[i, word]
         if word == i >> 6:
@@ -74,9 +71,7 @@ def _join(adjacent: Bits, degree: Indices, sizes: Indices, i: int, v: int) -> No
 
 @compiled
 def _neighbours(adjacent: Bits, vertex: int, found: Indices) -> int:
-    """Writes the neighbours of a vertex, ascending, to the front of `found`; returns their
-    number.
-    """
+    """Write the neighbours of a vertex, ascending, to the front of `found`; return their number."""
     count = 0
     for word in range(adjacent.shape[1]):
         bits = adjacent[vertex, word]
@@ -92,7 +87,6 @@ def _neighbours(adjacent: Bits, vertex: int, found: Indices) -> int:
 
 @compiled
 def _least(degree: Indices, eliminated: Bool[np.ndarray, " n"]) -> int:
-    """The remaining vertex of least degree, the first among equals."""
     least = -1
     for i in range(len(degree)):
         if not eliminated[i] and (least < 0 or degree[i] < degree[least]):
@@ -136,7 +130,7 @@ def _eliminated(
 
 @compiled
 def _postorder(parent: Indices) -> Indices:
-    """The steps of a forest with every subtree before its root, children in ascending order."""
+    """Order the steps of a forest with every subtree before its root, children ascending."""
     n = len(parent)
     child = np.full(n + 1, -1, dtype=np.int64)
     sibling = np.full(n, -1, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Dense algebra on big panels, by blocks: nearly all of it is matrix products.
+"""Dense algebra on big panels by blocks, mostly matrix products.
 
 A panel is Lᵀ on a supernode's columns J, a row per column of L (see `sparse_layout`); R are the
 rows below J (docs/decisions/27).
@@ -25,7 +25,7 @@ CHUNK = 64
 
 @compiled
 def is_big(width: int, m: int) -> bool:
-    """Whether products by BLAS are faster than loops for a panel of this shape."""
+    """Whether matrix products are faster than loops for a panel of this shape."""
     return m >= ROWS and width >= WIDTH
 
 
@@ -33,9 +33,7 @@ def is_big(width: int, m: int) -> bool:
 def add_products(
     target: Values, factors: Values, rows: Float[np.ndarray, "k m"], column: int, sign: float
 ) -> None:
-    """Adds Σ sign · factors[k] · rows[k, column:] in place: one row after the other, four in one
-    go.
-    """
+    """Add Σ sign · factors[k] · rows[k, column:] in place, row by row, four at once."""
     n, count = len(target), len(factors)
     whole = count - count % 4
     for k in range(0, whole, 4):
@@ -54,7 +52,7 @@ def add_products(
 
 @inlined
 def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, least: Values) -> int:
-    """Dense Cholesky factorisation of these columns in place; later columns are not changed.
+    """Factorise these columns (dense Cholesky) in place; later columns are not changed.
 
     Returns the first column whose pivot is ≤ least, else −1.
     """
@@ -77,9 +75,7 @@ def factorise_columns(panel: Float[np.ndarray, "w m"], begin: int, end: int, lea
 
 @compiled
 def factorise_by_blocks(panel: Float[np.ndarray, "w m"], least: Values) -> int:
-    """`factorise_columns` for all columns: each block by loops, then its product is subtracted from
-    the later ones.
-    """
+    """Factorise all columns: each block by loops, then subtract its product from the later ones."""
     width, m = panel.shape
     for begin in range(0, width, BLOCK):
         end = min(begin + BLOCK, width)
@@ -100,14 +96,14 @@ def factorise_by_blocks(panel: Float[np.ndarray, "w m"], least: Values) -> int:
 def rows_of_product(
     columns: Float[np.ndarray, "w h"], first: int, last: int
 ) -> Float[np.ndarray, "c _"]:
-    """Rows first … last − 1 of Aᵀ A, from column `first` on."""
+    """Compute rows first … last − 1 of Aᵀ A, from column `first` on."""
     rows = np.ascontiguousarray(columns[:, first:last].T)
     return matrix_product(rows, np.ascontiguousarray(columns[:, first:]))
 
 
 @compiled
 def inverse_by_blocks(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w w"]:
-    """The inverse L_JJ⁻ᵀ of a panel's triangle.
+    """Invert a panel's triangle: L_JJ⁻ᵀ.
 
     With L = (A 0; B C): L⁻¹ = (A⁻¹ 0; −C⁻¹ B A⁻¹  C⁻¹), one block of rows after the other.
     """

@@ -1,9 +1,9 @@
 """Sparse symmetric positive definite systems of small blocks: A = L Lᵀ, solutions, inverse entries.
 
-The analysis (order, structure) is separate from the numbers and is valid for as long as the pattern
-does not change. The factor is stored by supernodes: neighbouring columns with (nearly) the same
-rows share one dense panel (Davis 2006, "Direct Methods for Sparse Linear Systems", chapters 4 and
-6). All sums run in a fixed order.
+The analysis (order, structure) is separate from the numbers and holds while the pattern does not
+change. The factor is stored by supernodes: neighbouring columns with (nearly) the same rows share
+one dense panel (Davis 2006, "Direct Methods for Sparse Linear Systems", chapters 4 and 6). All sums
+run in a fixed order.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class NotPositiveDefiniteError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Which blocks of the lower triangle of a symmetric matrix are stored, and where.
+    """The stored blocks of the lower triangle of a symmetric matrix, and their places.
 
     sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1]
     is block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block. The
@@ -94,10 +94,9 @@ class Pattern:
 class Analysis:
     """Index in the panels of L of each number of a pattern.
 
-    permutation: position of each unknown in the elimination order.
-    structure: the panels (see `sparse_layout`).
-    target: index in the panels of each number of the pattern (the mirrored one for the upper half
-        of a diagonal block).
+    permutation: position of each unknown in the elimination order. structure: the panels (see
+    `sparse_layout`). target: index in the panels of each number of the pattern (the mirrored one
+    for the upper half of a diagonal block).
     """
 
     pattern: Pattern
@@ -115,7 +114,7 @@ class Cholesky:
 
 
 def analysed(pattern: Pattern) -> Analysis:
-    """Order, symbolic factorisation and supernodes of a pattern."""
+    """Analyse a pattern: order, symbolic factorisation and supernodes."""
     elimination = minimum_degree(pattern.sizes, pattern.column_start, pattern.rows)
     permutation, structure = supernodes(pattern.sizes, pattern.offset, *elimination)
     target = targets(
@@ -131,9 +130,7 @@ def analysed(pattern: Pattern) -> Analysis:
 
 
 def factorised(analysis: Analysis, values: Values) -> Cholesky:
-    """The factor L with L Lᵀ = A. Raises NotPositiveDefiniteError that names the pivot's
-    variable.
-    """
+    """Factorise A = L Lᵀ. Raises NotPositiveDefiniteError that names the pivot's variable."""
     panels, failed = sparse_kernel.factorise(analysis.structure, analysis.target, values)
     if failed >= 0:
         unknown = int(np.flatnonzero(analysis.permutation == failed)[0])
@@ -143,7 +140,7 @@ def factorised(analysis: Analysis, values: Values) -> Cholesky:
 
 
 def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Solves A X = right for X."""
+    """Solve A X = right."""
     permutation = cholesky.analysis.permutation
     permuted = np.empty_like(right)
     permuted[permutation] = right
@@ -153,13 +150,13 @@ def solved(cholesky: Cholesky, right: Float[np.ndarray, "n k"]) -> Float[np.ndar
 
 
 def inverse_columns(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "n k"]:
-    """The columns of A⁻¹ of these `unknowns`: their covariance with all unknowns."""
+    """Compute columns of A⁻¹: the covariance of `unknowns` with all unknowns."""
     permutation = cholesky.analysis.permutation
     return _columns(cholesky, permutation[unknowns], permutation, 0)
 
 
 def inverse_block(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "k k"]:
-    """A⁻¹ between these unknowns: their joint covariance, symmetric."""
+    """Compute A⁻¹ between these unknowns: their joint covariance, symmetric."""
     structure = cholesky.analysis.structure
     place = cholesky.analysis.permutation[unknowns]
     if sparse_kernel.has_big_panel(structure):
@@ -179,8 +176,8 @@ def inverse_block(cholesky: Cholesky, unknowns: Indices) -> Float[np.ndarray, "k
 def _columns(
     cholesky: Cholesky, chosen: Indices, requested: Indices, first: int
 ) -> Float[np.ndarray, "n k"]:
-    """The rows `requested` of columns of A⁻¹, both by their place in the order of elimination and
-    none before supernode `first`.
+    """Compute the rows `requested` of columns of A⁻¹, both by their place in the order of
+    elimination and none before supernode `first`.
     """
     columns = np.empty((len(requested), len(chosen)))
     for begin in range(0, len(chosen), COLUMNS_AT_ONCE):
@@ -193,7 +190,7 @@ def _columns(
 
 
 def selected_inverse(cholesky: Cholesky) -> Values:
-    """The entries of A⁻¹ on the pattern of A, in the layout of A's numbers.
+    """Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers.
 
     Takahashi's recursion over the pattern of L, from the last supernode back (Takahashi, Fagan &
     Chin 1973): with Y = L_RJ L_JJ⁻¹, Z_RJ = −Z_RR Y and Z_JJ = (L_JJ L_JJᵀ)⁻¹ − Yᵀ Z_RJ.

@@ -1,8 +1,8 @@
 """Compiled kernels of the sparse Cholesky factorisation, its solutions and its selected inverse.
 
 They traverse the panels of `sparse_layout`. Inner loops add a multiple of one contiguous column to
-another, which a compiler vectorises without changing the order of any sum. Big panels are handled
-by `panel_products` instead.
+another, which vectorises without changing the order of any sum. `panel_products` has those of big
+panels.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ def _panel(
 
 @inlined
 def _places(requested: Indices, present: Indices, place: Indices) -> None:
-    """place[i] := index of wanted[i] in `present`; both ascending, all wanted are present."""
+    """place[i] := index of requested[i] in `present`; both ascending, all are present."""
     at = 0
     for i in range(len(requested)):
         while present[at] != requested[i]:
@@ -47,9 +47,6 @@ def _places(requested: Indices, present: Indices, place: Indices) -> None:
 
 @compiled
 def _factorise_panel(panel: Float[np.ndarray, "w m"], least: Values) -> int:
-    """Dense Cholesky factorisation of a panel in place; returns the first column whose pivot is ≤
-    least, else −1.
-    """
     width, m = panel.shape
     if products.is_big(width, m):
         return products.factorise_by_blocks(panel, least)
@@ -58,7 +55,7 @@ def _factorise_panel(panel: Float[np.ndarray, "w m"], least: Values) -> int:
 
 @compiled
 def _subtract_product(structure: Structure, panels: Values, s: int, place: Indices) -> None:
-    """Subtracts L_RJ L_RJᵀ of supernode s from the panels of the rows R below it."""
+    """Subtract L_RJ L_RJᵀ of supernode s from the panels of the rows R below it."""
     columns_of, row_start, row, panel_start, supernode_of = structure
     rows, panel = _panel(structure, panels, s)
     width, m = panel.shape
@@ -91,10 +88,10 @@ def _subtract_product(structure: Structure, panels: Values, s: int, place: Indic
 
 @compiled
 def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Values, int]:
-    """The panels of L, and the permuted unknown whose pivot is not positive (−1 if all are).
+    """Compute the panels of L, and the permuted unknown whose pivot is not positive, or −1.
 
     Right-looking: a supernode's dense factorisation, then its outer product L_RJ L_RJᵀ is
-        subtracted from the panels of the rows that it reaches.
+    subtracted from the panels of the rows that it reaches.
     """
     columns_of, row_start, _, panel_start, _ = structure
     panels = np.zeros(panel_start[-1])
@@ -119,9 +116,7 @@ def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Va
 def _solve_column(
     structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], first: int, c: int
 ) -> None:
-    """`solve_in_place` of one column: a panel's numbers are gathered, so that a loop goes along its
-    row.
-    """
+    """Solve one column in place, with a panel's numbers gathered so that a loop follows its row."""
     count = len(structure[0]) - 1
     x = np.empty(len(right))
     for s in range(first, count):
@@ -153,7 +148,7 @@ def _solve_column(
 def _solve_many(
     structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], first: int
 ) -> None:
-    """`solve_in_place` of many columns: a loop goes along a row of them."""
+    """Solve many columns in place, with a loop along a row of them."""
     count = len(structure[0]) - 1
     many = right.shape[1]
     for s in range(first, count):
@@ -188,8 +183,7 @@ def solve_in_place(
 ) -> None:
     """Overwrite `right` with (L Lᵀ)⁻¹ right.
 
-    What belongs to supernodes before `first` must be zero, and stays as it is: nothing behind
-    depends on it.
+    Numbers of supernodes before `first` must be zero, and are not changed.
     """
     if right.shape[1] > FEW:
         _solve_many(structure, panels, right, first)
@@ -247,7 +241,7 @@ def _over_own_triangle(panel: Float[np.ndarray, "w m"]) -> Float[np.ndarray, "w 
 
 @compiled
 def takahashi(structure: Structure, panels: Values) -> Values:
-    """The entries of (L Lᵀ)⁻¹ on the pattern of L, lower triangle, in panels like L's."""
+    """Compute the entries of (L Lᵀ)⁻¹ on the pattern of L, lower triangle, in panels like L's."""
     columns_of, row_start, _, _, _ = structure
     inverse = np.zeros_like(panels)
     below = np.max(np.diff(row_start) - np.diff(columns_of))
@@ -277,7 +271,7 @@ def takahashi(structure: Structure, panels: Values) -> Values:
 
 @compiled
 def has_big_panel(structure: Structure) -> bool:
-    """Whether one of the panels is handled by `panel_products`."""
+    """Whether `panel_products` handles one of the panels."""
     columns_of, row_start, _, _, _ = structure
     for s in range(len(columns_of) - 1):
         width = columns_of[s + 1] - columns_of[s]
@@ -288,8 +282,8 @@ def has_big_panel(structure: Structure) -> bool:
 
 @compiled
 def _first_columns(structure: Structure) -> Indices:
-    """The first column of each supernode's subtree, whose columns directly precede the
-    supernode's.
+    """Return the first column of each supernode's subtree, whose columns directly precede its
+    own.
     """
     columns_of, row_start, row, _, supernode_of = structure
     first = columns_of[:-1].copy()
@@ -305,7 +299,7 @@ def _first_columns(structure: Structure) -> Indices:
 def inverse_among(
     structure: Structure, panels: Values, requested: Indices
 ) -> Float[np.ndarray, "k k"]:
-    """(L Lᵀ)⁻¹ among ascending unknowns: Wᵀ W with L W = their unit vectors.
+    """Compute (L Lᵀ)⁻¹ among ascending unknowns: Wᵀ W with L W = their unit vectors.
 
     A unit vector fills the supernodes from its own up to the root, so at each supernode only the
     unit vectors of its subtree take part, and those are neighbours.
@@ -346,7 +340,7 @@ def quadratic(
     offset: Indices,
     x: Values,
 ) -> float:
-    """xᵀAx of a symmetric A, given by the blocks of one triangle row by row.
+    """Compute xᵀAx of a symmetric A, given by the blocks of one triangle row by row.
 
     Block k, of the variables rows[k] and columns[k], begins at values[value_start[k]].
     """

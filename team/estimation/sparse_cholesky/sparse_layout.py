@@ -24,7 +24,7 @@ PADDING = 0.25
 
 @compiled
 def _supernode_begins(first: Indices, below: Indices, parent: Indices) -> Indices:
-    """The first block of each supernode, and the number of blocks at the end.
+    """Return the first block of each supernode, and the number of blocks at the end.
 
     A block joins the supernode before it if it is the parent of that supernode's last block; the
     rows of the earlier blocks are then among the columns and rows of the later one.
@@ -57,7 +57,7 @@ def supernodes(
     start: Indices,
     structure: Indices,
 ) -> tuple[Indices, Structure]:
-    """Gathers neighbouring blocks of the elimination into panels, in numbers of unknowns.
+    """Gather neighbouring blocks of the elimination into panels, in numbers of unknowns.
 
     Returns the position of each unknown in the elimination order, and the panels' structure.
     """
@@ -107,7 +107,7 @@ def targets(
     permutation: Indices,
     structure: Structure,
 ) -> Indices:
-    """Index in the panels of each number of a pattern.
+    """Find the index in the panels of each number of a pattern.
 
     The unknowns of a block variable are neighbours in the order of elimination and in each panel's
     rows, so one of them is searched for.
