@@ -1,9 +1,9 @@
-"""Examines a link to a router that fails: Zenoh reports nothing but a timeout.
+"""Diagnose a failing link to a router, for which Zenoh reports only a timeout.
 
 One TLS handshake by the standard library, beside Zenoh, distinguishes the cases. Only positive
-evidence refuses a link: a TLS alert about our certificate, a router's certificate that can not be
-verified, an answer that is not TLS. A timeout, a closed connection or any other error of the
-network is no evidence, and is reported as a reason to wait.
+evidence refuses a link: a TLS alert about our certificate, a router certificate that fails
+verification, an answer that is not TLS. A timeout, a closed connection or any other network error
+is a reason to wait.
 """
 
 import re
@@ -33,12 +33,12 @@ _NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL"
 
 @dataclass(frozen=True)
 class Examined:
-    """The result of one handshake.
+    """Result of one handshake.
 
     refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
-    is no link yet, in words; empty if the handshake succeeded. router_ends: when the router's
-    certificate expires [s since 1970], if it was received. accepts: whether connections are
-    accepted there, though perhaps not answered.
+    is no link yet; empty if the handshake succeeded. router_ends: expiry of the router's
+    certificate [s since 1970], if received. accepts: connections are accepted there, though perhaps
+    not answered.
     """
 
     refused: str | None = None
@@ -95,7 +95,6 @@ def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> 
 
 
 def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
-    """The result of a handshake that raised an error."""
     if isinstance(error, TimeoutError):
         return Examined(waits_for="connections are accepted, TLS is not answered")
     reason = (error.reason if isinstance(error, ssl.SSLError) else error.strerror) or str(error)
@@ -110,7 +109,7 @@ def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
 
 
 def _without_keys(link: socket.socket, connect: str) -> Examined:
-    """Whether it is a router with keys, which answers a greeting in TLS."""
+    """Test for a router with keys, which answers a greeting in TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
