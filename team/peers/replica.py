@@ -1,9 +1,8 @@
-"""One peer's copy of the team's set: grow-only, independent of the order in which members arrive.
+"""One peer's copy of the team's set: grow-only, independent of the order of arrival.
 
-Members of one name that differ (a robot that contradicts itself) are decided by their bytes: the
-smaller hash stays, so that all peers agree. The set is bounded: it takes known robots and possible
-incarnations and sequences only, and limits the bytes of each robot, so that none fills another's
-disk.
+Of two different members of one name (a robot contradicts itself) the smaller hash stays, so all
+peers agree. The set accepts only known robots and possible incarnations and sequences, and limits
+the bytes per robot: no robot can fill another's disk.
 """
 
 import hashlib
@@ -16,9 +15,9 @@ from team.peers.members import Member, Stream, about
 from team.wire import messages as m
 
 MOST_SEQUENCES = 200_000
-"""Most submaps of one incarnation."""
+"""Most submaps per incarnation."""
 MOST_STREAMS = 64
-"""Most incarnations of one robot."""
+"""Most incarnations per robot."""
 MOST_STATEMENTS = 2 * MOST_STREAMS + 8
 """Most orders and `Done` messages about one robot."""
 MOST_VERDICTS = 4096
@@ -26,7 +25,7 @@ MOST_VERDICTS = 4096
 SHARE = 256 * 2**20
 """Most bytes about one robot: 8 h of a submap of 4 kB every half second."""
 MOST_INTERVALS = 64
-"""Most intervals of one stream in a summary; those behind follow once gaps have closed."""
+"""Most intervals of a stream in a summary; later ones follow once gaps have closed."""
 MOST_LOOKS = 1024
 """Most inter-robot measurements from one submap."""
 _WORD = 2**256
@@ -38,15 +37,15 @@ TeammateAt = tuple[int, str]
 
 
 class RefusedError(ValueError):
-    """A member is not kept; the text names the bound that it breaks."""
+    """A rejected member; the text names the violated bound."""
 
 
 @dataclass
 class StreamShare:
-    """The members of one incarnation that are here.
+    """Stored members of one incarnation.
 
-    complete: sequences whose submap is here with all inter-robot measurements from it; count: how
-    many of them from 0 on without a gap; beyond: the others. sum: sum of the complete ones' hashes,
+    complete: sequences whose submap is stored with all inter-robot measurements from it; count: how
+    many of them from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes,
     modulo 2²⁵⁶.
     """
 
@@ -62,7 +61,7 @@ class StreamShare:
     def parcel(self, sequence: int) -> list[Member]:
         """A complete submap after the inter-robot measurements from it, in canonical order.
 
-        If there are more of these than the number in the submap, the first ones.
+        Surplus measurements beyond the number in the submap are left out.
         """
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
@@ -85,7 +84,7 @@ class StreamShare:
                 self.count += 1
 
     def forget(self, sequence: int) -> None:
-        """Remove a member of a submap from the counts, since it will be replaced."""
+        """Remove a replaced member of a submap from the counts."""
         if sequence in self.complete:
             self.complete.discard(sequence)
             self.sum = (self.sum - _sum(self.parcel(sequence))) % _WORD
@@ -96,9 +95,7 @@ class StreamShare:
 
 
 class Have(NamedTuple):
-    """The stored share of a robot: number of submaps, and the end of the newest [ns of team
-    time].
-    """
+    """Stored share of a robot: number of submaps, and the end of the newest [ns of team time]."""
 
     submaps: int
     newest_ns: int
@@ -107,7 +104,7 @@ class Have(NamedTuple):
 class Replica:
     """The set of a team with the given robots, as one peer has it.
 
-    replacements: how often a robot contradicted a member that had been passed to the fold.
+    replacements: how often a robot contradicted a member already passed to the fold.
     """
 
     def __init__(self, robots: Iterable[str], share: int = SHARE) -> None:
@@ -122,9 +119,7 @@ class Replica:
         self._announced: _Announced | None = None
 
     def add(self, member: Member) -> Outcome:
-        """Take a member. Raises RefusedError where it can not be of this team or exceeds a
-        bound.
-        """
+        """Add a member; raises RefusedError for a member of another team or beyond a bound."""
         message = member.message
         robot = about(message)
         if robot not in self._bytes:
@@ -207,23 +202,23 @@ class Replica:
     # Contents.
 
     def share_of(self, stream: Stream) -> StreamShare:
-        """The members of a stream that are here; empty where there are none."""
+        """Stored members of a stream."""
         return self.streams.get(stream) or StreamShare()
 
     def have(self, robot: str) -> Have:
-        """How much of a robot is here."""
+        """Stored share of a robot."""
         shares = [share for (name, _), share in self.streams.items() if name == robot]
         newest = max((share.newest_ns for share in shares), default=0)
         return Have(sum(len(share.complete) for share in shares), newest)
 
     @property
     def submaps(self) -> int:
-        """Number of complete submaps that are here."""
+        """Number of complete submaps."""
         return sum(len(share.complete) for share in self.streams.values())
 
     @property
     def concluded(self) -> dict[str, m.Concluded]:
-        """The peers whose final map is out, by robot, as each has announced it."""
+        """Conclusions of the peers whose final map is published, by robot."""
         found = {}
         for robot, statements in self.statements.items():
             member = statements.get(("concluded", 0))
@@ -232,13 +227,13 @@ class Replica:
         return found
 
     def certificates_of(self, robot: str) -> Iterator[bytes]:
-        """The certificates that a robot has stated: more than one where it was renewed."""
+        """Certificates of a robot: several where it was renewed."""
         for member in self.statements.get(robot, {}).values():
             if isinstance(member.message, m.Certificate):
                 yield member.message.certificate
 
     def members(self) -> Iterator[Member]:
-        """Every member, in an order in which a fold can take them one by one."""
+        """Every member, in an order that a fold accepts."""
         for stream in sorted(self.streams):
             share = self.streams[stream]
             if share.start is not None:
@@ -254,7 +249,7 @@ class Replica:
     # Summaries.
 
     def holding(self, stream: Stream) -> m.Holding | None:
-        """What is here of a stream, for a summary; None where nothing can be requested."""
+        """A stream's holding for a summary; None where nothing can be requested."""
         share = self.share_of(stream)
         if share.start is None and not share.complete:
             return None
@@ -288,7 +283,7 @@ class Replica:
         return self._announcement.digest
 
     def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
-        """A summary of the set, small enough to be published again and again."""
+        """Make a summary of the set, small enough to be repeated."""
         announced = self._announcement
         return m.SetSummary(
             stamp_ns=stamp_ns,
@@ -327,7 +322,7 @@ class Replica:
 
 
 class _Announced(NamedTuple):
-    """The contents of a summary, cached until a member arrives."""
+    """Contents of a summary, cached until a member arrives."""
 
     digest: bytes
     holdings: dict[Stream, m.Holding]
@@ -335,7 +330,7 @@ class _Announced(NamedTuple):
 
 
 def _stated(message: m.Message) -> tuple[str, int]:
-    """The name of a statement among those about its robot."""
+    """Name of a statement among those about its robot."""
     match message:
         case m.Done():
             return "done", message.incarnation
@@ -364,9 +359,8 @@ def _rank(member: Member) -> tuple[int, bytes]:
 
 
 def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
-    """First, last, first, last, … of the closed intervals; `count`: those from 0 on without a gap.
-
-    At most MOST_INTERVALS, the first ones.
+    """First, last, first, last, … of the first MOST_INTERVALS closed intervals; `count`: those from
+    0 on without a gap.
     """
     ends: list[int] = [0, count - 1] if count else []
     for each in sorted(s for s in sequences if s >= count):
