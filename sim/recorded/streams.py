@@ -1,4 +1,4 @@
-"""The measurement streams of a log, as a world has them."""
+"""Measurement streams of a log, as of a world."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,9 +28,9 @@ PART = "`teamslam log cut LOG --from S --to S -o PART.mcap` makes a log of a par
 
 
 def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
-    """The measurements of a log with its scenario: its world's, or the recorder's.
+    """Measurements of a log with its scenario: its world's, or the recorder's.
 
-    Of each robot the first incarnation is used. Raises LogError, ScenarioError.
+    Uses the first incarnation of each robot. Raises LogError, ScenarioError.
     """
     log = open_log(path)
     messages = [opened(sample)[2] for sample in log.samples(CHANNELS)]
@@ -50,9 +50,9 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
 def recorded_streams(
     messages: Sequence[m.Message], source: str, clocks: Mapping[str, float] | None = None
 ) -> WorldStreams:
-    """The streams of the measurements among these messages.
+    """Streams of the measurements among these messages.
 
-    clocks: the offset of each robot's odometry clock [s] that is corrected; absent: none.
+    clocks: corrected offset of each robot's odometry clock [s]; absent: none.
     """
     offsets = {} if clocks is None else clocks
     measurements: dict[str, dict[int, m.Measurement]] = {}

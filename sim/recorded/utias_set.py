@@ -1,4 +1,4 @@
-"""A log written as a data set in the UTIAS MRCLAM format."""
+"""Export a log as a data set in the UTIAS MRCLAM format."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +18,8 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 def export_utias(log: Log, folder: Path) -> list[str]:
     """Write the data set into `folder`; the robots in the order of their numbers 1, 2, …
 
-    The format has one stream per robot: the first incarnation of each is written. Raises `LogError`
-    for a log that has no measurements, or not those that the format needs.
+    The format has one stream per robot: the first incarnation of each. Raises `LogError` for a log
+    without measurements or without those that the format needs.
     """
     messages = list(_sound(log))
     measurements = [each for each in messages if isinstance(each, m.Measurement)]
@@ -52,4 +52,4 @@ def _sound(log: Log) -> Iterator[m.Message]:
         try:
             yield opened(sample)[2]
         except WireError:
-            continue  # no node would have let it in either; `teamslam log check` counts it
+            continue  # every node rejects it, too; `teamslam log check` counts it
