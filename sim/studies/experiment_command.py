@@ -1,4 +1,4 @@
-"""The commands `teamslam experiment NAME`: one for each of the catalogue, and `all`."""
+"""The commands `teamslam experiment NAME`: one per entry of the catalogue, and `all`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ app = typer.Typer(
 
 FOLDER = Path("runs") / "experiments"
 FILE_WIDTH = 120
-"""Columns of the tables where they are not shown in a terminal."""
+"""Columns of tables outside a terminal."""
 MOST_SEEDS = 100_000
 ALL = "all"
 Seeds = Annotated[
@@ -50,8 +50,6 @@ Check = Annotated[bool, typer.Option("--check", help="Exit status 1 if a goal is
 
 
 def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
-    """One command for these experiments."""
-
     def run(
         seeds: Seeds = None,
         first: First = 1,
@@ -84,7 +82,7 @@ def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Asked:
-    """The options of a command, but for its seeds."""
+    """Options of a command, except its seeds."""
 
     json_file: Path | None
     output: Path

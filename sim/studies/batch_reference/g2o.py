@@ -1,4 +1,4 @@
-"""Writes the batch problem of a log as a g2o file, for other optimisers to start from.
+"""Write the batch problem of a log as a g2o file, for other optimisers.
 
 VERTEX_SE2 are the poses of the robots' sensors at their keyframes, VERTEX_XY the landmarks, both
 from the joined map and the odometry between; FIX holds the first pose of each robot whose initial
@@ -26,7 +26,7 @@ Poses = Float[np.ndarray, "K 3"]
 
 
 def g2o_lines(samples: Iterable[Sample]) -> Iterator[str]:
-    """The lines of the file.
+    """Lines of the file.
 
     Raises BatchReferenceError for a log without a scenario or without a joined map.
     """

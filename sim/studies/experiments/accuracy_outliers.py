@@ -1,7 +1,7 @@
-"""Compares maps with three outliers in ten measurements with maps without them.
+"""Compare maps with 30 % outliers with maps without them.
 
-The clean run of the same seed leaves out the very measurements that become outliers, so it has as
-many inliers. An outlier has a uniform range and bearing, or the identity of another landmark.
+The clean run of the same seed leaves out the measurements that become outliers, so it has as many
+inliers. An outlier has a uniform range and bearing, or the identity of another landmark.
 """
 
 import msgspec
@@ -43,7 +43,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """The figures of every kind of outlier beside the clean runs."""
+    """Figures of every kind of outlier beside the clean runs."""
     figures: dict[str, dict[str, Figures]] = {}
     goals = []
     for world in WORLDS:
@@ -86,9 +86,9 @@ def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
 
 
 def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
-    """The scenario with outliers among its measurements, which its windows and its centre expect.
+    """The scenario with outliers, and windows and centre that expect them.
 
-    The clean run has the same centre, and windows that take every measurement.
+    The clean run has the same centre, and windows that accept every measurement.
     """
     replace = msgspec.structs.replace
     assert isinstance(scenario.world, SimulatedWorld)

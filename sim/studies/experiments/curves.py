@@ -1,7 +1,7 @@
-"""A task that computes a run's errors over team time: online poses, and one landmark of the map.
+"""Compute a run's errors over team time: online poses, and one landmark of the map.
 
-The landmark is the first that the first robot saw. Its error and its sigma are those of the newest
-map at each time: the fused one, or the robot's own where nothing is fused.
+The landmark is the first that the first robot detected. Its error and its sigma are those of the
+newest map at each time: the fused one, or the robot's own where nothing is fused.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ STEP_S = 1.0
 """Length [s] of a step of the thesis' world."""
 Map = m.FusedMap | m.MapEstimate
 DIGITS = 5
-"""Significant digits of a stored curve: a picture shows three."""
+"""Significant digits of a stored curve."""
 
 
 def curves_task(
@@ -41,11 +41,11 @@ def curves_task(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Task:
-    """A task that computes the curves of one run.
+    """Make the task of the curves of one run.
 
-    team_scenario: the scenario that the team uses, where it differs from the world's. late: each
-    step's measurements are those of the step before. shots: the steps at which maps and paths are
-    stored for pictures.
+    team_scenario: the team's scenario if it differs from the world's. late: each step's
+    measurements are those of the step before. shots: steps whose maps and paths are stored for
+    pictures.
     """
     return Task(
         "sim.studies.experiments.curves:curves_run",
@@ -65,7 +65,7 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """The curves of every robot's pose and of the first landmark, the map's error, and the map at
+    """Curves of every robot's pose and of the first landmark, the map's error, and the map at
     `shots`.
     """
     scenario = loads(msgspec.json.encode(world).decode())
@@ -100,7 +100,7 @@ def curves_run(
 def true_landmarks(
     samples: Iterable[Sample],
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """The ids and positions [m] of the world's landmarks; empty where they are not known."""
+    """Ids and positions [m] of the world's landmarks; empty if unknown."""
     for message in messages(samples, ch.TRUTH_LANDMARKS.key()):
         if isinstance(message, m.TruthLandmarks):
             return translate.landmarks_of(message)
@@ -108,7 +108,7 @@ def true_landmarks(
 
 
 def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
-    """The messages of one key, in their order."""
+    """Messages of one key, in order."""
     return (opened(sample)[2] for sample in samples if sample.key == key)
 
 
@@ -128,8 +128,8 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
-    """The keys of a robot's online poses: the centre's where the centre estimates them; else the
-    robot's own, then those in the team's map.
+    """Keys of a robot's online poses: the centre's if it estimates them; else the robot's own, then
+    those in the team's map.
     """
     if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)
@@ -139,7 +139,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
 def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """The poses and covariances on these keys; at equal times those of the last key."""
+    """Poses and covariances on these keys; at equal times those of the last key."""
     by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in by_stamp:
@@ -168,7 +168,7 @@ def _pose_curve(found: PoseErrors) -> Figures:
 
 
 def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
-    """The team's maps with landmarks in them, in their order; without any, those of the robot."""
+    """The team's maps with landmarks, in order; without any, those of the robot."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
         published = messages(samples, key)
         maps = [
@@ -215,7 +215,7 @@ def _landmark_curve(
     robot: str,
     truth: Mapping[int, Float[np.ndarray, "2"]],
 ) -> Figures | None:
-    """The error of the first landmark that this robot saw; None if it saw none."""
+    """Error of the robot's first landmark; None without one."""
     landmark = next(
         (
             int(translate.scan_of(message)[0][0])
@@ -246,5 +246,5 @@ def _landmark_curve(
 
 
 def short(values: Float[np.ndarray, " K"]) -> list[float]:
-    """The values rounded to DIGITS digits, for JSON."""
+    """Round the values to DIGITS digits, for JSON."""
     return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]

@@ -1,8 +1,8 @@
 """Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
 
-Each has the printed figures, his protocol (`downs_joined`) and ours: the profile of `utias` as it
-is. All use the sensor and odometry models of the profile. His paired t-tests are computed again, on
-the printed figures and on the computed ones.
+Each has the printed figures, his protocol (`downs_joined`) and ours: the unchanged profile of
+`utias`. All use the profile's sensor and odometry models. His paired t-tests are recomputed on the
+printed and on the computed figures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +44,7 @@ from sim.studies.experiments.team_runs import Figures, team_task
 from sim.world.config import UtiasWorld
 
 Row = tuple[float | None, ...]
-"""Errors [m] of robots 1 … 5, or the team's alone; None where there is none."""
+"""Errors [m] of robots 1 … 5, or of the team alone; None where there is none."""
 QUICK_S = 300.0
 TEAM = "team"
 
@@ -59,7 +59,7 @@ class Method(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """A paired t-test: what it compares, its p as printed, and the two sides of it by set.
+    """A paired t-test: its text, its printed p, and its two sides by set.
 
     before: the other table's row by the name of this table's method. tasks: the runs of these.
     """
@@ -87,7 +87,7 @@ class PrintedTable(NamedTuple):
     sample: Callable[[Options, Dataset], Task] | None = None
 
     def tasks(self, options: Options) -> list[Task]:
-        """Every method's runs on every set and the simulator's; what two methods share once."""
+        """Runs of every method on every set and in the simulator."""
         found = self.simulated.tasks(options)
         found += [
             task
@@ -98,7 +98,7 @@ class PrintedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """The rows of each set and of the simulator, the picture of them, the t-tests."""
+        """Rows of each set and of the simulator, their picture, the t-tests."""
         simulated = self.simulated.outcome(self.title, options, results)
         return combined(self.title, (self._of_sets(options, results), simulated))
 
@@ -151,8 +151,8 @@ class PrintedTable(NamedTuple):
         return rows | {m.name: m.row(options, dataset, results) for m in self.methods}
 
     def _tests(self, options: Options, results: Results) -> dict[str, Figures]:
-        """The paired two-sided t-tests: over the robots of sets, or over the sets' means where a
-        table has a team's map.
+        """Paired two-sided t-tests: over the robots of sets, or over the sets' means for a team's
+        map.
         """
         if self.compared is None:
             return {}
@@ -227,7 +227,6 @@ def _spherical(options: Options, dataset: Dataset) -> Task:
 
 
 def _team(options: Options, dataset: Dataset) -> Task:
-    """The whole sets as in `accuracy`: the same runs."""
     return team_task(_profile(options), dataset=dataset) if options.quick else team_on(dataset)
 
 
@@ -291,7 +290,7 @@ def _cells(row: Row) -> list[str]:
 def _paired(
     before: Sequence[float | None], after: Sequence[float | None], one: bool
 ) -> list[tuple[float, float]]:
-    """The pairs of one set; one: the mean of the robots against the team."""
+    """Pairs of one set; one: the mean of the robots against the team."""
     if one:
         known, team = _known(before), _known(after)
         return [(float(np.mean(known)), team[0])] if known and team else []
@@ -337,7 +336,7 @@ def _pair(
     names: Sequence[str],
     figures: Sequence[str],
 ) -> tuple[Method, ...]:
-    """The cross product of the two protocols and the figures."""
+    """Cross product of the two protocols and the figures."""
     found: list[Method] = []
     for k, name in enumerate(names):
         for source in figures:

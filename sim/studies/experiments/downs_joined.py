@@ -1,10 +1,9 @@
-"""Runs after J. Downs' thesis as tasks: whole-run maps of each robot, and submaps joined by his
-method.
+"""Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
 
-His protocol: measurements sampled to one second, a submap for every step, of which only the mean is
-used. Each robot's submaps are joined by least squares with the identity as covariance, and the
-robots' maps are aligned by singular values (`svd-join-spherical`). A submap here is a window of one
-step of the hybrid estimator; his is a step of an EKF without landmarks before it.
+His protocol: measurements sampled to one second, a submap per step, of which only the mean is used.
+Each robot's submaps are joined by least squares with the identity as covariance, and the robots'
+maps are aligned by singular values (`svd-join-spherical`). A submap here is a window of one step of
+the hybrid estimator; his is a step of an EKF without earlier landmarks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,8 +50,8 @@ DRAWN_POINTS = 1000
 
 
 def final_maps_only(scenario: Scenario) -> Scenario:
-    """The scenario without running poses and maps and without broadcasts, of which his tables have
-    nothing; the final map and the smoothed paths are the same without them.
+    """The scenario without running poses, maps and broadcasts, which his tables do not use and
+    which do not influence the final map and the smoothed paths.
     """
     change = msgspec.structs.replace
     robots = tuple(change(robot, pose_s=NEVER_S) for robot in scenario.robots)
@@ -92,8 +91,8 @@ def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str
 
 
 def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
-    """Every robot's submaps joined by his method, and the robots' maps aligned, under his
-    protocol.
+    """Every robot's submaps joined by his method under his protocol, and the robots' maps
+    aligned.
     """
     return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
 
@@ -112,7 +111,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """By robot, the errors of its last own map and of its online path; the map of one robot."""
+    """By robot, errors of its last own map and online path; the map of one robot."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -126,7 +125,7 @@ def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = 
 
 
 def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
-    """The first robot's last map and its paths, to be drawn."""
+    """The first robot's last map and its paths, for a picture."""
     name, robot = next(iter(evaluation.robots.items()))
     maps = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
     last = next((each for each in reversed(maps) if isinstance(each, m.MapEstimate)), None)
@@ -149,10 +148,9 @@ def _thinned(path: Path) -> list[list[float]]:
 def spherical_run(
     scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
 ) -> Figures:
-    """By robot, the errors of its joined map and smoothed path, and the map; the team's errors.
+    """By robot, errors of its joined map and smoothed path, and the map; the team's errors.
 
-    with_covariances: the figures of the same submaps in one join with the covariances that he
-    discards.
+    with_covariances: figures of the same submaps joined once with their covariances.
     """
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
@@ -198,14 +196,14 @@ def _samples(scenario: Mapping[str, Any], path: str | None) -> list[Sample]:
 
 
 def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
-    """A robot's submaps in their order."""
+    """A robot's submaps in order."""
     submaps = [opened(s)[2] for s in samples if s.key == ch.SUBMAP.key(robot)]
     by_sequence = {each.sequence: each for each in submaps if isinstance(each, m.Submap)}
     return [by_sequence[sequence] for sequence in sorted(by_sequence)]
 
 
 def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
-    """The robot's known initial pose; the origin of its own frame where it is unknown."""
+    """The robot's known initial pose, or else the origin of its own frame."""
     for sample in samples:
         if sample.key == ch.START.key(robot):
             message = opened(sample)[2]
@@ -230,7 +228,7 @@ def _joined(
 
 
 def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path:
-    """The end poses of the submaps, at their stamps."""
+    """End poses of the submaps, at their stamps."""
     graph = state.fold.main.graph
     ends = graph.offset[np.array(graph.streams[robot, 0][1:])]
     poses = state.fold.main.state[ends[:, None] + np.arange(3)]
@@ -238,7 +236,6 @@ def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path
 
 
 def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
-    """The error [m] of a joined path."""
     unit = np.broadcast_to(np.eye(3), (len(path.poses), 3, 3))
     errors = pose_errors(path, unit, evaluation.robots[robot].truth)
     return None if errors is None else errors.position_rmse_m
@@ -247,8 +244,8 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """The pairs of positions, one a step, at which two robots measured each other in the same step,
-    in both maps.
+    """Positions, in both maps, of two robots that measured each other in the same step, one pair a
+    step.
     """
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
     found: dict[tuple[Stream, Stream], PointPairs] = {}
@@ -289,7 +286,7 @@ def _looks(
 
 
 def _at(path: Path, step: int) -> int | None:
-    """The index of the pose at a step; None where the robot has none within half a step."""
+    """Index of the pose at a step; None if the robot has none within half a step."""
     stamp_ns = round(step * STEP_S * 1e9)
     nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
     near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S
@@ -299,7 +296,6 @@ def _at(path: Path, step: int) -> int | None:
 def _errors(
     found: LandmarkGaussian, truth: Mapping[int, Float[np.ndarray, "2"]]
 ) -> MapErrors | None:
-    """The errors of the landmarks with truth."""
     known = [k for k, id_ in enumerate(found.ids.tolist()) if id_ in truth]
     if not known:
         return None

@@ -33,7 +33,7 @@ from sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
 class ErrorFigure(NamedTuple):
     """Errors over frames. of: "path" of robot 1, or "map", the mean distance of its landmarks.
 
-    printed: the mean error [m] that the text names, by the method's name.
+    printed: mean error [m] in the text, by the method's name.
     """
 
     title: str
@@ -98,7 +98,7 @@ class ErrorFigure(NamedTuple):
         )
 
     def _curves(self, dataset: Dataset, options: Options, results: Results) -> dict[str, Curves]:
-        """By method, where there is a run of it."""
+        """Curves by method, where there is a run."""
         frames = np.arange(1.0, FRAMES + 1.0)
         found = {}
         for method in self.methods:
@@ -110,7 +110,7 @@ class ErrorFigure(NamedTuple):
 
 
 def _runs(dataset: Dataset, method: Method, options: Options) -> list[Task]:
-    """One run of each seed; of our estimator the first only, since it takes longest on the same
+    """One run per seed; of our estimator the first only, since it takes longest on the same
     data.
     """
     seeds = options.seeds[:1] if method == OURS else options.seeds

@@ -1,4 +1,4 @@
-"""Shows the progress of the runs: a bar with the time left, or plain lines outside a terminal."""
+"""Show the progress of the runs: a bar with the time left, or plain lines outside a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +19,7 @@ def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]
     """A function to call with every finished task; failures are printed at once."""
     console = Console(stderr=True)
     of = f"{len(tasks)} runs" + (f", {found} more are kept from before" if found else "")
-    # Runs cost very different times: the bar goes by what they are expected to cost.
+    # The bar advances by expected cost, which differs widely between runs.
     cost = sum(task.cost for task in tasks)
     bar = Progress(
         BarColumn(bar_width=30),

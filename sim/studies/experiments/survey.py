@@ -1,8 +1,7 @@
-"""All estimators and rules on the same measurements, and the thesis' tables 2.1 and 2.2 in numbers.
+"""All estimators and rules on the same measurements, with the thesis' tables 2.1 and 2.2.
 
-The thesis describes advantages and disadvantages of the methods in words; here are measurements of
-those that are implemented, on its own world and on the one with an accurate sensor. The methods
-that are not implemented are named.
+The thesis describes advantages and disadvantages of the methods in words; these are measurements of
+the implemented ones, on its world and on the one with an accurate sensor.
 """
 
 from typing import NamedTuple
@@ -25,9 +24,7 @@ from team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
 MOST_SEEDS = 12
-"""Most seeds: the methods differ by factors, and there are two dozen pairs of a second or
-two each.
-"""
+"""Most seeds: the methods differ by factors, and two dozen pairs take a second or two each."""
 PARTICLES = (50, 200, 1000)
 SHOWN: Shown = (
     ("rmse", "map [m]", "{:.3f}"),
@@ -86,7 +83,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """One table a world, and the two of the thesis with numbers."""
+    """One table a world, and the thesis' two with numbers."""
     figures = {world: _world(world, options, results) for world in WORLDS}
     seeds = seed_count(len(options.seeds[:MOST_SEEDS]))
     tables = [
@@ -118,7 +115,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def _world(world: str, options: Options, results: Results) -> dict[str, Figures]:
-    """The figures of each pair, and of the batch MAP."""
+    """Figures of each pair, and of the batch MAP."""
     figures = {}
     for pair in PAIRS:
         runs = results.of_all(_runs(world, pair, options))

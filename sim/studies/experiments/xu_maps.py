@@ -49,7 +49,7 @@ class MapFigure(NamedTuple):
     remarks: tuple[str, ...]
 
     def tasks(self, options: Options) -> list[Task]:
-        """A run of each method that is drawn, and those of the error figures."""
+        """A run of each drawn method, and those of the error figures."""
         return [
             each
             for method, reading in self.shown
@@ -93,7 +93,7 @@ class MapFigure(NamedTuple):
         return _run(method, reading, options.seeds[0], self.steps)
 
     def _pictures(self, label: str, run: Figures, seed: int) -> list[Picture]:
-        """A picture for each step, lettered as in the source where there are several."""
+        """A picture per step, lettered as in the source if there are several."""
         name = label.replace(" ", "-").replace(",", "").lower()
         pictures = []
         for k, shot in enumerate(run["shots"]):
@@ -168,7 +168,7 @@ class PathFigure(NamedTuple):
     errors: ErrorFigure
 
     def tasks(self, options: Options) -> list[Task]:
-        """The error figure's runs, and one of each panel and method to be drawn."""
+        """Runs of the error figure, and one of each panel and method for the picture."""
         drawn = [
             self._run(panel, method, options)
             for panel in self.errors.panels

@@ -1,9 +1,9 @@
-"""Rules that fuse whole maps which the robots then absorb, for comparison.
+"""Fusion of whole maps that the robots then absorb, for comparison.
 
-`kalman_per_axis` and `kalman` treat the maps as independent. They are not once a robot has absorbed
-a fused map and sends its own again: every measurement is then counted again with each exchange, and
-the covariance loses its meaning. Covariance intersection stays consistent for any correlation of
-the landmarks that it fuses; the price is that it gives away independent information.
+`kalman_per_axis` and `kalman` treat the maps as independent. Once a robot has absorbed a fused map
+and sends its own again they are not: every measurement is then counted again with each exchange,
+and the covariance loses its meaning. Covariance intersection is consistent for any correlation of
+the landmarks, at the price of independent information.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,9 +43,8 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
 
-    TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and
-    S = S^A S^B/(S^A + S^B). Counts measurements again when its result is absorbed and sent once
-    more.
+    TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and S =
+    S^A S^B/(S^A + S^B). Counts measurements again, as `kalman` does.
     """
     return _one_by_one(_per_axis_pair, maps)
 
@@ -84,9 +83,9 @@ def fused_totally(
     maps: Mapping[str, LandmarkGaussian],
     coordinate_m: float,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """The fusion of the robots' maps, and the maps that were left out, with reasons.
+    """Fuse the robots' maps; returns the result and the rejected maps, with reasons.
 
-    A map is left out if it exceeds the bounds, or if the rule has no result with it: then the maps
+    A map is rejected if it exceeds the bounds, or if the rule has no result with it: then the maps
     are fused one by one in the given order.
     """
     accepted: dict[str, LandmarkGaussian] = {}
@@ -113,7 +112,7 @@ def fused_totally(
 def _tried(
     rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian], maps: Sequence[LandmarkGaussian]
 ) -> LandmarkGaussian | None:
-    """The rule's result; None where there is none, or none in finite numbers."""
+    """The rule's result; None without a finite one."""
     try:
         with np.errstate(all="ignore"):
             fused = rule(maps)
@@ -134,7 +133,7 @@ def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
 
 
 def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
-    """`fused` with those landmarks of `a` that it lacks, by regression on the others."""
+    """Add the landmarks of `a` that `fused` lacks, by regression on the others."""
     in_a, in_fused = _shared(a, fused)
     mean, covariance = carried_along(
         a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused

@@ -1,4 +1,4 @@
-"""The common part of centres on raw measurements: keyframes of the team in, poses and map out."""
+"""Common part of centres on raw measurements: keyframes of the team in, poses and map out."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MapContent:
-    """The contents of a map: the landmarks and, where the rule has one, the joint cost.
+    """Contents of a map: the landmarks and, where the rule has one, the joint cost.
 
-    before: messages that go out before it.
+    before: messages that precede it.
     """
 
     landmarks: LandmarkGaussian = NO_LANDMARKS
@@ -45,8 +45,8 @@ class MeasurementCentre(ComparisonCentre):
     """An estimate over all robots' raw measurements at the centre.
 
     The keyframes of one team time are one step; they are the clock of the maps. The robots announce
-    their models. A robot with an unknown initial pose is left out; where no initial pose is known
-    the first robot's is the frame. A map's members name each robot's last measurement in it.
+    their models. A robot with an unknown initial pose is left out; if none is known the first
+    robot's is the frame. A map's members name each robot's last measurement in it.
     """
 
     inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)
@@ -105,7 +105,7 @@ class MeasurementCentre(ComparisonCentre):
         return self._keyframes.complete
 
     def requests(self) -> list[m.MeasurementsRequest]:
-        """Requests for measurements that the link has lost."""
+        """Requests for lost measurements."""
         return [] if self.finished else self._keyframes.requests(self.attendance.now_ns)
 
     def publish_due(self) -> list[Outgoing]:
@@ -170,7 +170,7 @@ class MeasurementCentre(ComparisonCentre):
     def _sensors_start(
         self, robot: str, pose: Pose, covariance: Matrix | None
     ) -> tuple[Pose, Matrix | None]:
-        """The initial pose of the robot's sensor, of which the keyframes are."""
+        """Initial pose of the robot's sensor, whose poses the keyframes are."""
         sensor = self.models[robot].sensor
         if not sensor.is_mounted:
             return pose, covariance
@@ -233,7 +233,7 @@ class MeasurementCentre(ComparisonCentre):
 
     @property
     def set_digest(self) -> bytes:
-        """The name of the set of measurements so far."""
+        """Digest of the set of measurements so far."""
         members = (self.members[robot] for robot in sorted(self.members))
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return digest_of(self.config_digest, named)
