@@ -19,7 +19,6 @@ app = typer.Typer(
 
 FOLDER = Path("runs") / "experiments"
 FILE_WIDTH = 120
-"""Columns of tables outside a terminal."""
 MOST_SEEDS = 100_000
 ALL = "all"
 Seeds = Annotated[

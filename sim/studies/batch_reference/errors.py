@@ -226,7 +226,6 @@ def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
 
 
 def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -> list[Any]:
-    """Factors between base poses of two robots at one time, where the teammate has a pose."""
     keys = {
         (chain.config.id, int(stamp)): _base_key(chain, c, i)
         for c, chain in enumerate(chains)

@@ -198,7 +198,6 @@ def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> Grow
 
 
 def _scales(robust_c: float | None) -> list[float | None]:
-    """Cauchy's scales of a robust solution, narrowing to `robust_c`."""
     if robust_c is None:
         return [None]
     scales = [ROBUST_START * robust_c]
@@ -210,7 +209,6 @@ def _scales(robust_c: float | None) -> list[float | None]:
 def _descended(
     batch: GrowingBatch, scale: float | None, iterations: int
 ) -> tuple[GrowingBatch, int]:
-    """Optimum of the present graph, and the number of iterations."""
     gtsam = load_gtsam()
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)

@@ -29,7 +29,6 @@ _TAKEN = frozenset(
     channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS, ch.SIGHTINGS)
 )
 _ENDLESS_S = 1e9
-"""Length [s] of the batch's only window."""
 
 
 JITTER_NS = 1_000_000
@@ -190,7 +189,6 @@ def _chain(
 def _of_sensor(
     pose: Pose | None, covariance: Matrix | None, mount: Pose
 ) -> tuple[Pose | None, Matrix | None]:
-    """Initial pose and covariance of a sensor, given those of its base."""
     if pose is None or not mount.any():
         return pose, covariance
     found = moved_by(
@@ -200,7 +198,6 @@ def _of_sensor(
 
 
 def _grid(config: RobotConfig) -> PoseGrid | None:
-    """Grid of a robot whose submaps have pose nodes."""
     if not config.front_end.node_s:
         return None
     return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))

@@ -278,7 +278,6 @@ def _reference_figures(
     run: Evaluation,
     **figures: Any,
 ) -> BatchReference:
-    """Compare the optimum's map, paths and covariances with the truth."""
     assert run.map is not None
     marginals = gtsam.Marginals(graph, optimum)
     ids = np.array(landmarks, dtype=np.uint32)

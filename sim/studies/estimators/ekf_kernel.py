@@ -125,7 +125,6 @@ def _all_applied(
     vector: Float[np.ndarray, " n"],
     out: Float[np.ndarray, " m"],
 ) -> None:
-    """H v of all measurements into `out`."""
     for i in range(len(places)):
         seen_at = (sights[i, 0], sights[i, 1], sights[i, 2])
         out[2 * i], out[2 * i + 1] = _applied(seen_at, places[i], vector)

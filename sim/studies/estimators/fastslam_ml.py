@@ -173,7 +173,6 @@ class _Scan:
 
 
 def _with_room(state: FastSlamMl, more: int) -> FastSlamMl:
-    """Add slots for so many landmarks to every particle."""
     places = state.means.shape[1]
     if int(state.counts.max()) + more <= places:
         return state
@@ -192,7 +191,6 @@ def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
 
 
 def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
-    """Systematic resampling if the effective number is below this share."""
     weights, m = _weights(state), len(state.poses)
     if 1.0 / float(dense.product(weights, weights)) >= below * m:
         return state

@@ -80,7 +80,6 @@ def _moved_and_named(
     bearings: Float[np.ndarray, " n"],
     gate: float,
 ) -> tuple[EkfSlam, UInt32[np.ndarray, " n"]]:
-    """The filter after the motion, and the measurements' landmarks."""
     slam = ekf_slam.filter_step(slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
     unnamed = np.flatnonzero(ids >= UNNAMED)
     given = ids.copy()

@@ -28,7 +28,6 @@ from team.estimation.submap import LocalMap
 Weighting = Literal["identity", "spherical", "full"]
 SETTINGS = JoinSettings()
 NEEDED = 2
-"""Points that tie two frames."""
 
 
 class TooFewPointsError(ValueError):

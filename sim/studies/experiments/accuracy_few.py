@@ -143,9 +143,6 @@ def _cases(options: Options) -> dict[str, list[Task]]:
 
 
 def _few(scenario: Scenario, count: int, seen: bool) -> Scenario:
-    """The scenario with `count` random landmarks and one known initial pose; `seen`: with
-    inter-robot measurements.
-    """
     assert isinstance(scenario.world, SimulatedWorld)
     world = msgspec.structs.replace(scenario.world, landmarks=(), landmark_count=count)
     node_s = SEEN_EVERY_S if seen else 0.0

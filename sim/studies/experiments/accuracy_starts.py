@@ -85,7 +85,6 @@ def unknown_starts(scenario: Scenario) -> Scenario:
 
 
 def _merges(runs: list[Figures]) -> Figures:
-    """Share of robots that joined, and of wrong joins."""
     chi2 = [
         figures["first_pose_chi2"]
         for run in runs

@@ -120,7 +120,6 @@ def _worlds(options: Options) -> list[World]:
 
 
 def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
-    """Tasks of each world and rule."""
     return {
         world.scenario: {
             named(estimator, fusion): [

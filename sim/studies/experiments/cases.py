@@ -20,9 +20,7 @@ from sim.studies.experiments.task import Task
 from team.extras import install_command
 
 FOLDER = "cases"
-"""Folder of stored results within an experiment's folder."""
 _STORED = "output.pkl"
-"""Joblib's file of a stored result."""
 IDLE_S = 5
 """Time [s] after which an idle worker ends."""
 Cached = Callable[..., dict[str, Any]]
@@ -107,7 +105,6 @@ class Cases:
 
 
 def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
-    """Workers: processes of this machine with one thread each, or those of a scheduler."""
     if scheduler is None:
         return [parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=IDLE_S)]
     try:

@@ -155,7 +155,6 @@ def estimated_poses(
 
 
 def _pose_curve(found: PoseErrors) -> Figures:
-    """Distance and heading error with their sigmas; √(σx² + σy²) is that of the distance."""
     errors, sigmas = found.errors, found.sigmas
     return {
         "time_s": short(found.stamps_ns * 1e-9),
@@ -168,7 +167,6 @@ def _pose_curve(found: PoseErrors) -> Figures:
 
 
 def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
-    """The team's maps with landmarks, in order; without any, those of the robot."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
         published = messages(samples, key)
         maps = [
@@ -191,7 +189,6 @@ def _shot(
     lines: Mapping[str, tuple[Path, Path]],
     truth: Mapping[int, Float[np.ndarray, "2"]],
 ) -> Figures:
-    """The newest map, its landmarks' 2 × 2 blocks and its error, and the paths until then."""
     now_ns = round(step * STEP_S * 1e9)
     newest = next((each for each in reversed(maps) if each.stamp_ns <= now_ns), None)
     return {
@@ -215,7 +212,6 @@ def _landmark_curve(
     robot: str,
     truth: Mapping[int, Float[np.ndarray, "2"]],
 ) -> Figures | None:
-    """Error of the robot's first landmark; None without one."""
     landmark = next(
         (
             int(translate.scan_of(message)[0][0])

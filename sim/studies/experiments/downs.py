@@ -207,7 +207,6 @@ class PrintedTable(NamedTuple):
 
 
 def _profile(options: Options) -> Scenario:
-    """The profile; with --quick only its first minutes."""
     scenario = load("utias")
     if not options.quick or not isinstance(scenario.world, UtiasWorld):
         return scenario
@@ -231,7 +230,6 @@ def _team(options: Options, dataset: Dataset) -> Task:
 
 
 def _singles(options: Options, dataset: Dataset) -> list[Task]:
-    """Each robot as a team of its own."""
     scenario = _profile(options)
     return [
         team_task(
@@ -244,8 +242,6 @@ def _singles(options: Options, dataset: Dataset) -> list[Task]:
 def _of_robots(
     task: Callable[[Options, Dataset], Task], name: str
 ) -> Callable[[Options, Dataset, Results], Row]:
-    """A figure of each robot from one run of all."""
-
     def row(options: Options, dataset: Dataset, results: Results) -> Row:
         robots = (results.of(task(options, dataset)) or {}).get("robots", {})
         return tuple(robots.get(robot.id, {}).get(name) for robot in load("utias").robots)
@@ -336,7 +332,6 @@ def _pair(
     names: Sequence[str],
     figures: Sequence[str],
 ) -> tuple[Method, ...]:
-    """Cross product of the two protocols and the figures."""
     found: list[Method] = []
     for k, name in enumerate(names):
         for source in figures:

@@ -46,7 +46,6 @@ from team.wire.bus import Sample, opened
 STEP_S = 1.0
 NEVER_S = 1e6
 DRAWN_POINTS = 1000
-"""Most points of a drawn path."""
 
 
 def final_maps_only(scenario: Scenario) -> Scenario:
@@ -125,7 +124,6 @@ def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = 
 
 
 def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
-    """The first robot's last map and its paths, for a picture."""
     name, robot = next(iter(evaluation.robots.items()))
     maps = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
     last = next((each for each in reversed(maps) if isinstance(each, m.MapEstimate)), None)
@@ -196,7 +194,6 @@ def _samples(scenario: Mapping[str, Any], path: str | None) -> list[Sample]:
 
 
 def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
-    """A robot's submaps in order."""
     submaps = [opened(s)[2] for s in samples if s.key == ch.SUBMAP.key(robot)]
     by_sequence = {each.sequence: each for each in submaps if isinstance(each, m.Submap)}
     return [by_sequence[sequence] for sequence in sorted(by_sequence)]
@@ -228,7 +225,6 @@ def _joined(
 
 
 def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path:
-    """End poses of the submaps, at their stamps."""
     graph = state.fold.main.graph
     ends = graph.offset[np.array(graph.streams[robot, 0][1:])]
     poses = state.fold.main.state[ends[:, None] + np.arange(3)]

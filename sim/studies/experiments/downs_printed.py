@@ -8,7 +8,6 @@ and some averages are not those of their rows.
 from collections.abc import Mapping
 
 Robots = tuple[float, float, float, float, float]
-"""Robots 1 … 5 of a set."""
 
 EKF_MAPS: Mapping[str, Robots] = {
     "1": (0.3304, 0.4240, 0.2255, 0.3733, 0.2437),

@@ -130,7 +130,6 @@ class SimulatedTable(NamedTuple):
         return list(dict.fromkeys([*self.methods, *compared]))
 
     def _errors(self, options: Options, results: Results) -> dict[str, list[float]]:
-        """By world, method and figure, over the seeds."""
         found = {}
         for world in WORLDS:
             count = world.partition("-")[2]
@@ -215,7 +214,6 @@ def _task(world: str, method: Simulated, options: Options, seed: int) -> Task:
 def _by_seed(
     world: str, method: Simulated, name: str, options: Options, results: Results
 ) -> dict[int, float]:
-    """Figure of each seed's run that has it."""
     found = {}
     for seed in options.seeds:
         run = results.of(_task(world, method, options, seed))

@@ -14,7 +14,6 @@ if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.figure import Figure
 
 BAND = (0.1, 0.9)
-"""Quantiles of a picture's band."""
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,6 @@ def _frames(stamps_ns: np.ndarray, start_ns: int) -> list[float]:
 def _robot(
     estimate: Path, covariances: Float[np.ndarray, "K 3 3"], true: Path, start_ns: int
 ) -> Figures:
-    """Curve of a robot's position error over frames, and its lines."""
     thinned = max(1, -(-len(estimate.poses) // _LINE_POINTS))
     end_ns = int(estimate.stamps_ns[-1]) if len(estimate.stamps_ns) else 0
     there = (true.stamps_ns >= start_ns) & (true.stamps_ns <= end_ns)
@@ -160,7 +159,6 @@ def _robot(
 def _map(
     samples: list[Sample], robot: str, truth: Mapping[int, np.ndarray], start_ns: int
 ) -> Figures | None:
-    """Mean distance of the landmarks from the truth over frames, and the last map."""
     fused, own = (
         [
             each
@@ -192,7 +190,6 @@ def _map(
 
 
 def _clouds(samples: list[Sample], robot: str) -> list[list[list[float]]]:
-    """Positions of the particles at eight times."""
     clouds = [
         floats(message.poses, "poses").reshape(-1, 3)[:, :2].round(3).tolist()
         for message in (opened(s)[2] for s in samples if s.key == ch.PARTICLES.key(robot))

@@ -98,7 +98,6 @@ class ErrorFigure(NamedTuple):
         )
 
     def _curves(self, dataset: Dataset, options: Options, results: Results) -> dict[str, Curves]:
-        """Curves by method, where there is a run."""
         frames = np.arange(1.0, FRAMES + 1.0)
         found = {}
         for method in self.methods:

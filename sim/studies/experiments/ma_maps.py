@@ -83,7 +83,6 @@ class PathFigure(NamedTuple):
 
 
 def _mean_errors(run: Figures) -> dict[str, float]:
-    """Mean position error [m] of each robot's path with poses."""
     return {
         name: float(np.mean(robot["curve"]["error_m"]))
         for name, robot in run["robots"].items()
@@ -97,7 +96,6 @@ class _Drawing:
     runs: tuple[tuple[Method, Figures], ...]
 
     def __call__(self, path: Path) -> None:
-        """One panel per method over the same area."""
         picture = figure(6.5 * len(self.runs), 7.2)
         row = picture.subplots(1, len(self.runs), squeeze=False)[0]
         for axis, (method, run) in zip(row, self.runs, strict=True):

@@ -199,7 +199,6 @@ def _section(concluded: Concluded, figures: Sequence[str]) -> str:
 
 
 def _kinds(concluded: Concluded) -> str:
-    """The runs and their parameters, in a collapsed section."""
     if not concluded.kinds:
         return ""
     rows = "".join(

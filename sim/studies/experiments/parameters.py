@@ -26,7 +26,6 @@ def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
 
 
 def _parameters(task: Task) -> Iterator[str]:
-    """Differences of a task's scenarios from the built-in ones, and its other parameters."""
     yield task.work.rpartition(".")[2]
     for name, value in task.parameters.items():
         if isinstance(value, Mapping) and "robots" in value:

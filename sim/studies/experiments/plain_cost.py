@@ -126,7 +126,6 @@ class PlainCost:
         return Solution(state, cost, at_rest=False)
 
     def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
-        """JᵀJ and Jᵀ r."""
         return self._sum.normal(self._terms(state))
 
     def _terms(self, state: Values) -> list[Whitened]:
@@ -229,7 +228,6 @@ Kinds = list[_Submaps | _Sightings | _Priors]
 
 
 def _submaps(graph: Graph, covariance_factor: float) -> Iterator[_Submaps]:
-    """The graph's submaps by their numbers of poses and points."""
     kinds = defaultdict(list)
     for contribution, nodes, *_ in graph.submaps:
         kinds[1 + len(contribution.local.node_stamps), len(nodes) - 1].append((contribution, nodes))
@@ -258,7 +256,6 @@ def _sightings(graph: Graph) -> Iterator[_Sightings]:
 
 
 def _priors(graph: Graph) -> Iterator[_Priors]:
-    """The graph's priors, one by one: they are few."""
     for node, mean, information in graph.priors:
         whitening = np.linalg.cholesky(information).T
         yield _Priors(
@@ -284,5 +281,4 @@ def _whitening(covariance: Rows) -> Rows:
 
 
 def _around(angles: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
-    """Angles in (−π, π]."""
     return np.asarray(np.angle(np.exp(1j * angles)))

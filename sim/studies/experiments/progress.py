@@ -11,7 +11,6 @@ from sim.studies.experiments.cases import Done
 from sim.studies.experiments.task import Task
 
 LINE_S = 10.0
-"""Wall time between two plain lines."""
 
 
 @contextmanager

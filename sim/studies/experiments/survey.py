@@ -115,7 +115,6 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def _world(world: str, options: Options, results: Results) -> dict[str, Figures]:
-    """Figures of each pair, and of the batch MAP."""
     figures = {}
     for pair in PAIRS:
         runs = results.of_all(_runs(world, pair, options))
@@ -160,7 +159,6 @@ def _fastslam(particles: int, options: Options) -> list[Task]:
 
 
 def _table_2_1(figures: dict[str, Figures]) -> Table:
-    """Uncertainty and online, as printed and as measured."""
     rows = []
     for surveyed in SURVEYED:
         found = _found(surveyed, figures)
@@ -179,7 +177,6 @@ def _table_2_1(figures: dict[str, Figures]) -> Table:
 
 
 def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Table:
-    """Adjectives beside numbers."""
     columns: Shown = (
         ("rmse", "map [m]", "{:.2f}"),
         ("nees", "NEES/dof", "{:.3g}"),

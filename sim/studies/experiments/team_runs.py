@@ -149,7 +149,6 @@ class TimedRun:
     def _nodes(
         self, config: CentralConfig
     ) -> tuple[Callable[[RobotConfig, Exchange], RobotNode], type[CentralNode]]:
-        """Makers of nodes that measure the time of handling a message."""
         robots, centre = self._robots, self._centre
 
         def timed_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:

@@ -135,7 +135,6 @@ def judged(
 def _at_truth(
     island: Island, landmarks: Mapping[int, Float[np.ndarray, "2"]], paths: Mapping[str, Path]
 ) -> tuple[Values, set[int]]:
-    """The state with every known node at its true value, and the set of these nodes."""
     graph, state = island.graph, island.state.copy()
     known: set[int] = set()
 

@@ -133,7 +133,6 @@ class ErrorFigure(NamedTuple):
         return Outcome(self.title, figures, (table,), tuple(pictures), remarks=self.remarks)
 
     def _curves(self, panel: Panel, options: Options, results: Results) -> dict[str, Curves]:
-        """Curves by method, where there is a run."""
         steps = np.arange(1, 501) * STEP_S
         found = {}
         for method in panel.methods:
@@ -220,7 +219,6 @@ def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
 
 
 def _of(run: Figures, what: str) -> Figures | None:
-    """Curve of robot 1's pose, or of the landmark."""
     curve: Figures | None = (
         run["landmark"] if what == "landmark" else next(iter(run["poses"].values()), None)
     )

@@ -52,7 +52,6 @@ PARTICLES = 1000
 ANYWHERE_PARTICLES = 20_000
 ANYWHERE_STEPS = (0, 1, 40)
 DRAWN = 2000
-"""Most particles of a picture."""
 STAGES = ("prediction", "update", "resampling")
 _COST_S = 1.0
 
@@ -177,8 +176,6 @@ def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
 
 @dataclass(frozen=True)
 class _Run:
-    """A robot's keyframes in a run, its known map, and its true poses."""
-
     scenario: Scenario
     keyframes: list[RobotKeyframe]
     start: np.ndarray
@@ -304,7 +301,6 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 
 def _summary(state: Localisation, true: np.ndarray) -> Figures:
-    """Error of the cloud's mean, and the cloud's own covariance."""
     mean, covariance = localisation.pose_gaussian(state)
     off = mean[:2] - true[:2]
     return {

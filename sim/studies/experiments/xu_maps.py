@@ -93,7 +93,6 @@ class MapFigure(NamedTuple):
         return _run(method, reading, options.seeds[0], self.steps)
 
     def _pictures(self, label: str, run: Figures, seed: int) -> list[Picture]:
-        """A picture per step, lettered as in the source if there are several."""
         name = label.replace(" ", "-").replace(",", "").lower()
         pictures = []
         for k, shot in enumerate(run["shots"]):
@@ -114,7 +113,6 @@ def _run(method: Method, reading: Reading, seed: int, shots: tuple[int, ...] = (
 
 
 def _named(method: Method, reading: Reading) -> str:
-    """The method's name with its reading, unless the name has it."""
     return method.name if "," in method.name else f"{method.name}, {_READ[reading]}"
 
 

@@ -33,8 +33,6 @@ from team.robot.own_map import InitialPose
 
 
 def _random(filter_step: Callable[..., Any]) -> FilterStep:
-    """Step of an estimator that draws random numbers."""
-
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
         increment, *scan, _ = step
         return filter_step(state, increment, config.sensor, *scan, generator)
@@ -45,8 +43,6 @@ def _random(filter_step: Callable[..., Any]) -> FilterStep:
 def _exact(
     initial_state: Callable[..., Any], filter_step: Callable[..., Any]
 ) -> tuple[InitialState, FilterStep]:
-    """Start and step of a deterministic estimator."""
-
     def start(
         config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
     ) -> Any:
@@ -87,7 +83,6 @@ def _thesis_step(
 
 
 def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
-    """Innovation against the particles of a state."""
     return lambda state, *measurements: innovation(particles(state), *measurements)
 
 
@@ -112,7 +107,6 @@ def _thesis_absorbed(
 def _coded_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> CodedState:
-    """An exact start, as in the thesis."""
     pose = np.zeros(3) if initial.pose is None else initial.pose
     return hybrid_thesis_coded.started(pose, config.front_end.particles)
 

@@ -154,7 +154,6 @@ class StreamMapper(ExchangingMapper):
         return False
 
     def _publish(self, estimates: Estimates) -> None:
-        """Publish the results of an interval, or of the stream's end."""
         writer, sequence = self.writer, self.sequence
         if estimates.pose_ns is not None:
             self.out += self.poses.publish(estimates.pose_ns, self)

@@ -125,7 +125,6 @@ class RunningEstimator:
         )
 
     def _cloud(self, map_ns: int | None) -> Callable[[], Cloud] | None:
-        """Particles, if there are any and a map is published."""
         if map_ns is None or self._filter.particles is None:
             return None
         return partial(thin_out, self._filter.particles(self._state), np.zeros(3))
@@ -144,7 +143,6 @@ class RunningEstimator:
             self._advance(keyframe.stamp_ns, motion, *seen)
 
     def _became(self) -> Became | None:
-        """Landmark of each detection without an identity so far."""
         if not self._looks or self._filter.took is None:
             return None
         numbers = self._filter.took(self._state)

@@ -105,7 +105,6 @@ class RoundsCentre(ComparisonCentre):
         return msgspec.structs.replace(last, final=True, reasons=reasons)
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> Outgoing:
-        """Fused map of a round."""
         values = {
             x.robot: LandmarkGaussian(
                 *translate.landmarks_of(x), translate.landmark_covariance_of(x)

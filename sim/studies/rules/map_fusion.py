@@ -123,7 +123,6 @@ def _tried(
 
 
 def _shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
-    """Indices of the common landmarks' coordinates in a and in b."""
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     return _points(in_a), _points(in_b)
 

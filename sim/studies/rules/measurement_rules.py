@@ -179,7 +179,6 @@ class MeasurementCentre(ComparisonCentre):
         return start.mean, None if covariance is None else start.covariance
 
     def _is_placed(self, start: m.InitialPose) -> bool:
-        """Whether the initial pose is known, and within the bounds."""
         value = translate.start_of(start)
         return value is not None and start_beyond(value, self.config.bounds) is None
 

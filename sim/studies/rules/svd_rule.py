@@ -168,7 +168,6 @@ class SvdCentre(CentralNode):
 
 
 def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
-    """Add a submap to the map; None without a solution or a covariance."""
     try:
         with np.errstate(all="ignore"):
             after = svd_joining.filter_step(state, robot, local)
@@ -180,7 +179,6 @@ def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoi
 
 
 def _solution(state: SubmapJoining) -> SubmapJoining:
-    """The full solution, or without one the state before it."""
     try:
         with np.errstate(all="ignore"):
             return svd_joining.solved(state)
