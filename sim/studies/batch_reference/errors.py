@@ -29,23 +29,20 @@ from team.estimation.geometry import Point, wrapped
 from team.estimation.models import NEAREST_M, predicted
 
 BIASES = ("bearing", "range_offset", "range_scale")
-"""Sensor biases that the centre would estimate, in the order of the state."""
+"""Sensor biases of the centre's model, in state order."""
 FORGOTTEN = 1e-3
-"""Correlation below which errors count as independent, and the process begins anew."""
+"""Correlation below which the error process begins anew."""
 _ERRORS = 2**56
 _BIASES = 2**57
 _BASES = 2**58
 PINNED_SIGMA = 1e-6
-"""Standard deviation [m, rad] that ties a base's pose to its mounted sensor's: the least that GTSAM
-handles.
-"""
+"""Standard deviation [m, rad] between base and mounted sensor: the least that GTSAM handles."""
 
 
 class Look(NamedTuple):
-    """A landmark measured from a pose of a chain, and the error state of this measurement.
+    """A landmark's measurement from a pose of a chain, with its error state.
 
-    before: error state of the same landmark's measurement gap_s earlier. number: index of the
-    measurement in its scan.
+    before: error state of the landmark's measurement gap_s earlier. number: index in the scan.
     """
 
     key: int
@@ -65,7 +62,7 @@ def bias_key(chain: int) -> int:
 
 
 def detections_of(chains: Sequence[Chain]) -> list[Look]:
-    """All measurements of landmarks in the order of chain, pose and landmark."""
+    """All measurements in the order of chain, pose and landmark."""
     looks: list[Look] = []
     for c, chain in enumerate(chains):
         last: dict[int, tuple[int, int]] = {}
@@ -101,10 +98,10 @@ def profile_graph(
     robust_c: float | None,
     sigmas: BiasSigmas,
 ) -> Any:
-    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+    """All factors. The range noise is that at the joined solution's range.
 
-    The Cauchy loss of scale c is on √(χ²/2) of each measurement and inter-robot measurement; the
-    centre's is on √(χ²/dim) of each submap.
+    The Cauchy loss of scale c is on √(χ²/2) of each measurement; the centre's is on √(χ²/dim) of
+    each submap.
     """
     graph = path_graph(gtsam, chains, poses)
     loss = None if robust_c is None else math.sqrt(2.0) * robust_c
@@ -140,12 +137,12 @@ def profile_graph(
 
 
 def has_biases(chain: Chain) -> bool:
-    """Whether the centre would estimate a bias of this robot's sensor."""
+    """Whether the centre would estimate this robot's sensor biases."""
     return bool(set(BIASES) & set(chain.config.front_end.biases))
 
 
 def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
-    """Add all error states and biases at zero, and the bases at their sensors' poses."""
+    """Add error states and biases at zero, and the bases at their sensors' poses."""
     for c, i in _bases(chains):
         pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
         values.insert(_base_key(chains[c], c, i), pose)
@@ -208,13 +205,13 @@ def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
 
 
 def _base_key(chain: Chain, number: int, pose: int) -> int:
-    """Key of the base's pose: the sensor's own unless it is mounted away from the base."""
+    """Key of the base's pose: the sensor's own unless mounted."""
     own = pose_key(number, pose)
     return _BASES + own if chain.config.sensor.is_mounted else own
 
 
 def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
-    """(chain, pose) of the base's poses that are states: those with inter-robot measurements."""
+    """(chain, pose) of the base's poses with inter-robot measurements."""
     times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
     return [
         (c, i)

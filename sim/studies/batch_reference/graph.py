@@ -1,7 +1,6 @@
 """Factor graph of the batch MAP in GTSAM: keys, factors and values.
 
-GTSAM is a parameter, since it is an optional extra. Its poses are perturbed on the right, like
-ours.
+GTSAM is a parameter: an optional extra. Poses are perturbed on the right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,15 +20,15 @@ from team.registry import NotInstalledError
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32
 FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
-"""Added to each keyframe's motion (forward [m], left [m], turn [rad]), whose covariance is singular
-without slip and zero without motion.
+"""Added to each motion (forward [m], left [m], turn [rad]): its covariance is singular without slip
+and zero without motion.
 """
 EXACT_SIGMA = 1e-5
 """Standard deviation of an exactly known initial pose [m, rad]."""
 
 
 def load_gtsam() -> Any:
-    """Import GTSAM; raises NotInstalledError with the command that installs it."""
+    """Import GTSAM; raises NotInstalledError."""
     try:
         import gtsam
     except ImportError:
@@ -47,14 +46,14 @@ def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
 
 
 def pose_key(chain: int, pose: int) -> int:
-    """Key of a pose of a chain; a landmark's is its id, which is below 2³²."""
+    """Key of a pose; a landmark's is its id < 2³²."""
     return (chain + 1) * _CHAIN + pose
 
 
 def landmark_starts(
     chains: Sequence[Chain], poses: Sequence[Poses], joined: MapResult
 ) -> dict[int, Point]:
-    """Initial position of every landmark: the joined map's, else by its first measurement."""
+    """Initial positions: the joined map's, else by the first measurement."""
     known = dict(zip(joined.ids.tolist(), joined.means, strict=True))
     found: dict[int, Point] = {}
     for chain, path in zip(chains, poses, strict=True):
@@ -72,9 +71,9 @@ def factor_graph(
     landmarks: Mapping[int, Point],
     robust_c: float | None,
 ) -> Any:
-    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+    """All factors. The range noise is that at the joined solution's range.
 
-    If no initial pose is known, the first chain's is fixed to the joined solution's.
+    Without a known initial pose the first chain's is fixed to the joined solution's.
     """
     graph = path_graph(gtsam, chains, poses)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
@@ -114,16 +113,14 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
 
 
 def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
-    """Noise model with a Cauchy loss of this scale; None: without a loss."""
+    """Noise model with a Cauchy loss of this scale, if any."""
     if c is None:
         return model
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
 
 
 def start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
-    """Prior of the initial pose; its covariance in (x, y, θ) is rotated into the pose's tangent
-    space.
-    """
+    """Prior of the initial pose, its (x, y, θ) covariance rotated into the tangent space."""
     if covariance is None:
         model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
     else:

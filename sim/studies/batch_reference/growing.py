@@ -29,25 +29,24 @@ from team.estimation.geometry import Pose, compose, tangent
 from team.estimation.models import located, predicted
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
-"""A robust solution begins with Cauchy's scale 8 c, which narrows to c: a residual of a
-dead-reckoned pose is not an outlier.
+"""A robust solution begins with Cauchy's scale 8 c, which narrows to c: errors of dead reckoning
+are no outliers.
 """
 _POSES = 2**32
-"""First key of a pose; a landmark's key is its id, which is below 2³²."""
+"""First key of a pose; a landmark's is its id < 2³²."""
 
 
 class UnsolvableError(ValueError):
-    """Measurements without a solution: an unknown is undetermined, or a number overflows."""
+    """An unknown is undetermined, or a number overflows."""
 
 
 @dataclass(frozen=True, eq=False)
 class GrowingBatch:
     """Estimate of all poses and landmarks, in the map frame.
 
-    starts: initial pose of each robot with its covariance in (x, y, θ); None: exactly known. steps:
-    step k ends at pose len(starts) + k. poses: (x [m], y [m], θ [rad]), initial poses first.
-    landmarks: [m], by id. robust_c: Cauchy's scale on √χ² of a measurement (2 numbers); None: least
-    squares.
+    starts: initial poses with covariance in (x, y, θ); None: exact. steps: step k ends at pose
+    len(starts) + k. poses: (x [m], y [m], θ [rad]), initial poses first. landmarks: [m], by id.
+    robust_c: Cauchy's scale on √χ² of a measurement (2 numbers); None: least squares.
     """
 
     starts: Mapping[str, tuple[Pose, Matrix | None]]
@@ -62,9 +61,7 @@ class GrowingBatch:
         return np.array(sorted(self.landmarks), np.uint32)
 
     def places(self, robot: str) -> list[int]:
-        """Rows of a robot's poses, its initial pose first; raises ValueError for a robot without
-        one.
-        """
+        """Rows of a robot's poses, initial pose first; ValueError without one."""
         robots = list(self.starts)
         if robot not in self.starts:
             raise ValueError(f"{robot} has no start")
@@ -111,7 +108,7 @@ class GrowingBatch:
         return self.graph(self.robust_c)
 
     def graph(self, robust_c: float | None) -> Any:
-        """Factors, with the noise of measurements at the present estimate."""
+        """Factors, with measurement noise at the present estimate."""
         gtsam = load_gtsam()
         graph = gtsam.NonlinearFactorGraph()
         floor = np.diag(FLOOR_SIGMAS) ** 2
@@ -138,7 +135,7 @@ class GrowingBatch:
 
     @cached_property
     def marginals(self) -> Any:
-        """GTSAM's marginals; raises `UnsolvableError` where an unknown is not determined."""
+        """GTSAM's marginals; raises `UnsolvableError`."""
         try:
             return load_gtsam().Marginals(self._graph, self.values)
         except RuntimeError as error:
@@ -155,10 +152,10 @@ def initial_state(
 
 
 def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
-    """Append steps to the batch, in the given order.
+    """Append steps to the batch.
 
-    A new pose is dead-reckoned from the robot's newest one, a new landmark is placed by its first
-    measurement. Raises ValueError for a robot without an initial pose.
+    A new pose is dead-reckoned, a new landmark placed by its first measurement. Raises ValueError
+    for a robot without an initial pose.
     """
     newest = {robot: batch.poses[batch.places(robot)[-1]] for robot in batch.starts}
     poses, landmarks = [*batch.poses], dict(batch.landmarks)
@@ -246,9 +243,8 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
-    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ).
-
-    Raises ValueError for a robot that is not in the batch.
+    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ); ValueError for an
+    unknown robot.
     """
     place = batch.places(robot)[-1]
     return PoseGaussian(batch.poses[place], _covariance(batch, place))

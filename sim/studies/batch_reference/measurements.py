@@ -36,13 +36,13 @@ JITTER_NS = 1_000_000
 
 
 class BatchReferenceError(RuntimeError):
-    """The batch reference cannot be computed; the text gives the reason and the remedy."""
+    """The batch reference cannot be computed; the text gives reason and remedy."""
 
 
 class Scan(NamedTuple):
-    """Measurements from one pose: accepted and calibrated ranges [m] and bearings [rad].
+    """Accepted, calibrated ranges [m] and bearings [rad] from one pose.
 
-    own: covariances that come with them (`team.estimation.scans`).
+    own: their covariances (`team.estimation.scans`).
     """
 
     ids: UInt32[np.ndarray, " n"]
@@ -51,9 +51,8 @@ class Scan(NamedTuple):
     own: Own = unclaimed(0)
 
     def noise(self, k: int, sensor: Sensor, distance: float) -> Matrix:
-        """Covariance of (range, bearing) of measurement k at this predicted range.
-
-        For a point: the first-order covariance at the measured point.
+        """Covariance of (range, bearing) k at this predicted range; of a point, at the measured
+        one.
         """
         if not self.own.size:
             return np.diag(noise(sensor, distance))
@@ -67,9 +66,9 @@ class Chain:
     pose.
 
     The base is at pose ∘ mount⁻¹ (`of_base`, `of_sensor`). increments[i] leads from pose i to pose
-    i + 1, scans[i] is measured from pose i + 1. start: initial pose (None: unknown), with its
-    covariance (None: exact). sightings: inter-robot measurements from the base's poses at the
-    team's grid times, if requested.
+    i + 1, scans[i] is from pose i + 1. start: initial pose (None: unknown), with its covariance
+    (None: exact). sightings: inter-robot measurements from the base's poses at grid times, if
+    requested.
     """
 
     config: RobotConfig
@@ -109,8 +108,8 @@ def chains_of(
 ) -> list[Chain]:
     """Chains of all robots by (robot, incarnation), each measurement once and in order.
 
-    With inter-robot measurements there is also a pose at each time of the team's grid
-    (`front_end.node_s`). Raises WireError for an invalid measurement.
+    sightings: with a pose at each grid time (`front_end.node_s`). Raises WireError for an invalid
+    measurement.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
@@ -134,7 +133,7 @@ def chains_of(
 def _chain(
     config: RobotConfig, incarnation: int, measurements: Sequence[m.Measurement], sightings: bool
 ) -> Chain | None:
-    """None for a stream without odometry, which has no motion between its poses."""
+    """None for a stream without odometry."""
     odometry = [
         translate.interval_of(measurement, config)
         for measurement in measurements
@@ -207,9 +206,8 @@ def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
     """Interpolate a chain's poses between known poses (at least one) by its odometry, in three
     ways.
 
-    Forward from the known pose before each; backward from the one after it; and the mean of both,
-    weighted by the time to each. Odometry up to a known pose counts to the chain's last pose that
-    is not after it.
+    Forward from the known pose before; backward from the one after; and the mean of both, weighted
+    by the time to each. Odometry up to a known pose counts to the last pose not after it.
     """
     odometry = chain.dead_reckoned
     at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1

@@ -27,7 +27,7 @@ class DeadReckoning:
 
 
 def initial_state(pose: Pose) -> DeadReckoning:
-    """Exact pose; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 

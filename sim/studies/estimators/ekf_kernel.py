@@ -1,8 +1,8 @@
 """EKF-SLAM step in one compiled pass: motion, measurements of known landmarks, new landmarks.
 
-The state is (x, y, theta, x₁, y₁, …); `mean` and `P` are fresh arrays with room for the new
-landmarks, written in place. A sensor is (σ_range², σ_range_per_m², σ_bearing²); the noise of a
-range is that of the predicted range.
+The state is (x, y, theta, x₁, y₁, …); `mean` and `P` have room for the new landmarks and are
+written in place. A sensor is (σ_range², σ_range_per_m², σ_bearing²); range noise is at the
+predicted range.
 """
 
 import math
@@ -30,9 +30,9 @@ def step(
 ) -> bool:
     """Perform one step; before it only the pose and the first `known` landmarks are in mean and P.
 
-    slots: landmark of each measurement in the state; first: first sight of it. A further
-    measurement of a landmark that is new in this step updates it after its placement. False where
-    the innovation covariance is not positive definite; mean and P are then invalid.
+    slots: landmark of each measurement in the state; first: first sight of it. Further measurements
+    of a new landmark update it after its placement. False where the innovation covariance is not
+    positive definite; mean and P are then invalid.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]

@@ -33,7 +33,7 @@ class EkfSlam:
 
 
 def initial_state(pose: Pose) -> EkfSlam:
-    """Exact pose; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
@@ -47,9 +47,8 @@ def filter_step(
 ) -> EkfSlam:
     """Move, update by all measurements of known landmarks at once, then place the new ones.
 
-    ranges [m] and bearings [rad] are calibrated. A further measurement of a landmark that is new in
-    this keyframe updates it after its placement. Raises NotACovarianceError where the state's
-    covariance is no longer positive definite.
+    ranges [m] and bearings [rad] are calibrated. Further measurements of a new landmark update it
+    after its placement. Raises NotACovarianceError.
     """
     ids_after, slots, first = slots_of(state.ids, ids)
     n = 3 + 2 * len(ids_after)
@@ -106,7 +105,7 @@ def landmark_gaussian(state: EkfSlam) -> LandmarkGaussian:
 
 
 def local_map(state: EkfSlam) -> LocalMap:
-    """The whole Gaussian with its landmarks by ascending id: a submap, if it began at pose zero."""
+    """The whole Gaussian, landmarks by ascending id: a submap, if it began at pose zero."""
     order = np.argsort(state.ids)
     columns = (3 + 2 * order[:, None] + np.arange(2)).ravel()
     at = np.concatenate((np.arange(3), columns))

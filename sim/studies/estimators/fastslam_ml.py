@@ -1,9 +1,8 @@
 """FastSLAM 1.0 with maximum-likelihood data association in each particle.
 
-Montemerlo and Thrun 2003: each particle assigns each detection to its landmark with the largest
-likelihood, or to a new one where none reaches that at the gate's edge. Particles have maps of
-different sizes, so there is no common state; the map and the association are the heaviest
-particle's.
+Montemerlo and Thrun 2003: each particle assigns a detection to its likeliest landmark, or to a new
+one where none reaches the likelihood at the gate's edge. Maps differ in size, so there is no common
+state; map and association are the heaviest particle's.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from team.estimation.models import Increment
 class FastSlamMl:
     """M particles with C landmark slots each, of which the first counts[m] are used.
 
-    seen: number of detections per slot. took: slot of each detection so far, by particle.
+    seen: detections per slot. took: slot of each detection, by particle.
     """
 
     poses: Float[np.ndarray, "M 3"]
@@ -73,7 +72,7 @@ def filter_step(
 
 
 class _Scan:
-    """A scan in progress: copies of the state's arrays, and the landmarks already used."""
+    """A scan in progress: the state's arrays, and the landmarks already used."""
 
     def __init__(self, state: FastSlamMl) -> None:
         self._state = state

@@ -1,9 +1,9 @@
 """Hybrid-SLAM as stated in the thesis: after each step all particles become their weighted mean.
 
-W. Xu, sections 4.2 and 4.3. The reset discards the correlation of pose and landmarks and all of the
-pose's uncertainty but the last step's, so the covariances are far too small; `window` avoids this.
-Two corrections: the initial covariance of a landmark follows from the measurement (the thesis sets
-30 m), and the weights start anew with each step, as in its text, not its program.
+W. Xu, sections 4.2 and 4.3. The reset discards the correlation of pose and landmarks and all pose
+uncertainty but the last step's, so the covariances are far too small; `window` avoids this. Two
+corrections: the initial covariance of a landmark follows from the measurement (thesis: 30 m), and
+the weights start anew with each step, as in the text, not the program.
 """
 
 from dataclasses import dataclass
@@ -24,9 +24,8 @@ from team.estimation.models import Increment
 class ThesisState:
     """Mean pose and a map of independent landmarks, in the map frame.
 
-    pose: (x [m], y [m], theta [rad]). pose_covariance: the spread of the last step's particles,
-    [m², m·rad, rad²]; may be singular. ids: strictly ascending. landmarks: positions [m];
-    covariances: one 2 × 2 matrix each [m²].
+    pose: (x [m], y [m], theta [rad]). pose_covariance: spread of the last step's particles; may be
+    singular. ids: strictly ascending. landmarks: [m]; covariances: 2 × 2 each [m²].
     """
 
     pose: Pose
@@ -55,8 +54,7 @@ def filter_step(
 ) -> ThesisState:
     """Sample poses about the mean, update and weigh (FastSLAM 1.0), and reset to eq. 4.5-4.6.
 
-    Landmarks without a measurement keep their values exactly. ranges [m] and bearings [rad] are
-    calibrated.
+    Unmeasured landmarks stay exactly equal. ranges [m] and bearings [rad] are calibrated.
     """
     after, _ = fastslam.filter_step(
         particles=reset(state, ids, particles),
@@ -81,10 +79,7 @@ def filter_step(
 
 
 def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> Particles:
-    """Particles at the mean, with these landmarks: the state before a step.
-
-    All correlations and the pose's covariance are discarded.
-    """
+    """Particles at the mean with these landmarks, without correlations or pose covariance."""
     observed = np.isin(state.ids, ids)
     blocks = state.covariances[observed]
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
@@ -105,8 +100,8 @@ def absorbed(
 ) -> ThesisState:
     """Replace the state's landmarks of the same id; add unknown ones.
 
-    This is the feedback of the thesis' fused map (section 5.2): fusing the result again counts its
-    measurements again.
+    The feedback of the thesis' fused map (section 5.2): fusing the result again counts measurements
+    again.
     """
     others = ~np.isin(state.ids, ids)
     merged = np.concatenate((state.ids[others], ids))

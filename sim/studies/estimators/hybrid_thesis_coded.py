@@ -1,11 +1,10 @@
 """Hybrid-SLAM as in the appendix of W. Xu's thesis, where its program differs from its text.
 
-The particles' poses and landmarks become their weighted mean after each step, as in the text
-(`hybrid_thesis`); but the weights carry over from step to step (`particle_w(j) = particle_w(j)*w`,
-reset only if all are zero) and nothing is resampled: soon a few particles carry all the weight and
-the others' spread no longer counts. Each particle keeps its own landmark covariances: those of eq.
-4.6 are computed and not used. A new landmark begins with 15 m and 17.8°, rotated by a matrix with
-one wrong sign (`Gz = [c r*s; s r*c]`).
+Poses and landmarks become their weighted mean after each step, as in the text (`hybrid_thesis`);
+but the weights carry over (`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without
+resampling: soon a few particles carry all the weight. Each particle keeps its own landmark
+covariances: those of eq. 4.6 are computed and not used. A new landmark begins with 15 m and 17.8°,
+rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
 """
 
 import math
@@ -32,8 +31,8 @@ FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
 class CodedState:
     """The particles before and after they were set to their mean.
 
-    drawn: the last step's particles, whose pose and map are reported. particles: poses and
-    landmarks are the mean; weights and covariances are each particle's own.
+    drawn: the last step's particles, whose pose and map are reported. particles: at the mean, with
+    own weights and covariances.
     """
 
     drawn: Particles

@@ -30,8 +30,8 @@ class Localisation:
     """Weighted poses and their map.
 
     cloud: particles without landmarks, in the map frame. ids, landmarks: the map, ids strictly
-    ascending, positions [m]. resample_below: relative effective sample size below which a step
-    begins with a resampling; Xu takes 0.5.
+    ascending, [m]. resample_below: relative effective sample size below which a step resamples; Xu:
+    0.5.
     """
 
     cloud: Particles
@@ -46,7 +46,7 @@ def initial_state(
     ids: UInt32[np.ndarray, " L"],
     landmarks: Float[np.ndarray, "L 2"],
 ) -> Localisation:
-    """Exact pose; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
@@ -78,8 +78,8 @@ def filter_step(
 ) -> Localisation:
     """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
 
-    ranges [m] and bearings [rad] are calibrated; a measurement of an unmapped landmark is left out.
-    Draws one uniform number if it resamples and M × 3 normal ones.
+    ranges [m] and bearings [rad] are calibrated; unmapped landmarks are left out. Draws one uniform
+    number if it resamples and M × 3 normal ones.
     """
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)
@@ -109,8 +109,7 @@ def innovation(
 ) -> Innovation:
     """Innovation of the measurements that `filter_step` would use, on an exact map.
 
-    A cloud of several modes predicts a broad mixture, whose innovation is as uninformative as its
-    Gaussian.
+    Uninformative for a cloud of several modes.
     """
     read = np.isin(state.ids, ids)
     count, known = len(state.cloud.poses), int(read.sum())

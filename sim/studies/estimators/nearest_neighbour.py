@@ -1,8 +1,8 @@
 """EKF-SLAM over the whole run with nearest-neighbour data association.
 
 Smith, Self and Cheeseman 1990 with individual compatibility and nearest neighbour (Neira and Tardós
-2001, section II): the best pair of a scan first, each detection and each landmark once; a detection
-beyond the gate is a new landmark. A wrong pair is never undone.
+2001, section II): the best pair of a scan first, each detection and landmark once; beyond the gate
+a landmark is new. A wrong pair is never undone.
 """
 
 from dataclasses import dataclass, replace
@@ -64,7 +64,7 @@ def innovation(
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
     """Innovation of the measurements that `filter_step` would use, after association: ids from
-    UNNAMED on name rows of a scan, not landmarks.
+    UNNAMED on are rows of a scan.
     """
     if (ids >= UNNAMED).any():
         _, ids = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, GATE)

@@ -1,8 +1,8 @@
 """FastSLAM over the whole run: one set of particles from start to end.
 
-Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Every resampling discards paths
-for good: after a long run all particles share their early path, so the landmarks' covariance is far
-too small. `window` uses the same particles without over-confidence.
+Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Resampling discards paths for
+good: after a long run all particles share their early path, so the landmarks' covariance is far too
+small, unlike that of `window`.
 """
 
 from dataclasses import dataclass, replace
@@ -25,8 +25,8 @@ from team.estimation.scans import Own
 class PlainFastSlam:
     """Weighted particles in the map frame, with their proposal and resampling.
 
-    resample_below: relative effective sample size below which a step begins with a resampling (Xu,
-    eq. 3.24-3.25: 0.5); 1: at every step, as Ma & Ma and Montemerlo do.
+    resample_below: relative effective sample size below which a step resamples (Xu, eq. 3.24-3.25:
+    0.5); 1: always, as Ma & Ma and Montemerlo do.
     """
 
     particles: Particles
@@ -37,7 +37,7 @@ class PlainFastSlam:
 def initial_state(
     pose: Pose, particles: int, proposal: Proposal, resample_below: float
 ) -> PlainFastSlam:
-    """Exact pose; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     poses = np.tile(pose, (particles, 1))
     return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 

@@ -1,10 +1,9 @@
 """Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
 
 Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1) with their means only: P is
-the identity, so a radian of heading counts as a metre (sections 3.2 and 4.3). Two robots that
-measure each other exchange their maps, rotate one into the frame of the other by a singular value
-decomposition and join the landmarks alone (section 4.3 and appendix II). The minimiser is that of
-`joining`: only the covariances differ.
+the identity, so a radian of heading counts as a metre (sections 3.2 and 4.3). Robots that measure
+each other exchange maps, rotate one into the other's frame by a singular value decomposition and
+join the landmarks alone (section 4.3 and appendix II). The minimiser is that of `joining`.
 """
 
 from collections.abc import Mapping
@@ -43,7 +42,7 @@ def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
     """The submap with the covariance for the join.
 
     "identity": I. "spherical": a position and every landmark get half the trace of their block
-    times I, a heading keeps its variance, all correlations are dropped (each block commutes with
+    times I, a heading keeps its variance, correlations are dropped (each block commutes with
     rotations, as Huang's count of minima requires). "full": unchanged.
     """
     if weighting == "full":
@@ -144,7 +143,7 @@ def mutual_sighting(
     """The positions of two robots that measure each other, as points in both maps.
 
     Each is at its own map's pose and, in the other map, at its measured position; these replace
-    shared poses (Downs, chapter 3). pose_a is in frame a, pose_b in frame b.
+    shared poses (Downs, chapter 3).
     """
     return PointPairs(
         np.stack((pose_a[:2], located(pose_a, range_to_b, bearing_to_b))),
@@ -164,8 +163,8 @@ def exchanged(
 
     With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have
     σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and
-    G/2 for the common ones; σ̂² = cost/(2n − 3). As in Downs, the maps' own covariances are
-    discarded, so the result omits each map's drift as a whole. Raises TooFewPointsError for n < 2.
+    G/2 for the common ones; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances, and with them
+    their drift, are discarded. Raises TooFewPointsError for n < 2.
     """
     ids = np.union1d(a.ids, b.ids)
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
@@ -217,10 +216,9 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     """Join two independent maps in the frame of a, each with its own covariance.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
-    rotation and translation of `exchanged`; the covariance is (JᵀWJ)⁻¹. This is Downs' exchange
-    with the maps' own covariances, which include each map's drift as a whole. Raises
-    TooFewPointsError for fewer than two common landmarks, NotACovarianceError for an invalid
-    covariance.
+    motion of `exchanged`; the covariance is (JᵀWJ)⁻¹. This is Downs' exchange with the maps' own
+    covariances, which include their drift. Raises TooFewPointsError for fewer than two common
+    landmarks, NotACovarianceError.
     """
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     if len(in_a) < NEEDED:

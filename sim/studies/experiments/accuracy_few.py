@@ -1,11 +1,11 @@
 """Worlds with few landmarks and unknown initial poses, where wrong minima occur.
 
-A map is wrong where it lies in another minimum of the cost than the truth (`true_minimum`); its
-submaps exclude the truth where the cost at the fixed truth exceeds the 99.9 % quantile. A map is
-beyond its ellipsoid where its shape (without the rigid part), or the first pose of a robot that
-joined, is outside the 99.9 % region of its own covariance; with a curved valley of the cost this
-happens more often, even in the right minimum. A wrong map without a warning is silent. An alarm is
-a warning of a right map about more than a large or nonlinear covariance.
+A map is wrong in another minimum of the cost than the truth (`true_minimum`); its submaps exclude
+the truth where the cost there exceeds the 99.9 % quantile. A map is beyond its ellipsoid where its
+shape (without the rigid part), or the first pose of a robot that joined, is outside the 99.9 %
+region of its own covariance; in a curved valley of the cost this is more frequent, even in the
+right minimum. A wrong map without a warning is silent. An alarm is a warning of a right map about
+more than a large or nonlinear covariance.
 """
 
 import msgspec
@@ -81,7 +81,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def few_figures(runs: list[Figures]) -> Figures:
-    """Figures over the seeds of one case, with the numbers of wrong and of silent maps."""
+    """Figures over the seeds of one case, with counts of wrong and silent maps."""
     figures = over_seeds(runs)
     if not runs:
         return figures
@@ -114,9 +114,7 @@ def _alarmed(run: Figures) -> bool:
 
 
 def is_beyond(run: Figures) -> bool:
-    """Whether the map's shape or a joined robot's first pose lies beyond 99.9 % of its
-    covariance.
-    """
+    """Whether the shape or a joined robot's first pose is beyond its 99.9 % ellipsoid."""
     dof = 2 * round(run["landmarks"] or 0.0) - 3
     shape = run["shape_nees"]
     if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:

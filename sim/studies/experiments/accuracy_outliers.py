@@ -15,11 +15,11 @@ from sim.world.config import OutlierKind, SimulatedWorld
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
 LANDMARK_SUBMAPS = 2
-"""Least number of submaps of a landmark, in the clean runs, too: a landmark of one submap may be an
+"""Least number of submaps of a landmark, also in clean runs: a landmark of one submap may be an
 outlier.
 """
 ROBUST_C = 2.0
-"""Scale of the centre's robust loss, in the clean runs, too: it down-weights outliers that agree by
+"""Scale of the centre's robust loss, also in clean runs: it down-weights outliers that agree by
 chance.
 """
 KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
@@ -88,7 +88,7 @@ def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
 def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
     """The scenario with outliers, and windows and centre that expect them.
 
-    The clean run has the same centre, and windows that accept every measurement.
+    The clean run has the same centre, and windows without rejection.
     """
     replace = msgspec.structs.replace
     assert isinstance(scenario.world, SimulatedWorld)

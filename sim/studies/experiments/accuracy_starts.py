@@ -1,8 +1,7 @@
 """Unknown initial poses: all robots but the first must be placed in the team's map.
 
-A merge is wrong where the first pose of a robot that joined lies outside the 99.9 % ellipsoid of
-its own covariance. After a right merge only the position of the map as a whole is undetermined, so
-maps are compared after alignment.
+A merge is wrong where the first pose of a robot that joined lies outside its own 99.9 % ellipsoid.
+After a right merge only the map's position is undetermined, so maps are compared after alignment.
 """
 
 import msgspec

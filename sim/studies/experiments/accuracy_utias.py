@@ -1,9 +1,8 @@
 """Real data: every given UTIAS set, five robots, one fixed profile.
 
 The raw map lies according to the initial poses; `shape` is the error that no rigid motion explains,
-and its NEES is per landmark: 2 for a correct covariance. The batch optimum over all raw
-measurements under the same noise is computed for each set; the difference is the cost of the
-submaps.
+its NEES is per landmark: 2 for a correct covariance. The difference from the batch optimum under
+the same noise is the cost of the submaps.
 """
 
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ NORMAL_SCALE = (0.8, 1.25)
 `normal_scale`.
 """
 MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
-"""Largest aligned error [m] by the data set's number; other sets have no goal."""
+"""Largest aligned error [m] by the data set's number."""
 MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}
 SHOWN: Shown = (
     ("aligned", "aligned [m]", "{:.4f}"),
@@ -52,7 +51,7 @@ ROBOT: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each set with and without known starts; only the estimator is random."""
+    """Each set with and without known starts."""
     return [
         task for dataset in options.datasets for task in (team_on(dataset), _unknown_task(dataset))
     ]
@@ -113,7 +112,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def set_figures(run: Figures) -> Figures:
-    """Figures of one set under the names of real data."""
+    """Figures of one set."""
     renamed = {
         "aligned": "rmse_aligned",
         "raw": "rmse",

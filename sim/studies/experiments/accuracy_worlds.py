@@ -31,7 +31,7 @@ from team.pairs import PAIRS
 class World(NamedTuple):
     """A world: its scenario, its most seeds, and the goals of the default pair.
 
-    rules: every valid pair runs in it, not only the default one. batch: with the batch MAP.
+    rules: every valid pair runs, not only the default. batch: with the batch MAP.
     """
 
     scenario: str
@@ -42,7 +42,7 @@ class World(NamedTuple):
 
 
 OTHERS_SEEDS = 10
-"""Most seeds of pairs for comparison, which differ from the default pair by factors."""
+"""Most seeds of pairs for comparison."""
 _THESIS = {
     "nees": (0.93, 1.07),
     "in_band": (0.90, 1.0),
@@ -80,7 +80,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Figures of every world and rule, with the goals of the default rule."""
+    """Figures of every world and rule, and the default rule's goals."""
     worlds: dict[str, dict[str, Figures]] = {}
     goals: list[Goal] = []
     tables: list[Table] = []
@@ -97,7 +97,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
     """Figures over the seeds of each rule of one world, and of the batch.
 
-    ratio: of the RMS landmark errors to the batch's on the same seeds.
+    ratio: of the RMS landmark errors to the batch's.
     """
     figures = {rule: over_seeds(of_rule) for rule, of_rule in runs.items() if of_rule}
     batches = {run["seed"]: run["batch"] for run in runs.get(named(*OURS), []) if "batch" in run}

@@ -1,8 +1,8 @@
 """Accuracy of data association over landmark spacing, clutter and missed detections.
 
-One simulated place, four systems: ours without identities, the same measurements with identities,
-an EKF over the whole run with nearest neighbour, and FastSLAM with maximum-likelihood association
-per particle. The sensors differ only in their noise; one parameter is varied at a time.
+One simulated place, four systems: ours without and with identities, an EKF over the whole run with
+nearest neighbour, and FastSLAM with maximum-likelihood association per particle. The sensors differ
+only in their noise; one parameter is varied at a time.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ FIGURES = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each axis, value, system and seed; a run common to two axes is run once."""
+    """Each axis, value, system and seed; common runs once."""
     runs = [
         task
         for axis in AXES
@@ -116,9 +116,7 @@ def association_run(
     missed: float,
     seed: int,
 ) -> dict[str, Any]:
-    """Figures of one run; the baselines have one robot, since each of their robots has its own
-    map.
-    """
+    """Figures of one run; baselines have one robot, since they do not merge maps."""
     alone = fusion == "alone"
     scenario = load("waypoints")
     error_m = SPACING_M / ratio

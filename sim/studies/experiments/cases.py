@@ -1,7 +1,7 @@
 """Compute cases in parallel and store their results on disk, with joblib's workers and memory.
 
-A case that fails, or whose process dies, loses only itself. With a scheduler the cases run on
-Dask's workers, on a cluster, too (decision 37).
+A case that fails or dies loses only itself. With a scheduler the cases run on Dask's workers, also
+on a cluster (decision 37).
 """
 
 import threading
@@ -60,8 +60,8 @@ class Cases:
     def run(self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None) -> Iterator[Done]:
         """Compute the cases, `jobs` at a time; yields each as it is done, in no fixed order.
 
-        Long cases begin first. Leaving the iterator early ends the workers. scheduler: address of a
-        Dask scheduler whose workers can read the folder; its number of workers replaces `jobs`.
+        Long cases begin first. Leaving the iterator ends the workers. scheduler: address of a Dask
+        scheduler whose workers can read the folder; their number replaces `jobs`.
         """
         # An idle worker may end just as it gets a case; joblib warns and starts another. With
         # warnings as errors joblib's thread would end instead.
@@ -120,10 +120,10 @@ def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
 
 @contextmanager
 def _cancelling() -> Iterator[None]:
-    """Suppress the pool's message about a case that is cancelled on request.
+    """Suppress the pool's message about a cancelled case.
 
-    Loky kills the workers first; its thread then fails with a KeyError on a case that was being
-    handed over (joblib/loky, pull request 663).
+    Loky kills the workers first; its thread then fails with a KeyError on a case being handed over
+    (joblib/loky, pull request 663).
     """
     previous = threading.excepthook
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 class Entry(NamedTuple):
     """An experiment: its command, its module, a summary.
 
-    module: has `tasks` and `outcome`; or `module:object` of an object that has them. seeds: default
-    number, with --quick, and at most as a part of `all`.
+    module: has `tasks` and `outcome`; or `module:object` of an object with them. seeds: by default,
+    with --quick, and at most in `all`.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Compute a run's errors over team time: online poses, and one landmark of the map.
 
-The landmark is the first that the first robot detected. Its error and its sigma are those of the
-newest map at each time: the fused one, or the robot's own where nothing is fused.
+The landmark is the first robot's first. Its error and sigma are those of the newest map at each
+time: the fused one, or else the robot's own.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,9 +43,8 @@ def curves_task(
 ) -> Task:
     """Make the task of the curves of one run.
 
-    team_scenario: the team's scenario if it differs from the world's. late: each step's
-    measurements are those of the step before. shots: steps whose maps and paths are stored for
-    pictures.
+    team_scenario: the team's scenario if it differs from the world's. late: measurements are those
+    of the step before. shots: steps whose maps and paths are stored.
     """
     return Task(
         "sim.studies.experiments.curves:curves_run",
@@ -65,9 +64,7 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """Curves of every robot's pose and of the first landmark, the map's error, and the map at
-    `shots`.
-    """
+    """Curves of the poses and of the first landmark, the map's error, and the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
@@ -129,7 +126,7 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
     """Keys of a robot's online poses: the centre's if it estimates them; else the robot's own, then
-    those in the team's map.
+    the team map's.
     """
     if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)

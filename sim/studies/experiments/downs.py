@@ -1,8 +1,8 @@
 """Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
 
-Each has the printed figures, his protocol (`downs_joined`) and ours: the unchanged profile of
-`utias`. All use the profile's sensor and odometry models. His paired t-tests are recomputed on the
-printed and on the computed figures.
+Each has the printed figures, his protocol (`downs_joined`) and ours (`utias`), all with the
+profile's sensor and odometry models. His paired t-tests are recomputed on the printed and on the
+computed figures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,13 +44,13 @@ from sim.studies.experiments.team_runs import Figures, team_task
 from sim.world.config import UtiasWorld
 
 Row = tuple[float | None, ...]
-"""Errors [m] of robots 1 … 5, or of the team alone; None where there is none."""
+"""Errors [m] of robots 1 … 5, or of the team alone."""
 QUICK_S = 300.0
 TEAM = "team"
 
 
 class Method(NamedTuple):
-    """A row of a table: its name, its runs, and the figure of each robot (or of the team)."""
+    """A row of a table: name, runs, and a figure per robot (or of the team)."""
 
     name: str
     tasks: Callable[[Options, Dataset], list[Task]]
@@ -61,7 +61,7 @@ class Method(NamedTuple):
 class Compared(NamedTuple):
     """A paired t-test: its text, its printed p, and its two sides by set.
 
-    before: the other table's row by the name of this table's method. tasks: the runs of these.
+    before: the other table's row by method. tasks: its runs.
     """
 
     text: str
@@ -151,9 +151,7 @@ class PrintedTable(NamedTuple):
         return rows | {m.name: m.row(options, dataset, results) for m in self.methods}
 
     def _tests(self, options: Options, results: Results) -> dict[str, Figures]:
-        """Paired two-sided t-tests: over the robots of sets, or over the sets' means for a team's
-        map.
-        """
+        """Paired two-sided t-tests over the robots of sets, or over the sets' means."""
         if self.compared is None:
             return {}
         one = len(self.columns) == 1

@@ -1,9 +1,9 @@
 """Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
 
 His protocol: measurements sampled to one second, a submap per step, of which only the mean is used.
-Each robot's submaps are joined by least squares with the identity as covariance, and the robots'
-maps are aligned by singular values (`svd-join-spherical`). A submap here is a window of one step of
-the hybrid estimator; his is a step of an EKF without earlier landmarks.
+Each robot's submaps are joined by least squares with the identity as covariance, and the maps are
+aligned by singular values (`svd-join-spherical`). A submap here is a window of one step of the
+hybrid estimator; his is a step of an EKF without earlier landmarks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -49,8 +49,8 @@ DRAWN_POINTS = 1000
 
 
 def final_maps_only(scenario: Scenario) -> Scenario:
-    """The scenario without running poses, maps and broadcasts, which his tables do not use and
-    which do not influence the final map and the smoothed paths.
+    """The scenario without running poses, maps and broadcasts, which do not influence the final map
+    and the smoothed paths.
     """
     change = msgspec.structs.replace
     robots = tuple(change(robot, pose_s=NEVER_S) for robot in scenario.robots)
@@ -59,8 +59,8 @@ def final_maps_only(scenario: Scenario) -> Scenario:
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """The scenario with measurements and submaps of one second, exact initial poses, no loss, no
-    factor and no error states.
+    """The scenario with measurements and submaps of one second, exact initial poses, no loss,
+    factor or error states.
     """
     change = msgspec.structs.replace
     scenario = final_maps_only(scenario)
@@ -148,7 +148,7 @@ def spherical_run(
 ) -> Figures:
     """By robot, errors of its joined map and smoothed path, and the map; the team's errors.
 
-    with_covariances: figures of the same submaps joined once with their covariances.
+    with_covariances: the same submaps joined with their covariances.
     """
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
@@ -240,7 +240,7 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """Positions, in both maps, of two robots that measured each other in the same step, one pair a
+    """Positions, in both maps, of two robots that measured each other in one step, a pair per
     step.
     """
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
@@ -282,7 +282,7 @@ def _looks(
 
 
 def _at(path: Path, step: int) -> int | None:
-    """Index of the pose at a step; None if the robot has none within half a step."""
+    """Index of the pose at a step; None beyond half a step."""
     stamp_ns = round(step * STEP_S * 1e9)
     nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
     near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S

@@ -1,7 +1,7 @@
 """Test by a global optimiser Downs' claim that two robots' maps have one joint minimum.
 
-The shared-map problem is argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (t, θ). The
-points and t are linear in it and are eliminated exactly, so the minima are those of the profile
+The shared-map problem is argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (t, θ). It
+is linear in the points and t, which are eliminated exactly: the minima are those of the profile
 C(θ). With the identity C(θ) = c − α cos θ − β sin θ, which has one minimum. With the maps' own
 covariances it may have more: the profile is searched on a grid. SciPy's differential evolution, the
 successor of his genetic algorithm, searches (t, θ) without a start.
@@ -58,7 +58,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Number of minima of each pair of maps, and the optimiser's agreement with the closed form."""
+    """Minima of each pair of maps, and the optimiser's agreement with the closed form."""
     found: dict[str, Figures] = {}
     for name, task in _runs(options):
         robots = (results.of(task) or {}).get("robots", {})

@@ -1,8 +1,7 @@
 """Tables 5.1 … 5.5 of J. Downs' thesis on his simulator: 10 and 100 landmarks, one run a seed.
 
-He ran it thirty times for each (section 4.2) and prints no figure of it; the methods and the
-t-tests are those of the tables. It has one robot; table 5.5 needs a team, here two robots that
-start at its centre together.
+He ran it thirty times for each (section 4.2) and prints no figure. Methods and t-tests are those of
+the tables. It has one robot; for table 5.5, two robots start at its centre together.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +32,7 @@ STARTED, ALIGNED = "rmse", "rmse_aligned"
 class Simulated(NamedTuple):
     """A method on the simulator: its name, run, robots and colour.
 
-    robot: the figures are robot 1's; else those of `part`, or of the run itself.
+    robot: figures of robot 1; else of `part`, or of the run.
     """
 
     name: str
@@ -71,8 +70,8 @@ OUR_TEAM = Simulated("team, ours", _ours, TEAM, BLACK)
 class SimulatedTable(NamedTuple):
     """The simulator's part of a table. figures: names and headings.
 
-    compared: pairs of methods for the paired t-test, before and after. sample: a map of the first
-    method is drawn, as in figure 5.1.
+    compared: pairs of methods for the t-test. sample: draw a map of the first method, as in figure
+    5.1.
     """
 
     methods: tuple[Simulated, ...]

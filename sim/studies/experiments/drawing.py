@@ -20,7 +20,7 @@ BAND = (0.1, 0.9)
 class Curves:
     """Errors and sigmas of S runs at K common times; NaN before a run's first value.
 
-    nees: mean per degree of freedom of each run; None without NEES.
+    nees: mean per degree of freedom of each run, if any.
     """
 
     times_s: Float[np.ndarray, " K"]

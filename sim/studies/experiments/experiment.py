@@ -99,8 +99,8 @@ class Goal:
 class Outcome:
     """Result of an experiment.
 
-    figures: for machines, by name. remarks: differences from the source, with the reason. missing:
-    what could not be computed, with the remedy.
+    figures: for machines. remarks: differences from the source, with the reason. missing: figures
+    that need more data, with the remedy.
     """
 
     title: str

@@ -1,9 +1,8 @@
 """Common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
 
-The report prints no parameters and no data set's number. Both are in its program (the repository of
-its appendix): the initial pose of robot 1 is that of set 2, α₁ … α₆ are 0.1 for intervals of 0.02
-s, the variances of range and bearing 0.0167 m² and 0.000737 rad². It uses the logged odometry
-without calibration.
+Parameters and set are only in its program (the repository of its appendix): the initial pose of
+robot 1 is that of set 2, α₁ … α₆ are 0.1 for intervals of 0.02 s, the variances of range and
+bearing 0.0167 m² and 0.000737 rad². The logged odometry is not calibrated.
 """
 
 from collections.abc import Mapping
@@ -92,9 +91,7 @@ def _scenario(method: Method, seed: int) -> Scenario:
 
 
 def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
-    """The program's models; measurements are processed separately, with resampling at each step and
-    a map each second.
-    """
+    """The program's models: separate measurements, resampling at each step, a map each second."""
     replace = msgspec.structs.replace
     front_end = replace(
         robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()
@@ -105,7 +102,7 @@ def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
 def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
     """Errors over frames of every robot's path and of the map, the lines and the last map.
 
-    sha256: of the data set at `path`, which it replaces in the task's name.
+    sha256: of the data set at `path`.
     """
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     samples = list(TimedRun().samples(resolved))

@@ -31,9 +31,9 @@ from sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
 
 
 class ErrorFigure(NamedTuple):
-    """Errors over frames. of: "path" of robot 1, or "map", the mean distance of its landmarks.
+    """Errors over frames. of: "path" of robot 1, or "map", its landmarks' mean distance.
 
-    printed: mean error [m] in the text, by the method's name.
+    printed: mean error [m] by method.
     """
 
     title: str
@@ -109,9 +109,7 @@ class ErrorFigure(NamedTuple):
 
 
 def _runs(dataset: Dataset, method: Method, options: Options) -> list[Task]:
-    """One run per seed; of our estimator the first only, since it takes longest on the same
-    data.
-    """
+    """One run per seed; of our estimator the first only: it takes longest."""
     seeds = options.seeds[:1] if method == OURS else options.seeds
     return [ma_task(dataset, method, seed) for seed in seeds]
 

@@ -6,9 +6,8 @@ A reference for the team's map joining, without shared code. The same formulas
     + Σ ‖L⁻¹ (range, bearing of a teammate; minus the measurement)‖² + Σ ‖prior‖²
 
 are implemented with complex numbers and solved by Levenberg-Marquardt steps (damping as in Nielsen
-1999) through SuperLU, where the map joining has kernels, a factorisation of its own and
-Gauss-Newton steps. The graph provides the measurements, and the indices in the state of each pose
-and landmark.
+1999) through SuperLU, where the map joining has kernels, its own factorisation and Gauss-Newton
+steps. The graph provides measurements and state indices.
 """
 
 from collections import defaultdict
@@ -49,9 +48,7 @@ class Solution(NamedTuple):
 
 
 class Whitened(NamedTuple):
-    """Whitened residuals of K terms of one kind and size, their Jacobians, and the indices of their
-    coordinates in the state.
-    """
+    """Whitened residuals of K terms of one kind and size, their Jacobians and state indices."""
 
     residuals: Float[np.ndarray, "K r"]
     jacobians: Float[np.ndarray, "K r m"]
@@ -103,7 +100,7 @@ class PlainCost:
     def solved(self, state: Values) -> Solution:
         """Minimise from a state.
 
-        Each step is δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, and is taken if it lowers the cost.
+        Steps δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, are taken if they lower the cost.
         """
         state, cost, damping, growth = state.copy(), self.of(state), DAMPING, 2.0
         N, gradient = self._normal(state)
@@ -158,8 +155,8 @@ class _Sum:
 
 
 class _Submaps(NamedTuple):
-    """K submaps with the same numbers of poses and points. at: state indices of each one's start,
-    poses and landmarks; points: the first ones of the latter two.
+    """K submaps of equal size. at: state indices of each one's start, poses and landmarks; points:
+    the first ones of the latter two.
     """
 
     whitening: Float[np.ndarray, "K n n"]

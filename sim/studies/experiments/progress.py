@@ -1,4 +1,4 @@
-"""Show the progress of the runs: a bar with the time left, or plain lines outside a terminal."""
+"""Show the progress of the runs: a bar, or plain lines outside a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -25,7 +25,7 @@ _BLOCK = 1 << 20
 class Concluded:
     """An experiment's outcome, and its failed runs with their errors.
 
-    kinds: runs that differ in their seed only, their number, and their parameters.
+    kinds: runs that differ in their seed only: label, number, parameters.
     """
 
     entry: Entry
@@ -47,8 +47,8 @@ class Plan:
 
 
 Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[[Done], None]]]
-"""Given the tasks to compute and the number of stored results, returns the function to call with
-every finished task.
+"""Given the tasks and the number of stored results, returns the function to call per finished
+task.
 """
 
 

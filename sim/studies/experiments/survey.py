@@ -1,7 +1,7 @@
 """All estimators and rules on the same measurements, with the thesis' tables 2.1 and 2.2.
 
-The thesis describes advantages and disadvantages of the methods in words; these are measurements of
-the implemented ones, on its world and on the one with an accurate sensor.
+The thesis describes advantages and disadvantages in words; these are measurements of the
+implemented methods, on its world and on the one with an accurate sensor.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
 MOST_SEEDS = 12
-"""Most seeds: the methods differ by factors, and two dozen pairs take a second or two each."""
+"""Most seeds: the methods differ by factors."""
 PARTICLES = (50, 200, 1000)
 SHOWN: Shown = (
     ("rmse", "map [m]", "{:.3f}"),
@@ -43,7 +43,7 @@ SHOWN: Shown = (
 
 
 class SurveyedMethod(NamedTuple):
-    """A method of tables 2.1 and 2.2: the thesis' judgement, and the pair that implements it."""
+    """A method of tables 2.1 and 2.2, and the pair that implements it."""
 
     method: str
     uncertainty: str
@@ -73,7 +73,7 @@ SURVEYED = (
          "data association", ("hybrid-thesis", "alone")),
 )  # fmt: skip
 BATCH = "graph based"
-"""The batch MAP is this method's optimum; it runs after the team has ended."""
+"""The batch MAP is this method's optimum."""
 
 
 def tasks(options: Options) -> list[Task]:

@@ -21,8 +21,8 @@ LIBRARIES = ("numpy", "scipy", "numba", "gtsam")
 class Task:
     """One run. work: `module:function`, from the parameters to a JSON object.
 
-    local: further keyword arguments that do not change the result, such as the path of a data set
-    whose checksum is a parameter. cost: estimated run time [s].
+    local: further arguments without influence on the result, such as the path of a data set whose
+    checksum is a parameter. cost: estimated run time [s].
     """
 
     work: str
@@ -51,9 +51,7 @@ class Task:
 
 @lru_cache
 def program_of(module: str) -> str:
-    """Digest of the libraries' versions and of all sources that a module imports, directly or
-    not.
-    """
+    """Digest of library versions and of all sources that a module imports."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:

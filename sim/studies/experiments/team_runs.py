@@ -47,7 +47,7 @@ def team_task(
     note: str = "",
     noise: NoiseKind = "white",
 ) -> Task:
-    """Make the task of a team's run. batch: with the batch MAP of the same measurements.
+    """Make the task of a team's run. batch: with the batch MAP.
 
     minimum: with `true_minimum`. note: appended to the scenario's name. noise: the batch's.
     """
@@ -92,10 +92,9 @@ def team_run(
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """Figures of one run; `batch` and `minimum`, if requested, are those of the batch MAP and of
-    `true_minimum`.
+    """Figures of one run; `batch`, `minimum`: with those of the batch MAP and of `true_minimum`.
 
-    sha256: of the data set at `path`, which it replaces in the task's name.
+    sha256: of the data set at `path`.
     """
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     run = TimedRun()
@@ -118,7 +117,7 @@ def team_run(
 
 
 class TimedRun:
-    """A team in memory, and the CPU time [s] that its robots and its centre spend on messages."""
+    """A team in memory, and its robots' and centre's CPU time [s]."""
 
     def __init__(self) -> None:
         self._robots = _Watch()
@@ -127,9 +126,7 @@ class TimedRun:
         self._fusions = 0
 
     def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
-        """Run the team; yields the samples of its log. streams: of the world; None: those of the
-        scenario.
-        """
+        """Run the team; yields the samples of its log. streams: default: the scenario's."""
         measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
         for sample in run_team(scenario, measurements, *self._nodes(scenario.central)):
@@ -187,7 +184,7 @@ class _Watch:
 def team_figures(evaluation: Evaluation) -> Figures:
     """Figures of a run, averaged over the robots; None without truth.
 
-    Without a fused map the map's figures are those of the robots' own maps.
+    Without a fused map the robots' own maps count.
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map
@@ -227,9 +224,7 @@ def team_figures(evaluation: Evaluation) -> Figures:
 
 
 def _robot_figures(robot: RobotResult) -> Figures:
-    """One robot's errors [m]; first_pose_chi2: of its first smoothed pose's error, 3 degrees of
-    freedom.
-    """
+    """One robot's errors [m]; first_pose_chi2: 3 degrees of freedom."""
     smoothed, online = robot.smoothed, robot.online
     return {
         "position_rmse": None if smoothed is None else smoothed.position_rmse_m,

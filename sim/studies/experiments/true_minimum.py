@@ -1,11 +1,11 @@
 """Decide by the cost, not the covariance, whether map and truth lie in the same minimum.
 
-An ellipsoid is exceeded in any curved valley of the cost, even in the right minimum. So three tests
+An ellipsoid is exceeded in any curved valley of the cost, even in the right minimum. Three tests
 use the final map's own cost: whether a solution from the truth has less cost, whether it ends in
 another place that is about as likely, and by how much the cost rises with the truth fixed (the
-likelihood ratio: χ² of the fixed coordinates, for any parametrisation). The cost and its minima are
-those of `plain_cost`, which shares no code with the map joining: a map whose state has not
-converged is wrong, too.
+likelihood ratio: χ² of the fixed coordinates, for any parametrisation). Cost and minima are those
+of `plain_cost`, which shares no code with the map joining: a map whose state has not converged is
+wrong, too.
 """
 
 from collections.abc import Iterable, Mapping
@@ -40,10 +40,9 @@ Values = Float[np.ndarray, " _"]
 class TrueMinimum(NamedTuple):
     """The map's minimum compared with that of a solution from the truth.
 
-    lower: how much less the cost from the truth is. other_minimum: that solution ends outside the
-    map's 99.9 % ellipsoid, at a cost that does not exclude it. rise: increase of the cost with the
-    landmarks and the end of each robot's first submap fixed at the truth; dof: number of fixed
-    coordinates.
+    lower: how much less the latter's cost is. other_minimum: it ends outside the map's 99.9 %
+    ellipsoid, at a cost that does not exclude it. rise: increase of the cost with the landmarks and
+    the end of each robot's first submap fixed at the truth; dof: number of fixed coordinates.
     """
 
     lower: float
@@ -63,7 +62,7 @@ class TrueMinimum(NamedTuple):
 
 
 def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | None:
-    """Figures of the final map of a run under `join`; None where no initial pose is known."""
+    """Figures of the final map under `join`; None without a known initial pose."""
     fold = final_fold(samples)
     if run.map is None or not fold.starts:
         return None
@@ -96,7 +95,7 @@ def judged(
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     paths: Mapping[str, Path],
 ) -> TrueMinimum:
-    """Figures of an island in the frame of the truth, with plain squares and without biases."""
+    """Figures of an island in the truth's frame, with plain squares and without biases."""
     graph, settings = island.graph, island.settings
     if settings.robust_c is not None:
         raise NotImplementedError("the judge has plain squares: central.robust_c must be left out")

@@ -1,8 +1,7 @@
 """Common part of the experiments after W. Xu's thesis: its world, its methods, its curves.
 
-Its world is the built-in scenario `thesis`, with the 50 particles of its section 4.4.2. A figure of
-the thesis is one run; ours is the median of many seeds with the 10 … 90 % band, and one single run
-with its 3σ bound.
+The world is the scenario `thesis`, with the 50 particles of section 4.4.2. A figure of the thesis
+is one run; ours is the median of many seeds with the 10 … 90 % band, and one run with its 3σ bound.
 """
 
 import math
@@ -33,9 +32,9 @@ CODED_BEARING_SIGMA = math.sqrt(math.pi / 18.0**2)
 
 
 class Method(NamedTuple):
-    """A curve of a figure: its name, pair, number of robots and colour.
+    """A curve of a figure: name, pair, number of robots, colour.
 
-    particles: 50, as in the thesis; None: our scenario's number.
+    particles: 50, as in the thesis; None: the scenario's.
     """
 
     name: str
@@ -65,10 +64,9 @@ Reading = Literal["stated", "exact", "coded"]
 class Panel(NamedTuple):
     """One world of a figure, its methods, and the thesis' figures in metres.
 
-    noise: of the odometry, (m, rad) in a step; None: the scenario's. reading: the interpretation of
-    the thesis. "stated": its text. "exact": the same with exact odometry, while the filters assume
-    noise. "coded": its appendix' program (`as_coded`). printed: by the method's name, the largest
-    error in the text or the picture.
+    noise: of the odometry, (m, rad) in a step; None: the scenario's. reading: "stated": the thesis'
+    text; "exact": the same with exact odometry, while the filters assume noise; "coded": its
+    appendix' program (`as_coded`). printed: by method, the largest error in text or picture.
     """
 
     name: str
@@ -167,9 +165,7 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
 
 
 def _telling(scenario: Scenario) -> Scenario:
-    """The scenario with a map at every step of a filter over the whole run, which has no
-    windows.
-    """
+    """The scenario with a map at every step of a filter without windows."""
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, window_s=STEP_S))
@@ -198,7 +194,7 @@ def as_coded(scenario: Scenario) -> Scenario:
 
 
 def with_particles(scenario: Scenario, particles: int) -> Scenario:
-    """Set the number of particles of every robot, and of a filter at the centre."""
+    """Set the number of particles of robots and centre."""
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, particles=particles))
@@ -259,7 +255,7 @@ def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
 def drawing(
     title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
 ) -> Callable[[Path], None]:
-    """Draw the medians with their bands, and one run with its bound; unit: of the times."""
+    """Draw medians with bands, and one run with its bound; unit: of the times."""
 
     def draw(path: Path) -> None:
         _draw(path, title, panel, found, unit)

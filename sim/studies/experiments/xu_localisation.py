@@ -1,9 +1,8 @@
 """Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
 
 Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here they are on the thesis'
-world: the three steps of the filter one by one after a stretch without measurements, and a start
-anywhere. The filter is `sim.studies.estimators.localisation`; motions and measurements are those of
-a robot in such a run, cut into keyframes as in every node.
+world: the three steps of the filter after a stretch without measurements, and a start anywhere. The
+filter is `sim.studies.estimators.localisation`; keyframes are those of a robot's node.
 """
 
 from collections.abc import Mapping
@@ -45,7 +44,7 @@ if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
 
 STRETCH = ((28.715, 33.276), (51.298, 53.539), (64.3, 67.3))
-"""A part of robot 1's path: from the lower left to the upper right, as in figure 3.2."""
+"""Part of robot 1's path, from the lower left to the upper right, as in figure 3.2."""
 STRETCH_STEPS = 49
 BLIND_CLOUDS = 6
 PARTICLES = 1000
@@ -67,7 +66,7 @@ ERRORS = ErrorFigure(
 
 
 def tasks(options: Options) -> list[Task]:
-    """The three steps, a start anywhere and the errors over 500 steps, for every seed."""
+    """The three steps, a start anywhere and the errors over 500 steps."""
     return [
         *(_stages_task(options, seed) for seed in options.seeds),
         *(_anywhere_task(options, seed) for seed in options.seeds),
@@ -165,7 +164,7 @@ def _alone(seed: int, particles: int) -> Scenario:
 
 
 def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
-    """A run of one seed; only the first seed's clouds are stored, for the picture."""
+    """A run of one seed; only the first one's clouds are stored."""
     return Task(
         f"sim.studies.experiments.xu_localisation:{work}",
         {"world": msgspec.to_builtins(scenario), "clouds": seed == options.seeds[0]},
@@ -214,9 +213,7 @@ def _run_of(world: Mapping[str, Any]) -> _Run:
 
 
 def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """Predict over the whole stretch, weigh by one measurement, resample; a summary of each
-    cloud.
-    """
+    """Predict over the stretch, weigh by one measurement, resample; a summary of each cloud."""
     run = _run_of(world)
     sensor = run.scenario.robots[0].sensor
     random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
@@ -270,7 +267,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 
 def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """Run the filter from a uniform cloud, by the farthest measurement of each step."""
+    """Localise from a uniform cloud, by each step's farthest measurement."""
     run = _run_of(world)
     config = run.scenario.robots[0]
     assert isinstance(run.scenario.world, SimulatedWorld)

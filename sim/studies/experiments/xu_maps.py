@@ -40,7 +40,7 @@ STEPS = 500
 class MapFigure(NamedTuple):
     """Maps of some methods at some steps: one run drawn, and the error over the seeds.
 
-    shown: the methods, each with its reading of the thesis.
+    shown: methods with their reading.
     """
 
     title: str
@@ -161,12 +161,12 @@ def _draw_paths(axis: "Axes", shot: Figures) -> None:
 
 
 class PathFigure(NamedTuple):
-    """Figure 4.5: paths of one run, without landmarks as in the source, beside the errors."""
+    """Figure 4.5: paths of one run, without landmarks, beside the errors."""
 
     errors: ErrorFigure
 
     def tasks(self, options: Options) -> list[Task]:
-        """Runs of the error figure, and one of each panel and method for the picture."""
+        """Runs of the error figure, and one of each panel and method."""
         drawn = [
             self._run(panel, method, options)
             for panel in self.errors.panels
@@ -175,7 +175,7 @@ class PathFigure(NamedTuple):
         return self.errors.tasks(options) + drawn
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """A picture of the paths for each panel, then the errors."""
+        """A picture per panel, then the errors."""
         pictures = []
         for panel in self.errors.panels:
             runs = [

@@ -32,9 +32,9 @@ NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """Results of an odometry interval: stamps of a new running pose and map.
 
-    cloud: returns the particles, if any, until the next interval is taken. judged: the innovation
-    since its last report, and its time. became: outcomes of all detections without identities, at
-    the end of the stream.
+    cloud: returns the particles, if any, until the next interval. judged: the innovation since its
+    last report, and its time. became: outcomes of all detections without identities, at the end of
+    the stream.
     """
 
     pose_ns: int | None = None
@@ -52,8 +52,8 @@ class RobotEstimator(Protocol):
     """An estimator on one incarnation of a robot's stream: measurements in, running poses and maps
     out.
 
-    sequence: number of its running poses and maps. used: disposition of a measurement that it uses.
-    joint: its map has a joint covariance. innovation: of all predicted measurements.
+    sequence: number of its running poses and maps. used: disposition of its measurements. joint:
+    the map has a joint covariance. innovation: of all predicted measurements.
     """
 
     @property

@@ -1,7 +1,7 @@
 """Exchange whole maps between a robot and a centre that fuses them.
 
 A map with its joint covariance is sent every `exchange_s`. Under a rule with feedback the robot
-then waits for the answer (lockstep) and absorbs it.
+waits for the answer (lockstep) and absorbs it.
 """
 
 from collections import deque
@@ -13,17 +13,14 @@ from team.robot.statements import MessageWriter
 from team.wire.bus import Outgoing
 
 JOINT_LANDMARKS = 2000
-"""Landmarks of an own map beyond which only 2 × 2 covariances are sent: a message has at most 64
-MiB.
-"""
+"""Landmarks beyond which a map has only 2 × 2 covariances: a message has at most 64 MiB."""
 
 
 class MapExchange:
     """Rounds of one robot.
 
-    exchanges: the rule fuses own maps. lockstep: each map is answered before the robot goes on.
-    answered: last answered round; awaited: round of the last sent map. last: sequence of the last
-    sent map; −1: none.
+    exchanges: the rule fuses own maps. lockstep: the robot waits for answers. answered: last
+    answered round; awaited: round of the last sent map. last: its sequence; −1: none.
     """
 
     def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
@@ -49,7 +46,7 @@ class MapExchange:
         return True
 
     def is_sent(self, stamp_ns: int) -> bool:
-        """Record a new map; returns whether to send it: for viewers, or because a round is due."""
+        """Record a new map; returns whether to send it, for viewers or a due round."""
         self._map_ns = stamp_ns
         since = None if self._sent_ns is None else stamp_ns - self._sent_ns
         return not self.exchanges or since is None or since >= self._every_ns

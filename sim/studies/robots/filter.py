@@ -17,8 +17,8 @@ IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
 """Dispositions of a measurement that such an estimator uses."""
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the measurements'
-own covariances (`team.estimation.scans`) at its end.
+"""Motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and own covariances
+(`team.estimation.scans`) at its end.
 """
 InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 FilterStep = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
@@ -30,10 +30,9 @@ Judged = Callable[
 class Filter(NamedTuple):
     """A recursive estimator over its own state.
 
-    looks: accepts landmarks; claims: also those with covariances of their own; maps: has a map.
-    joint: its map has covariances between landmarks. absorbed: the state with the given landmarks
-    in place of its own. particles: of a state, for viewers. innovation: of a step's measurements,
-    predicted by the state before it.
+    looks: accepts landmarks; claims: with covariances of their own; maps: has a map. joint: with
+    covariances between landmarks. absorbed: the state with the given landmarks. particles: of a
+    state, for viewers. innovation: of a step's measurements, predicted by the state before.
     """
 
     initial_state: InitialState

@@ -128,7 +128,7 @@ def _with_start(
 ) -> S:
     """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
 
-    The noise is rotated into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
+    In the pose's own axes the noise is C = GᵀPG, G = blkdiag(R(θ), 1).
     """
     at = np.zeros(3) if initial.pose is None else initial.pose
     state = initial_state(at)
@@ -188,7 +188,7 @@ def _localisation_initial_state(
 ) -> Localisation:
     """An unknown initial pose is uniform where the sensor may detect a landmark of the known map.
 
-    That is the map's box widened by the sensor's reach, at most by half the box's longer side.
+    That is the map's box widened by the sensor's reach, at most by half its longer side.
     """
     front = config.front_end
     landmarks = known.landmarks

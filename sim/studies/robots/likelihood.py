@@ -17,7 +17,7 @@ from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 def with_association(plain: Filter) -> Filter:
     """The filter with identities until the first scan without; later scans ignore identities.
 
-    Its particles keep their poses, and landmarks mapped by identity are dropped.
+    Particles keep their poses; landmarks mapped by identity are dropped.
     """
     assert plain.particles is not None
     particles_of = plain.particles

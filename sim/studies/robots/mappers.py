@@ -1,5 +1,5 @@
-"""Mappers of comparison robots: Hybrid-SLAM that exchanges its own map, and estimators with one
-state over a whole stream.
+"""Mappers of comparison robots: Hybrid-SLAM that exchanges its own map, and whole-stream
+estimators.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ from team.wire import messages as m
 class ExchangingMapper(Mapper):
     """Hybrid-SLAM that sends its own map in exchanges, or for viewers if the rule fuses no maps.
 
-    joint: its map has a joint covariance.
+    joint: with a joint covariance.
     """
 
     joint = True
@@ -50,7 +50,7 @@ class ExchangingMapper(Mapper):
         self.exchange.last = -1
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether a map is published at the end of this window, or may be exchanged."""
+        """Whether a map is published or may be exchanged at the end of this window."""
         return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
 
     def publish_map(self, stamp_ns: int) -> None:
@@ -112,7 +112,7 @@ class StreamMapper(ExchangingMapper):
     def know(self, message: m.KnownMap) -> None:
         """Store the known map; of two the newer one by its stamp.
 
-        Landmarks beyond the bounds are left out.
+        Landmarks beyond the bounds are dropped.
         """
         if self._known_ns is not None and message.stamp_ns <= self._known_ns:
             return

@@ -1,7 +1,7 @@
 """The node of a comparison robot: its centre fuses whole maps or raw measurements.
 
-Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot's map
-absorbs the fused one, and the robot waits for the answer of each exchange.
+Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot waits
+for the fused map of each exchange and absorbs it.
 """
 
 from typing import Any
@@ -45,7 +45,7 @@ class ExchangingRobot(RobotNode):
                 super().receive(message)
 
     def _absorb(self, fused: m.FusedMap) -> None:
-        """Handle the answer of an exchange: under a rule with feedback the own map absorbs it."""
+        """Absorb the answer of an exchange, under a rule with feedback."""
         if not self.mapper.exchange.take_answer(fused.exchange):
             return
         ids, means = translate.landmarks_of(fused)
@@ -59,8 +59,8 @@ class ExchangingRobot(RobotNode):
     def is_held(self) -> bool:
         """Whether the robot waits for a known map, or for a centre that is present.
 
-        A centre that was never present may still answer: lockstep does not depend on the order in
-        which tokens arrive.
+        A centre that was never present may still answer: lockstep does not depend on the order of
+        tokens.
         """
         waits = self.mapper.exchange.waits and not self._centre_is_away
         return self.mapper.waits_for_map or waits
@@ -68,8 +68,7 @@ class ExchangingRobot(RobotNode):
     def consume(self) -> None:
         """Consume the measurements in order; a waiting robot reports those received.
 
-        Otherwise the world would wait for it, and with the world a teammate that needs more
-        measurements for its map, or the end.
+        Otherwise the world would wait for it, and a teammate for the world.
         """
         super().consume()
         if not self.mapper.exchange.lockstep or not self.is_held:

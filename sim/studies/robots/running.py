@@ -32,8 +32,8 @@ from team.rejection import Rejection
 from team.robot.own_map import Cloud, InitialPose, thin_out
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a running pose's covariance [m², m², rad²], which is singular for an exact start, a
-motion without lateral noise, or fewer than four different particles.
+"""Added to a running pose's covariance [m², m², rad²], singular for an exact start, motion without
+lateral noise, or fewer than four different particles.
 """
 
 
@@ -41,8 +41,8 @@ class RunningEstimator:
     """The state after every keyframe; its map is published once per window, or at every keyframe.
 
     Without submaps it cannot be resumed: a restarted robot processes its stream from the beginning
-    and publishes the same messages again. sequence: number of keyframes so far. associates: accepts
-    scans without identities; their outcomes are reported at the end.
+    and publishes the same messages again. sequence: number of keyframes. associates: accepts scans
+    without identities; their outcomes are reported at the end.
     """
 
     def __init__(
@@ -199,9 +199,7 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; returns the last keyframe and map, and the number of scans without
-        odometry.
-        """
+        """End the stream; returns the last keyframe and map, and the scans without odometry."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:

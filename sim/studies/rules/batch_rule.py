@@ -22,18 +22,18 @@ from team.wire import channels as ch
 from team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
-"""Most iterations of a broadcast's map, which starts from the last solution, and the Newton step in
-σ that ends them.
+"""Most iterations of a broadcast's map from the last solution, and the Newton step in σ that ends
+them.
 """
 FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
-"""The same for the final map, which has a warning if the iterations do not suffice."""
+"""The same for the final map, which has a warning without convergence."""
 
 
 class BatchCentre(MeasurementCentre):
     """All poses at the robots' keyframes and all landmarks, solved anew at each broadcast.
 
-    Each robot's newest pose is published with the map, and the whole paths with the final map.
-    Persistent sensor errors and biases are treated as white noise, with a warning.
+    The robots' newest poses are published with the map, whole paths with the final map. Persistent
+    sensor errors and biases are treated as white noise, with a warning.
     """
 
     _batch: GrowingBatch
@@ -90,9 +90,7 @@ class BatchCentre(MeasurementCentre):
         return MapContent(landmarks, self._batch.cost, self._batch.dof, outgoing)
 
     def _grow(self) -> None:
-        """Add the waiting steps; without their measurements, or not at all, if there is no
-        solution.
-        """
+        """Add the waiting steps; without a solution drop their measurements, or all."""
         turns, self._waiting = self._waiting, []
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):

@@ -1,7 +1,7 @@
 """Common part of the comparison centres without submaps.
 
-Such a centre is a node like the product's (`central.node.CentralNode`): attendance, the end of the
-streams and the conclusion are the product's, inputs and maps its own.
+Attendance, the end of the streams and the conclusion are the product's
+(`central.node.CentralNode`), inputs and maps their own.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,8 @@
 """Rules that fuse whole maps which the robots absorb, in lockstep.
 
-Each round takes the map that every robot sent for it. The fused map replaces the robots' own
-landmarks, so the next round's maps contain this round's: under `kalman` and `kalman-per-axis` the
-same measurements are counted repeatedly, and the covariance has no meaning.
+The fused map of a round replaces the robots' own landmarks, so the next round's maps contain it:
+under `kalman` and `kalman-per-axis` measurements are counted repeatedly, and the covariance has no
+meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ _NOT_VALID = "this rule counts measurements more than once: its covariance is no
 class RoundsCentre(ComparisonCentre):
     """Fuses the maps of each round in the order of the robots' names; a round names those before.
 
-    It stores the robots' submaps for their next processes.
+    Stores the robots' submaps for their next processes.
     """
 
     inputs = (ch.START, ch.SUBMAP, ch.OWN_MAP)
@@ -63,7 +63,7 @@ class RoundsCentre(ComparisonCentre):
         return []
 
     def publish_due(self) -> list[Outgoing]:
-        """Map of every round that has the maps of all robots that may still send one.
+        """Map of every round complete but for robots that send no more.
 
         A restarted centre continues with the present round.
         """

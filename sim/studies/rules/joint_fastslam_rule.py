@@ -22,9 +22,7 @@ from team.wire.bus import Outgoing
 RESAMPLE_BELOW = 1.0
 """Resamples at every step, as algorithm 1 does."""
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a pose's covariance [m², m², rad²], which is singular for fewer than four different
-particles.
-"""
+"""Added to a pose's covariance [m², m², rad²], singular for fewer than four different particles."""
 
 
 class JointFastSlamCentre(MeasurementCentre):

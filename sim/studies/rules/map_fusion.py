@@ -1,9 +1,8 @@
 """Fusion of whole maps that the robots then absorb, for comparison.
 
 `kalman_per_axis` and `kalman` treat the maps as independent. Once a robot has absorbed a fused map
-and sends its own again they are not: every measurement is then counted again with each exchange,
-and the covariance loses its meaning. Covariance intersection is consistent for any correlation of
-the landmarks, at the price of independent information.
+they are not: every exchange counts measurements again, and the covariance loses its meaning.
+Covariance intersection is consistent for any correlation, at the price of independent information.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +34,7 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """Full-covariance Kalman fusion in the given order, as if the maps were independent.
 
     K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's further landmarks follow
-    by regression on c. Counts measurements again when its result is absorbed and sent once more.
+    by regression on c. Counts measurements again when its result is absorbed.
     """
     return _one_by_one(_kalman_pair, maps)
 
@@ -56,8 +55,7 @@ def covariance_intersection(
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
     of the least trace or determinant of C. The landmarks of one map alone follow by regression on
-    the common ones in that map; the residual of the regression counts as that map's own
-    information.
+    the common ones in that map; its residual counts as that map's own information.
     """
 
     def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
@@ -85,8 +83,8 @@ def fused_totally(
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """Fuse the robots' maps; returns the result and the rejected maps, with reasons.
 
-    A map is rejected if it exceeds the bounds, or if the rule has no result with it: then the maps
-    are fused one by one in the given order.
+    Rejected maps exceed the bounds, or the rule has no result with them: then maps are fused one by
+    one in order.
     """
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class NewestMapsCentre(ComparisonCentre):
-    """Stores the newest map of every robot, and the initial poses of the streams.
+    """Stores the newest map of every robot, and the streams' initial poses.
 
     names_inputs: a map follows from its named maps alone.
     """
@@ -99,9 +99,8 @@ class NewestMapsCentre(ComparisonCentre):
 class LatestCentre(NewestMapsCentre):
     """The latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
 
-    Each map uses its own robot's measurements alone, so the maps are independent and the result is
-    as consistent as they are. A robot with an unknown initial pose has its map in its own frame and
-    is left out.
+    Each map uses its own robot's measurements alone, so the result is as consistent as the maps. A
+    robot with an unknown initial pose is left out.
     """
 
     names_inputs = False
@@ -114,14 +113,14 @@ class LatestCentre(NewestMapsCentre):
         self._published_ns: int | None = None
 
     def publish_due(self) -> list[Outgoing]:
-        """A map broadcast_s of team time after the last one, if a robot has a newer map."""
+        """A map broadcast_s of team time after the last, if a robot has a newer one."""
         last_ns, now_ns = self._published_ns, self.attendance.now_ns
         if last_ns is not None and now_ns - last_ns < self.config.broadcast_s * 1e9:
             return []
         return self.publish_newest()
 
     def publish_newest(self) -> list[Outgoing]:
-        """A map at once, if a robot has a newer one than in the last."""
+        """A map at once, if a robot has a newer one."""
         maps = [self._maps[robot] for robot in sorted(self._maps)]
         named = {(x.robot, x.incarnation): x.sequence for x in maps if is_placed(x, self._starts)}
         if all(self._published.get(stream, -1) >= last for stream, last in named.items()):
@@ -167,7 +166,7 @@ class AloneCentre(NewestMapsCentre):
         *,
         final: bool,
     ) -> m.FusedMap:
-        """The map of a single robot; of several robots a map without landmarks, with the reason."""
+        """The map of a single robot; for several an empty map, with the reason."""
         reason = ""
         if not maps:
             reason = "no fusion, and this estimator makes no map"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MapContent:
-    """Contents of a map: the landmarks and, where the rule has one, the joint cost.
+    """Contents of a map: the landmarks and the joint cost, if any.
 
     before: messages that precede it.
     """
@@ -44,9 +44,9 @@ class MapContent:
 class MeasurementCentre(ComparisonCentre):
     """An estimate over all robots' raw measurements at the centre.
 
-    The keyframes of one team time are one step; they are the clock of the maps. The robots announce
-    their models. A robot with an unknown initial pose is left out; if none is known the first
-    robot's is the frame. A map's members name each robot's last measurement in it.
+    The keyframes of one team time are one step, the clock of the maps. The robots announce their
+    models. A robot with an unknown initial pose is left out; if none is known the first robot's is
+    the frame. A map's members name each robot's last measurement in it.
     """
 
     inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)
@@ -70,9 +70,7 @@ class MeasurementCentre(ComparisonCentre):
 
     @abstractmethod
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
-        """Process one step of the team, which the members already name; returns the poses to
-        publish.
-        """
+        """Process one step of the team, already in the members; returns poses to publish."""
 
     @abstractmethod
     def _content(self, *, final: bool) -> MapContent:
@@ -109,9 +107,7 @@ class MeasurementCentre(ComparisonCentre):
         return [] if self.finished else self._keyframes.requests(self.attendance.now_ns)
 
     def publish_due(self) -> list[Outgoing]:
-        """Process the complete steps; broadcast_s of team time after the last map, one before the
-        next step.
-        """
+        """Process the complete steps, with a map every broadcast_s of team time."""
         if not self.models and not self._begin():
             return []
         out: list[Outgoing] = []

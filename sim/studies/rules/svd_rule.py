@@ -1,9 +1,9 @@
 """Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
 
 Every robot's submaps make one map by least squares in the frame of its own initial pose (section
-4.1). The map is then moved into the frame of the others by a singular value decomposition over the
-common landmarks, and the landmarks are joined (section 4.3). Only the first robot's initial pose
-has an influence: it fixes the frame.
+4.1). It is moved into the others' frame by a singular value decomposition over the common
+landmarks, and the landmarks are joined (section 4.3). Only the first robot's initial pose matters:
+it fixes the frame.
 """
 
 import math
@@ -46,7 +46,7 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """The submaps of a stream so far: their number, their map, and the digest of its inputs.
+    """The submaps of a stream so far: number, map, and digest of the inputs.
 
     refused: the submap that ended the chain, with the reason.
     """
@@ -60,8 +60,8 @@ class _Joined:
 class SvdFold(SubmapFold):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
-    A later incarnation of a robot is a stream in a frame of its own. A running map contains all
-    stored submaps; a later one may place any of them elsewhere.
+    A later incarnation is a stream in its own frame. A later running map may place stored submaps
+    elsewhere.
     """
 
     def __init__(
@@ -135,8 +135,8 @@ class SvdFold(SubmapFold):
     ) -> _Joined:
         """The map of a stream's chain, from its longest stored part.
 
-        Running maps continue from the last solution with each submap; the final one is solved until
-        it converges, including a search for other minima.
+        Running maps continue from the last solution; the final one is solved until it converges,
+        including a search for other minima.
         """
         begin = svd_joining.initial_state(
             {stream[0]: np.zeros(3) if initial_pose is None else initial_pose}, self._weighting
@@ -193,11 +193,11 @@ def tied(
     full: bool,
     sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """Align greedily the map that has the most landmarks in common with the aligned ones.
+    """Align greedily the map with the most landmarks in common with the aligned ones.
 
-    sightings: by two streams in their order, the robots' positions in both maps where they measured
-    each other (`mutual_sighting`); they are aligned like common landmarks, but not with `full`. A
-    map with too few common points is left out, with the reason.
+    sightings: by two streams in order, the robots' positions in both maps where they measured each
+    other (`mutual_sighting`); aligned like common landmarks, but not with `full`. A map with too
+    few common points is left out, with the reason.
     """
     fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}

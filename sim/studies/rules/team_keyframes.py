@@ -19,9 +19,7 @@ from team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):
-    """One robot's motion and its measurements at the end; `number`: of the measurement that closed
-    it.
-    """
+    """One robot's motion and final measurements; `number`: of the measurement that closed it."""
 
     stamp_ns: int
     robot: str
@@ -101,8 +99,8 @@ class _Stream:
 class TeamKeyframes:
     """The team's keyframes by (stamp, robot), as far as every robot's stream is known.
 
-    The sequence is a function of the streams alone. A stream that restarts at an unknown pose ends
-    there; inter-robot measurements are not used.
+    A function of the streams alone. A stream that restarts at an unknown pose ends there;
+    inter-robot measurements are not used.
     """
 
     def __init__(self, robots: Sequence[str]) -> None:
