@@ -1,8 +1,8 @@
 """Access control at the router: a node publishes its own keys and receives those of its team.
 
-Zenoh's rules select by message, direction as the router sees it, and key; a subject is the common
-name of a certificate. There are no templates, so each node has a rule. Besides its own keys a node
-needs those of its advanced publishers' caches and heartbeats, `…/@adv/pub/*/*/*`.
+Zenoh's rules select by message, direction as the router sees it, and key; a subject is a
+certificate's common name. There are no templates, so each node has a rule. It includes its advanced
+publishers' caches and heartbeats, `…/@adv/pub/*/*/*`.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ TRUTHS = (TRUTH, TRUTH_LANDMARKS, TRUTH_LABELS, TRUTH_POSITIONS)
 def owned(node: str) -> tuple[str, ...]:
     """Keys, relative to the team, that only this node may publish, answer and hold tokens on.
 
-    They come from the table of channels and have a fixed depth; the router drops all others. The
-    world drives every robot's sensors, so it shares those keys with each `source-…`.
+    They are those of the table of channels, of a fixed depth. The world drives every robot's
+    sensors, so it shares those keys with each `source-…`.
     """
     kind, _, name = node.partition("-")
     if node == REPLAY:
@@ -52,7 +52,7 @@ def _keys_of(channel: Channel, kind: str, name: str) -> tuple[str, ...]:
 
 
 def access_control(roster: Roster) -> dict[str, Any]:
-    """Zenoh's `access_control` for a team: requests without a matching rule are refused."""
+    """Zenoh's `access_control` for a team; everything else is refused."""
     prefix = f"team/{roster.team}/"
     every = [f"{prefix}**", f"{prefix}**/@adv/**"]
     truths = [key for channel in TRUTHS for key in channel.selectors()]

@@ -1,8 +1,7 @@
 """Track the publications of a publisher: deliver each once and find the missing ones.
 
 A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats.
-As long as it lives, a receiver can therefore detect every gap, at the beginning, in between and at
-the end: `docs/decisions/07-delivery-by-counts.md`.
+As long as it lives, a receiver can detect every gap: `docs/decisions/07-delivery-by-counts.md`.
 """
 
 from dataclasses import dataclass, field
@@ -11,13 +10,13 @@ from typing import Generic, TypeVar
 from team.wire.intervals import IntervalSet
 
 PATIENCE_S = 0.5
-"""Age [s] of a gap at which it is requested from the publisher."""
+"""Age [s] at which a gap is requested."""
 LONGEST_S = 8.0
-"""Longest interval [s] between two requests; intervals double up to it."""
+"""Longest interval [s] between two requests, which double."""
 DELAY_S = 2.0
 """Longest delay [s] of publications after a gap."""
 MOST_GAPS = 4096
-"""Largest number of gaps per publisher and key; beyond it the oldest is given up."""
+"""Largest number of gaps per publisher and key; then the oldest is given up."""
 T = TypeVar("T")
 
 
@@ -25,10 +24,10 @@ T = TypeVar("T")
 class Arrivals(Generic[T]):
     """Publications of one publisher on one key; those before `first` are not requested.
 
-    All numbers come from the wire, so memory is proportional to the arrivals, not to the numbers.
+    Memory is proportional to the arrivals, not to the numbers, which come from the wire.
 
-    in_order: delay publications after a gap until it is closed or overdue. newest: the last number
-    in an arrival or a heartbeat.
+    in_order: delay publications after a gap until it is closed or overdue. newest: last number
+    received.
     """
 
     first: int
@@ -37,7 +36,7 @@ class Arrivals(Generic[T]):
     _settled: IntervalSet = field(default_factory=IntervalSet, init=False)
     """Numbers from `first` on that arrived or are gone."""
     _gone: IntervalSet = field(default_factory=IntervalSet, init=False)
-    """Numbers that the publisher no longer has, and those of gaps that were given up."""
+    """Numbers that the publisher no longer has, and gaps given up."""
     _delayed: dict[int, T] = field(default_factory=dict, init=False)
     _since_s: float | None = field(default=None, init=False)
     _due_s: float = field(default=0.0, init=False)
@@ -67,13 +66,13 @@ class Arrivals(Generic[T]):
 
     @property
     def missing(self) -> tuple[int, int] | None:
-        """First and last missing number; some in between may have arrived."""
+        """First and last missing number."""
         last = self._settled.last_absent(self.newest)
         return (self._whole, last) if last >= self._whole else None
 
     @property
     def lacking(self) -> list[tuple[int, int]]:
-        """Missing intervals; those that the publisher no longer has come first."""
+        """Missing intervals, first those that the publisher no longer has."""
         return [*self._gone, *self._open()]
 
     def due(self, now_s: float) -> tuple[int, int | None] | None:
@@ -96,9 +95,7 @@ class Arrivals(Generic[T]):
         return missing if self._asked == 1 else (missing[0], None)
 
     def overdue(self, now_s: float) -> list[T]:
-        """Release the items that a gap delayed too long, in order; none are delayed until it is
-        closed.
-        """
+        """Release the items of an overdue gap; none are delayed until it is closed."""
         if self._since_s is None or now_s - self._since_s < DELAY_S:
             return []
         self._loose = True
@@ -106,11 +103,11 @@ class Arrivals(Generic[T]):
 
     def answered(self, first: int, newest: int, known: int | None = None) -> list[T]:
         """Record the publisher's complete reply for `first` to `newest`; returns the items to
-        deliver now.
+        deliver.
 
-        Numbers still missing in that interval are gone. known: the last number known at the
-        request. If it exceeds the publisher's own and nothing newer arrived since, it was that of
-        another key: after a cut Zenoh can deliver a heartbeat, too, under another key.
+        Numbers still missing are gone. known: the last number at the request. If it exceeds the
+        publisher's and nothing newer arrived since, it was that of another key: after a cut Zenoh
+        can deliver a heartbeat under another key.
         """
         for begin, end in self._open():
             self._give_up(max(begin, first), min(end, newest))
@@ -120,7 +117,7 @@ class Arrivals(Generic[T]):
 
     @property
     def _whole(self) -> int:
-        """First number from `first` on that neither arrived nor is gone."""
+        """First number that neither arrived nor is gone."""
         return self._settled.next_absent(self.first)
 
     def _give_up(self, first: int, last: int) -> None:

@@ -2,9 +2,9 @@
 
 32 bytes, `<qqq8s`: team time [ns], the publisher's wall clock [ns], the publisher's counter of the
 key, and a hash of the whole key (BLAKE2b with a digest of 8 bytes, of the key's UTF-8). Zenoh
-abbreviates keys by numbers that both ends of a link agree on; data in flight when a link is cut is
-read with the numbers of the new link and can arrive under another key. The hash reveals that. The
-length is the version of the format: an attachment of 24 bytes has no hash.
+abbreviates keys by numbers per link; data in flight when a link is cut is read with the numbers of
+the new link and can arrive under another key. The hash reveals that. The length is the version of
+the format: 24 bytes have no hash.
 """
 
 import hashlib
@@ -40,7 +40,7 @@ def pack(key: str, attachment: Attachment) -> bytes:
 
 
 def unpack(key: str, data: bytes) -> Attachment:
-    """Unpack the attachment of a publication received on a key; raises `AttachmentError`."""
+    """Unpack the attachment of a publication on this key; raises `AttachmentError`."""
     if len(data) == _WITHOUT_HASH:
         raise AttachmentError("its attachment has no hash of the key: an older version's publisher")
     if len(data) != _FORMAT.size:

@@ -1,11 +1,10 @@
 """The bus over Zenoh: publish, subscribe, query and answer for one process of the team.
 
-Each payload has an attachment: stamps, the publisher's counter of the key, and a hash of the key
-(`team.wire.zenoh.attachment`). `team.wire.zenoh.delivery` implements a channel's delivery;
-`team.wire.zenoh.recovery` requests samples that Zenoh does not recover.
+Each payload has an attachment (`team.wire.zenoh.attachment`). `team.wire.zenoh.delivery` implements
+a channel's delivery; `team.wire.zenoh.recovery` requests samples that Zenoh does not recover.
 
-Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue.
-There is no further thread, the order of arrival is preserved across subscriptions, and a slow node
+Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue:
+there is no further thread, the order of arrival is preserved across subscriptions, and a slow node
 never blocks the link (the team's credit bounds the queue). A bus does not receive its own samples.
 """
 
@@ -40,12 +39,12 @@ _ALIVE_TIMEOUT_S = 5.0
 _FLUSH = "router/flush"
 _FLUSH_S = 10.0  # a closing bus waits this long for a router that reads slowly or is stopped
 MOST_WAITING = 1_000
-"""Queued samples of an observing node beyond which dispensable ones are dropped.
+"""Queue length of an observing node beyond which dispensable samples are dropped.
 
 Each sample keeps its receive buffer alive: some 10 kB.
 """
 MOST_KEYS = 16_384
-"""Number of keys on which a bus receives samples; a team of 100 robots has 4,500."""
+"""Most keys on which a bus receives samples; a team of 100 robots has 4,500."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +59,9 @@ _Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | Non
 class ZenohBus:
     """A bus over one Zenoh session: a client of the router at `connect`.
 
-    keys: this node's certificate for TLS; None: TCP without a certificate. stop: set for a process
-    of the team, which waits for a silent router until the event is set. Raises `BusError` when no
-    router answers within `patience_s`, or when either side refuses the other. One thread publishes
-    and receives; `close` may be called from any.
+    keys: this node's certificate for TLS; None: TCP. stop: with it, wait for a silent router until
+    the event is set. Raises `BusError` when no router answers within `patience_s`, or either side
+    refuses the other. One thread publishes and receives; `close` may be called from any.
     """
 
     def __init__(
@@ -88,8 +86,8 @@ class ZenohBus:
         self.tap: Tap | None = None
         """Receives all samples that this bus publishes and receives."""
         self.dropped = 0
-        """Received samples dropped for a key of no channel, an unsound attachment, or another key
-        than their publisher's.
+        """Samples dropped for a key of no channel, an unsound attachment, or another publisher's
+        key.
         """
         self._keys_received: set[str] = set()
         self._counting = threading.Lock()
@@ -122,10 +120,9 @@ class ZenohBus:
             self._queue.put(None)
 
     def _flush(self) -> None:
-        """Wait until the router has received the publications: a closing session may drop unsent
-        ones.
+        """Wait until the router has received the publications, which a closing session may drop.
 
-        The query follows the samples on their link and nobody answers it, so its end comes from the
+        The query follows them on their link and nobody answers it, so its end comes from the
         router. Without a link it ends at once.
         """
         with suppress(zenoh.ZError):
@@ -138,8 +135,8 @@ class ZenohBus:
                 pass
 
     def publish_totals(self) -> Tally | None:
-        """Report the sample count of each key to a recorder, this report included, to reveal lost
-        samples at the end. None for a process without a token.
+        """Report the sample count of each key, this report included, to reveal lost samples at the
+        end. None for a process without a token.
         """
         if not self._tokens:
             return None
@@ -157,8 +154,7 @@ class ZenohBus:
         return tally
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and publish, stamped with this machine's wall clock; returns the payload's size
-        [bytes].
+        """Encode and publish, stamped with the wall clock; returns the payload's size [bytes].
 
         Blocks while the link is busy; after ten seconds Zenoh drops the link and connects anew.
         """
@@ -170,9 +166,7 @@ class ZenohBus:
         return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
-        """Publish a sample unchanged, with the delivery of its key; a key that is not in the table
-        is a stream.
-        """
+        """Publish a sample unchanged, with its key's delivery (default: stream)."""
         self._check_open()
         if len(sample.payload) > LARGEST_PAYLOAD:
             raise BusError(
@@ -200,10 +194,9 @@ class ZenohBus:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribe to a channel for `receive`; a repeated call changes nothing.
+        """Subscribe to a channel; repetition has no effect.
 
-        whole: for a `latest` channel all samples that its publishers still have, not only the
-        newest.
+        whole: for a `latest` channel all samples that its publishers still have.
         """
         self._check_open()
         if {(channel.name, "*"), (channel.name, name)} & self._requested:
@@ -223,7 +216,7 @@ class ZenohBus:
                 self._recovery.watch(key)
 
     def _admit(self, item: _Item) -> None:
-        """Queue a received item, unless it is a sample on a key of no channel or of too many keys.
+        """Queue a received item, except samples on keys of no channel or of too many keys.
 
         Called on Zenoh's receiving threads.
         """
@@ -250,7 +243,7 @@ class ZenohBus:
         return row is not None and row.name in self._sheds
 
     def _shed(self, item: _Item) -> None:
-        """Queue a dispensable sample of an observing node, unless the node is too far behind."""
+        """Queue an observing node's dispensable sample, unless it is too far behind."""
         if self._queue.qsize() < MOST_WAITING:
             self._admit(item)
 
@@ -258,10 +251,9 @@ class ZenohBus:
         """Return all samples received since the last call, in order; waits at most `timeout_s` for
         the first.
 
-        Queries are answered here, on the caller's thread: a node's state needs no lock. Samples
-        missing for a while are requested and returned when they arrive, after later ones. Samples
-        that arrive during the call are left for the next one, which bounds the call for a team that
-        publishes faster than this node reads.
+        Queries are answered here, on the caller's thread: a node's state needs no lock. Missing
+        samples are requested and returned when they arrive, after later ones. Samples that arrive
+        during the call are left for the next, which bounds it for a fast team.
         """
         self._check_open()
         self._link.look(time.monotonic())
@@ -322,9 +314,8 @@ class ZenohBus:
         self._recovery.again()
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples published and not received: by key, intervals of a publisher's counters.
-
-        Includes samples that their publisher no longer has.
+        """Samples published and not received, even if no longer available: by key, intervals of a
+        publisher's counters.
         """
         return self._recovery.lacking()
 
@@ -333,17 +324,15 @@ class ZenohBus:
         return self._recovery.awaited()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer the queries of `channel` within `receive`; the text of a ValueError is sent as the
-        reply.
-        """
+        """Answer the queries of `channel` within `receive`; a ValueError's text is the reply."""
         self._check_open()
         self._queries.answer(channel, name, answer)
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
         """Query and return the replies' payloads in order; empty when nobody answers.
 
-        Raises `BusError` when a reply is an error or not complete within `timeout_s`. Meanwhile
-        this bus answers no queries: two nodes must not query each other at once.
+        Raises `BusError` for an error or timeout. Meanwhile this bus answers no queries: two nodes
+        must not query each other at once.
         """
         self._check_open()
         payloads = self._queries.ask(channel, name, request, timeout_s)
@@ -354,7 +343,7 @@ class ZenohBus:
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Query without waiting: `receive` returns the replies as samples of their channels.
+        """Query without waiting: `receive` returns the replies as samples.
 
         No effect while the same query is open.
         """
@@ -369,9 +358,7 @@ class ZenohBus:
             self._tokens[node] = self._session.liveliness().declare_token(key)
 
     def watch_alive(self, node: str = "*") -> None:
-        """Receive `Liveliness` samples when other nodes' tokens appear and disappear, present ones
-        first.
-        """
+        """Receive `Liveliness` samples of other nodes' tokens, present ones first."""
         self._check_open()
 
         def notice(sample: zenoh.Sample) -> None:

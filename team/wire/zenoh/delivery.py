@@ -1,11 +1,11 @@
 """Implement the deliveries of the table of channels by Zenoh's means.
 
-All publishers block while their link to the router is busy; the router drops samples to a receiver
-that is slower than the team (`team.wire.zenoh.router`).
+All publishers block while their link to the router is busy; the router drops samples to a slow
+receiver (`team.wire.zenoh.router`).
 
-stream: a plain publisher; samples sent during a cut, and dropped ones, are lost.
+stream: a plain publisher; samples of a cut, and dropped ones, are lost.
 latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut or a drop
-the receiver requests what the heartbeat shows as missed, as far back as the cache reaches.
+the receiver requests the missed ones, as far back as the cache reaches.
 all: as `latest` with everything cached, and a late joiner requests everything.
 """
 
@@ -28,9 +28,7 @@ Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
 
 def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
-    """Declare a publisher with the delivery of the key's row; a key that is not in the table is a
-    stream.
-    """
+    """Declare a publisher with the key's delivery (default: stream)."""
     row = row_of(key)
     if row is None or row.delivery == "stream":
         return session.declare_publisher(

@@ -15,19 +15,17 @@ from team.wire.bus import BusError
 TOKENS_S = 5.0
 """Timeout [s] for the list of tokens that are present."""
 CAPACITY = 65_536
-"""Capacity [messages] of a subscription. Only a full channel blocks Zenoh's thread, and with it the
+"""Capacity [messages] of a subscription. A full channel blocks Zenoh's thread, and with it the
 router, which then drops messages.
 """
 AT_ONCE = 10_000
-"""Largest number of messages per subscription that one call of `receive` returns."""
+"""Largest number of messages per subscription and call of `receive`."""
 LOOK_S = 0.005
 """Polling interval [s] while nothing has arrived."""
 
 
 class ForeignSample(NamedTuple):
-    """A publication with its attachment, or a liveliness token, which appeared or disappeared
-    (`alive`).
-    """
+    """A publication with its attachment, or a liveliness token (`alive`: it appeared)."""
 
     key: str
     payload: bytes
@@ -40,9 +38,9 @@ class ForeignKeys:
     """Subscriptions to keys and tokens at a router or peer; raises BusError where none answers.
 
     Zenoh's thread fills one channel per subscription without running Python, so a process that is
-    busy decoding does not block it. `receive` reads from these channels; samples of one key keep
-    their publisher's order, those of different keys have none. latched: keys whose earlier samples
-    are requested from the publishers' caches.
+    busy decoding does not block it. Samples of one key keep their publisher's order, those of
+    different keys have none. latched: keys whose earlier samples are requested from the publishers'
+    caches.
     """
 
     def __init__(
@@ -124,9 +122,9 @@ class ForeignKeys:
     def publish(
         self, key: str, payload: bytes, attachment: bytes | None = None, *, latched: bool = False
     ) -> None:
-        """Publish on a key; a late subscriber receives the newest sample of a latched one.
+        """Publish on a key; a late subscriber receives a latched one's newest sample.
 
-        A message that a slow network cannot take is dropped: the next one replaces it.
+        A message that a slow network cannot take is dropped.
         """
         publisher = self._publishers.get(key)
         if publisher is None:

@@ -1,9 +1,8 @@
 """Diagnose a failing link to a router, for which Zenoh reports only a timeout.
 
-One TLS handshake by the standard library, beside Zenoh, distinguishes the cases. Only positive
-evidence refuses a link: a TLS alert about our certificate, a router certificate that fails
-verification, an answer that is not TLS. A timeout, a closed connection or any other network error
-is a reason to wait.
+One TLS handshake by the standard library distinguishes the cases. Only evidence refuses a link: a
+TLS alert about our certificate, a router certificate that fails verification, an answer that is not
+TLS. A timeout, a closed connection or another network error is a reason to wait.
 """
 
 import re
@@ -36,9 +35,8 @@ class Examined:
     """Result of one handshake.
 
     refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
-    is no link yet; empty if the handshake succeeded. router_ends: expiry of the router's
-    certificate [s since 1970], if received. accepts: connections are accepted there, though perhaps
-    not answered.
+    is no link yet; empty after success. router_ends: expiry of the router's certificate [s since
+    1970], if received. accepts: connections are accepted, though perhaps not answered.
     """
 
     refused: str | None = None
@@ -48,7 +46,7 @@ class Examined:
 
 
 def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT_S) -> Examined:
-    """Make one handshake with the router at `connect`; takes at most three times `timeout_s`."""
+    """Make one handshake with the router; takes at most three times `timeout_s`."""
     at = _ENDPOINT.match(connect)
     if at is None:
         return Examined()

@@ -37,7 +37,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Reply:
-    """One reply to a request; without a payload it marks the end, or an error with its reason."""
+    """One reply to a request; without a payload the end, or an error with its reason."""
 
     channel: Channel
     name: str
@@ -46,9 +46,7 @@ class Reply:
 
 
 class Queries:
-    """Queries of one session. Zenoh's thread passes questions and replies to `put`; all other
-    methods are for one thread.
-    """
+    """Queries of one session. Zenoh's thread calls `put`; all other methods are for one thread."""
 
     def __init__(
         self, session: zenoh.Session, prefix: str, put: Callable[[Question | Reply], None]
@@ -108,7 +106,7 @@ class Queries:
         )
 
     def taken(self, reply: Reply) -> list[Sample]:
-        """Convert a reply to a sample of its channel; empty for the end or an unsound reply."""
+        """Convert a reply to a sample; empty for the end or an unsound reply."""
         key = reply.channel.key(reply.name)
         if reply.payload is None:
             self._requests.discard((reply.channel.name, reply.name))

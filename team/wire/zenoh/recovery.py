@@ -1,13 +1,13 @@
 """Request missing publications from their publisher's cache.
 
-Zenoh's advanced subscriber does most of this, but some late joiners receive only a part of the
-history. The arrivals of each publisher are therefore counted (`team.wire.zenoh.arrivals`) and
-compared with its heartbeats, and gaps older than half a second are requested.
+Zenoh's advanced subscriber gives some late joiners only a part of the history. The arrivals of each
+publisher are therefore counted (`team.wire.zenoh.arrivals`) and compared with its heartbeats, and
+gaps older than half a second are requested.
 
 Keys, publishers and numbers come from the wire, so the publishers tracked per node and in all are
-bounded: samples of further publishers are delivered as they come and not recovered. A robot has
-some 30 keys with a cache, the centre five per robot, and a restarted process is a new publisher: a
-team of a hundred robots, each restarted thirty times, is within the bounds.
+bounded; samples of further ones are delivered as they come. A robot has some 30 keys with a cache,
+the centre five per robot, and a restarted process is a new publisher: a team of a hundred robots,
+each restarted thirty times, is within the bounds.
 """
 
 import struct
@@ -24,18 +24,18 @@ from team.wire.logs import LOG
 from team.wire.zenoh.arrivals import Arrivals
 
 ADVANCED = "/@adv/pub/"
-"""Part of the keys on which an advanced publisher sends its heartbeats."""
+"""Part of the keys of advanced publishers' heartbeats."""
 _BEAT = struct.Struct("<I")  # payload of a heartbeat: the number of the last publication
 _LOOK_S = 0.1  # interval of the checks for missing samples
 _ANSWER_S = 10.0
 _NEVER = 2**63
 _SEVERAL = ""  # replaces a publisher's key: its samples arrived on several
 MOST_OF_A_NODE = 4_096
-"""Largest number of publishers, each on one key, tracked on the keys of one node."""
+"""Most tracked publishers, each on one key, on the keys of one node."""
 MOST_PUBLISHERS = 131_072
-"""Largest number of publishers tracked in all: some 100 MB."""
+"""Most tracked publishers in all: some 100 MB."""
 MOST_BEATS = 131_072
-"""Number of stored heartbeats beyond which they are cleared; each is then new again."""
+"""Number of stored heartbeats beyond which they are cleared."""
 LONGEST_KEY = 512
 """Longest key, in characters, on which missing samples are requested."""
 MOST_ASKED = 256
@@ -55,7 +55,7 @@ class Heartbeat:
 class CacheAnswer:
     """Complete reply of a publisher's cache: the requested interval, and the samples.
 
-    known: the publisher's last number known at the request. newest: that of the reply.
+    known: the publisher's last number at the request. newest: that of the reply.
     """
 
     key: str
@@ -68,8 +68,8 @@ class CacheAnswer:
 
 
 class Recovery:
-    """Recovery for one session. Zenoh's thread passes heartbeats and replies to `put`; all other
-    methods are for one thread.
+    """Recovery for one session. Zenoh's thread calls `put`; all other methods are for one
+    thread.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Recovery:
         """Number of samples and heartbeats of publishers beyond the bounds."""
 
     def watch(self, key: str) -> None:
-        """Subscribe to the heartbeats of a key's publishers; the key has the session's prefix."""
+        """Subscribe to the heartbeats of a key (with the session's prefix)."""
         self._session.declare_subscriber(
             f"{key}{ADVANCED}**",
             Callback(self._beat, indirect=False),
@@ -100,7 +100,7 @@ class Recovery:
         )
 
     def take_whole(self, channel: str) -> None:
-        """Request all samples that the publishers of this `latest` channel still have."""
+        """Request all samples that publishers of this `latest` channel still have."""
         self._whole.add(channel)
 
     def _beat(self, sample: zenoh.Sample) -> None:
@@ -153,7 +153,7 @@ class Recovery:
 
     def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample] | None:
         """Arrivals of one publisher on one key; None beyond the bounds, and on a key of no channel.
-        On a `latest` channel nothing older than the first known number is requested.
+        On a `latest` channel nothing before the first known number is requested.
         """
         found = self._arrivals.get((key, publisher))
         if found is None:
@@ -235,9 +235,8 @@ class Recovery:
         }
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples published and not received: by key, intervals of a publisher's counters.
-
-        Includes samples that their publisher no longer has.
+        """Samples published and not received, even if no longer available: by key, intervals of a
+        publisher's counters.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):
@@ -253,5 +252,5 @@ def _node_of(key: str) -> str:
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
-    """The publisher, by the name in its heartbeats, and its number of the publication."""
+    """The publisher as in its heartbeats, and its number of the publication."""
     return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn

@@ -26,11 +26,11 @@ if TYPE_CHECKING:  # not needed without keys
     from team.keys.credentials import Credentials
 
 REFUSALS = "error,zenoh_link_tls=warn"
-"""Zenoh's log filter of a router with keys: refused connections, with the reasons."""
+"""Zenoh's log filter with keys: refused connections, with reasons."""
 DROP_US = 100_000
 """Time [us] that a publication waits for a subscriber's full queue before it is dropped.
 
-Zenoh marks that queue as congested and drops further publications to it without a wait until the
+Zenoh marks that queue as congested and drops further publications to it at once until the
 subscriber reads again: a stopped subscriber delays the others once. It fetches the missed samples
 as after a cut link.
 """
@@ -39,11 +39,11 @@ DROP_LARGE_US = 1_000_000
 CLOSE_US = 2_000_000
 """Time [us] that a reply or a query waits for a full queue before the link is closed.
 
-Its process connects again. A publication dropped for its size is fetched by a query, so a message
-of S bytes needs a link of (S - 5 MB) in that time.
+Its process reconnects. A publication dropped for its size is fetched by a query, so a message of S
+bytes needs a link of (S - 5 MB) in that time.
 """
 QUEUE_BATCHES = 16
-"""Batches of 64 kB in the queue to each subscriber, Zenoh's largest number."""
+"""Batches of 64 kB per subscriber's queue, Zenoh's largest number."""
 RX_THREADS = 128
 """Receiving threads; more than a team has links."""
 _CONGESTION = "transport/link/tx/queue/congestion_control"
@@ -52,7 +52,7 @@ _DROPS = {
     "flows": ["egress"],
     "overwrite": {"congestion_control": "drop"},
 }
-"""Publishers block on their own full queue; on its way out of the router a publication does not."""
+"""Publishers block on their own full queue; publications leaving the router do not."""
 MOST_TEAMS = 1_000
 """Number of teams for which a router without keys stores messages."""
 
@@ -61,11 +61,10 @@ MOST_TEAMS = 1_000
 def router(
     listen: str = "tcp/127.0.0.1:0", keys: "tuple[Credentials, Roster] | None" = None
 ) -> Iterator[str]:
-    """Run a router in this process; yields the endpoint that it is bound to.
+    """Run a router in this process; yields its endpoint.
 
     keys: the router's credentials and the roster of accepted nodes: it then uses TLS only and logs
-    refused nodes, with the reason, on stderr or stdout. Raises `BusError` when it cannot listen
-    there.
+    refused nodes, with the reason. Raises `BusError` when it cannot listen there.
     """
     settings: dict[str, object] = {
         "mode": "router",
@@ -104,10 +103,10 @@ def router(
 
 
 class _Keeper:
-    """Stores each team's ends and operators' orders at the router, and answers queries for them.
+    """Stores each team's ends and operators' orders, and answers queries for them.
 
     team: the only team of a router with keys, whose access control would refuse a subscription to
-    the keys of all teams; "*": any team.
+    all teams' keys; "*": any team.
     """
 
     def __init__(self, session: zenoh.Session, team: str) -> None:
@@ -164,7 +163,7 @@ class _Keeper:
 
 
 def _answer_door(session: zenoh.Session, roster: Roster) -> None:
-    """Answer to each certificate of the authority, by common name, whether the roster has it."""
+    """Answer to the authority's certificates whether the roster has their name."""
     names = {roster.common_name(node) for node in roster.nodes}
 
     def answer(query: zenoh.Query) -> None:

@@ -1,7 +1,7 @@
 """Open a process's link to its team's router and monitor it.
 
-Every process is a client of one router, a star without discovery: a process that is not configured
-cannot connect, and the router is the single place to control or watch a team's traffic.
+Every process is a client of one router, a star without discovery: an unconfigured process cannot
+connect, and the router is the single place to control or watch the traffic.
 """
 
 import json
@@ -26,14 +26,13 @@ FIRST_LOOK_S = 3.0
 LINK_S = 1.0
 """Interval [s] between two checks of the link."""
 LONGEST_S = 30.0
-"""Longest interval [s] between two examinations of a failing link; intervals double up to it."""
+"""Longest interval [s] between two examinations of a failing link, which double."""
 REPEAT_S = 60.0
 """Interval [s] at which a client without a router logs the reason again."""
 ANSWER_S = 5.0
 """Timeout [s] of the query for our certificate's acceptance, and of an examination."""
 DOOR = "router/door"
-"""Key prefix on which a router with keys answers whether it accepts a certificate, by common name.
-"""
+"""Key prefix on which a router with keys answers for a certificate's common name."""
 ACCEPTED, REVOKED = b"accepted", b"revoked"
 
 
@@ -63,8 +62,8 @@ def client(
     """Open a client's session; raises `BusError` if none opens within `patience_s` or the router
     refuses us.
 
-    stop: set for a process of the team, which waits until the event for a router that accepts
-    connections without answering, as a stopped or busy one does.
+    stop: with it, wait until the event for a router that accepts connections without answering, as
+    a stopped or busy one does.
     """
     settings: dict[str, object] = {
         "mode": "client",
@@ -122,10 +121,10 @@ class RouterLink:
     it.
 
     Silence never ends a process: a router that is gone, stopped or behind a bad radio link is
-    waited for without limit, and the reason is logged. Only evidence raises `BusError`: the result
-    of a handshake (`team.wire.zenoh.handshake`), or the router's statement that its roster lacks
-    our certificate. Zenoh connects a revoked certificate, too, and drops its messages silently; so
-    each new link is followed by that query.
+    waited for without limit. Only evidence raises `BusError`: the result of a handshake
+    (`team.wire.zenoh.handshake`), or the router's statement that its roster lacks our certificate.
+    Zenoh connects a revoked certificate, too, and drops its messages silently; so each new link is
+    followed by that query.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:

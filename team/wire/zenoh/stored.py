@@ -1,16 +1,15 @@
 """Samples of a team that a router stores for absent processes: ends and orders.
 
-A stored sample keeps its key, bytes and attachment, and thereby its author: with keys, the router's
-access control lets only that node publish on the key. A sample is decoded and checked before it is
-stored, and an end replaces only an end of the same author.
+A stored sample keeps its key, bytes and attachment, and thereby its author: with keys, access
+control lets only that node publish on the key. It is decoded and checked before it is stored, and
+an end replaces only an end of the same author.
 
 Ends (`ENDS`: the centre's final map; without a centre each robot's final map and conclusion) are
-stored until their author publishes another one. A starting process cannot tell by itself whether it
-belongs to the finished run or to a new one. The router stores which nodes of that run never
-announced their end (`Tally`): a node of that name is sent the end until one of its processes
-announces its own. Orders of operators who have left (a robot withdrawn or given up, verdicts on
-landmarks, the end of a live team) are valid until the centre's final map, or until no process of
-the team is present.
+stored until their author publishes another. A starting process cannot tell whether it belongs to
+the finished run or to a new one. The router stores which nodes of that run never announced their
+end (`Tally`): a node of that name is sent the end until one of its processes announces its own.
+Orders of operators who have left (a robot withdrawn or given up, verdicts on landmarks, the end of
+a live team) are valid until the centre's final map, or until no process of the team is present.
 """
 
 import threading
@@ -22,9 +21,9 @@ from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FusedMap, Kept, KeptRequest
 
 MOST_ORDERS = 10_000
-"""Number of stored orders to a team, signatures included; further ones must be repeated."""
+"""Most stored orders to a team, signatures included; others must be repeated."""
 MOST_ENDS = 400
-"""Number of keys on which ends are stored: two per robot of the largest team, and others."""
+"""Most keys of stored ends: two per robot of the largest team, and others."""
 
 MOST_NODES = 1_000
 """Number of nodes of a team whose end is tracked."""
@@ -32,9 +31,7 @@ MOST_NODES = 1_000
 
 @dataclass(frozen=True)
 class _End:
-    """A stored end: its channel, the monotonic time of its arrival [s], its reply, and the nodes
-    that missed it.
-    """
+    """A stored end: channel, monotonic time of arrival [s], reply, and the nodes that missed it."""
 
     channel: str
     since_s: float
@@ -44,9 +41,7 @@ class _End:
 
 @dataclass
 class StoredMessages:
-    """Stored messages of one team. Calls may come from any thread; times are a monotonic clock's
-    [s].
-    """
+    """Stored messages of one team. Calls come from any thread; times are monotonic [s]."""
 
     _there: set[str] = field(default_factory=set, init=False)
     _silent: set[str] = field(default_factory=set, init=False)
@@ -69,7 +64,7 @@ class StoredMessages:
             return node in self._silent
 
     def last_word(self, node: str) -> None:
-        """Record the orderly end of a node's process, which no longer needs the end of the team."""
+        """Record the orderly end of a node's process, which needs no stored end."""
         with self._lock:
             self._silent.discard(node)
             for end in self._ends.values():
@@ -115,7 +110,7 @@ class StoredMessages:
         self._named.clear()
 
     def answer(self, request: KeptRequest, now_s: float) -> list[bytes]:
-        """Stored samples that a node requests, the oldest first, as payloads of `Kept`."""
+        """Stored samples for a node, the oldest first, as payloads of `Kept`."""
         with self._lock:
             orders = [reply for reply, name in self._orders.items() if name in request.channels]
             ends = [
