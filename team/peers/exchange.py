@@ -20,7 +20,7 @@ MOST_REQUESTED = 64
 MOST_ASKED = 512
 """Most submaps per request."""
 ANSWER_BYTES = 1 * 2**20
-"""Most bytes of members per answer, except for a single larger member."""
+"""Most bytes of members per answer, unless a single member is larger."""
 BATCH_BYTES = 64 * 2**10
 """Bytes of members per message of an answer."""
 
@@ -30,7 +30,7 @@ def make_request(
 ) -> m.MembersRequest | None:
     """Request the members of the summary's node that this replica lacks; None where there are none.
 
-    not_now: (stream, sequence) requested from another peer recently. A stream with equal sequences
+    not_now: (stream, sequence) requested recently from another peer. A stream with equal sequences
     and different digests is requested whole: its robot has contradicted itself, and all peers keep
     the smaller of two members.
     """

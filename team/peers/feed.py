@@ -20,7 +20,7 @@ def feed_order(message: m.Message) -> int:
 
 def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
     """Yield members of streams that `fed` does not count yet: initial poses, then submaps by end
-    time, each after the inter-robot measurements from it.
+    time, each after its inter-robot measurements.
 
     A fold in the order of time undoes nothing.
     """

@@ -7,7 +7,7 @@ GIVEN_BYTES = 32 * 2**20
 class Given:
     """Bytes sent within the current second: bounds the cost of endless requests.
 
-    Not counted by node: the name in a request is not authenticated.
+    Not counted by node, since the name in a request is not authenticated.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
 """A member of the team's set: a message's original bytes and its name in the set.
 
-Members are the inputs of a map: initial poses, submaps with the inter-robot measurements from them,
-orders (withdrawals, robots given up), verdicts on identities and `Done`. `Concluded` is a member,
-too, but no input.
+Members are the inputs of a map: initial poses, submaps and their inter-robot measurements, orders
+(withdrawals, robots given up), verdicts on identities and `Done`; and `Concluded`, which is no
+input.
 """
 
 import hashlib

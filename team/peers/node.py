@@ -1,8 +1,8 @@
 """Replicate the team's set between peers: members in, members out; no I/O, no clock.
 
-The node publishes a summary of its set (`SetSummary`) when the set has changed or a node appears,
-requests members that it lacks, and answers requests. Members travel over third robots. The fold
-receives each stream in order: the initial pose, then the submaps without a gap.
+The node publishes a summary (`SetSummary`) when its set has changed or a node appears, requests
+members that it lacks, and answers requests. Members travel over third robots. The fold receives
+each stream's initial pose, then its submaps without a gap.
 """
 
 from collections import Counter, defaultdict
@@ -29,9 +29,9 @@ REPEAT_S = 10.0
 PATIENCE_S = 3.0
 """Time [s] after which an unanswered request goes to another node."""
 FRESH_S = 25.0
-"""Age [s] beyond which a summary does not show that its node is in reach."""
+"""Age [s] beyond which a summary does not prove reach."""
 MOST_OPEN = 16_384
-"""Most open requests per node; further ones wait for members or expiry."""
+"""Most open requests per node."""
 
 
 @dataclass
@@ -45,9 +45,9 @@ class NodeTraffic:
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    known: nodes that may have a set: the team's robots and a centre. proofs: checks members that
-    come over third nodes; None: no keys, every node is trusted. unsaved: new members since last
-    cleared. refused: number of rejected members; last_refused: the reason.
+    known: nodes that may have a set: the robots and a centre. proofs: checks members that come over
+    third nodes; None: no keys, every node is trusted. unsaved: new members since last cleared.
+    refused: rejected members; last_refused: the reason.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -102,8 +102,8 @@ class PeerNode:
         return True
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
-        """As `take`, for a sample on a member's key, which the router lets only its author use; a
-        certificate must also be the authority's.
+        """As `take`, for a sample on a member's key, which only its author may use; a certificate
+        must also be the authority's.
         """
         try:
             member = member_of(sample.key, sample.payload)
@@ -144,8 +144,8 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """Yield queued messages for the fold: operators' orders first, since it may end with the
-        last member of a stream; `Done` messages last.
+        """Yield queued messages for the fold: operators' orders first, since it may end with a
+        stream's last member; `Done` messages last.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)
@@ -167,9 +167,7 @@ class PeerNode:
     # Exchange.
 
     def take_summary(self, summary: m.SetSummary) -> list[Outgoing]:
-        """Request missing members from a summary's node; publish a summary where that node lacks
-        members.
-        """
+        """Request a summary's missing members; publish one where that node lacks members."""
         if summary.node == self.node:
             return []
         if summary.node not in self.known:

@@ -2,14 +2,14 @@
 
 Every robot publishes its certificates, themselves members, and the signature of each of its members
 on its own key (`robot/r1/signature`). An operator leaves at once: it signs its orders
-(`operator/signature/r1`) with its certificate in front, so robots out of its reach can check them.
+(`operator/signature/r1`) with its certificate in front, for robots out of its reach.
 
-A member is proven by any certificate of its author that the team's authority issued, that is not
-revoked, and that had not expired at the member's stamp. That stamp is by the author's own clock: a
-stolen key can sign with an earlier date, and only its revocation ends that. A certificate of a
-later generation proves that the earlier ones are revoked, since the authority issues it only then;
-a roster beside the own key names revocations without a successor. Certificates of revoked
-generations stay in the set, which is the same for all peers, and prove nothing.
+A member is proven by any certificate of its author that the authority issued, that is not revoked,
+and that had not expired at the member's stamp. That stamp is by the author's clock: a stolen key
+can sign with an earlier date until it is revoked. A certificate of a later generation proves that
+the earlier ones are revoked, since the authority issues it only then; a roster beside the own key
+names revocations without a successor. Certificates of revoked generations stay in the set, which is
+the same for all peers, and prove nothing.
 """
 
 from collections.abc import Iterator
@@ -85,8 +85,8 @@ class Proofs:
             signatures[signature.member] = signature.signature
 
     def of(self, member: Member) -> bytes:
-        """A member's signature; empty where it is missing, and for a certificate, which the
-        authority has signed.
+        """A member's signature; empty where missing, and for a certificate, signed by the
+        authority.
         """
         if isinstance(member.message, m.Certificate):
             return b""

@@ -1,8 +1,8 @@
 """One peer's copy of the team's set: grow-only, independent of the order of arrival.
 
-Of two different members of one name (a robot contradicts itself) the smaller hash stays, so all
-peers agree. The set accepts only known robots and possible incarnations and sequences, and limits
-the bytes per robot: no robot can fill another's disk.
+Of two members of one name (a robot contradicts itself) the smaller hash stays, so all peers agree.
+The set accepts only known robots and possible incarnations and sequences, and limits the bytes per
+robot: none can fill another's disk.
 """
 
 import hashlib
@@ -44,9 +44,9 @@ class RefusedError(ValueError):
 class StreamShare:
     """Stored members of one incarnation.
 
-    complete: sequences whose submap is stored with all inter-robot measurements from it; count: how
-    many of them from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes,
-    modulo 2²⁵⁶.
+    complete: sequences whose submap is stored with all its inter-robot measurements; count: how
+    many from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes, modulo
+    2²⁵⁶.
     """
 
     start: Member | None = None
@@ -59,9 +59,9 @@ class StreamShare:
     newest_ns: int = 0
 
     def parcel(self, sequence: int) -> list[Member]:
-        """A complete submap after the inter-robot measurements from it, in canonical order.
+        """A complete submap after its inter-robot measurements, in canonical order.
 
-        Surplus measurements beyond the number in the submap are left out.
+        Surplus measurements are left out.
         """
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
@@ -104,7 +104,7 @@ class Have(NamedTuple):
 class Replica:
     """The set of a team with the given robots, as one peer has it.
 
-    replacements: how often a robot contradicted a member already passed to the fold.
+    replacements: contradictions of members already passed to the fold.
     """
 
     def __init__(self, robots: Iterable[str], share: int = SHARE) -> None:
@@ -119,7 +119,7 @@ class Replica:
         self._announced: _Announced | None = None
 
     def add(self, member: Member) -> Outcome:
-        """Add a member; raises RefusedError for a member of another team or beyond a bound."""
+        """Add a member; raises RefusedError for another team's or beyond a bound."""
         message = member.message
         robot = about(message)
         if robot not in self._bytes:
@@ -359,8 +359,8 @@ def _rank(member: Member) -> tuple[int, bytes]:
 
 
 def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
-    """First, last, first, last, … of the first MOST_INTERVALS closed intervals; `count`: those from
-    0 on without a gap.
+    """First, last, first, last, … of the first MOST_INTERVALS intervals; `count`: gap-free from 0
+    on.
     """
     ends: list[int] = [0, count - 1] if count else []
     for each in sorted(s for s in sequences if s >= count):

@@ -1,11 +1,11 @@
 """A peer's or a centre's set on disk: an append-only file, loaded after a restart.
 
 Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
-little-endian; the body is a MessagePack array [key, payload, signature]. A record truncated by a
-crash is cut off when the file is opened. After a damaged record reading continues at the next one
-whose CRC fits; the file is then rewritten without the damage, which is reported. Lost members come
-from other peers or are computed again. A record is in the hands of the operating system when
-`append` returns: a killed process loses nothing, a computer without power the last seconds.
+little-endian; the body is a MessagePack array [key, payload, signature]. A truncated last record is
+cut off when the file is opened. After a damaged record reading continues at the next one whose CRC
+fits; the file is then rewritten without the damage, which is reported. Lost members come from other
+peers or are computed again. A record is in the operating system's hands when `append` returns: a
+killed process loses nothing, a power failure the last seconds.
 """
 
 import logging
@@ -69,7 +69,7 @@ def _next_record(content: bytes, at: int) -> int | None:
     """Find the first intact record from `at` on.
 
     A damaged record of sound length is skipped as a whole: apparent records within it are its
-    author's. Otherwise each place with the first byte of a body is tried.
+    author's. Otherwise each body's first byte is tried.
     """
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
         following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]
@@ -123,8 +123,8 @@ def missing_in(members: Iterable[Member]) -> list[str]:
 class SetFile:
     """The file of one peer; raises SetFileError.
 
-    members: those in it when opened. torn: bytes of an incomplete record at its end, cut off. lost:
-    other damage, in words; empty if none.
+    members: those in it when opened. torn: bytes of an incomplete last record, cut off. lost: other
+    damage, in words.
     """
 
     def __init__(self, path: Path) -> None:
@@ -186,7 +186,7 @@ class SetFile:
 
 
 def _is_cut_off(content: bytes, at: int) -> bool:
-    """Whether a file ends within the record here, as after a process was killed while writing."""
+    """Whether the file ends within this record, as after a killed write."""
     if at + _HEAD.size > len(content):
         return any(content[at:]) or at >= len(content)
     length, _ = _HEAD.unpack_from(content, at)
@@ -224,7 +224,7 @@ class Keeper:
     """Stores a set in its file; without a path in memory only.
 
     members: those in it when opened. Members that cannot be written are reported, kept in memory
-    and written once that is possible. Raises SetFileError where the file cannot be used.
+    and written later. Raises SetFileError for an unusable file.
     """
 
     def __init__(self, path: Path | None) -> None:

@@ -24,14 +24,12 @@ class Inbox:
         self._of_source: set[int] = set()
 
     def confirm(self, measurement: Measurement) -> None:
-        """Confirm a measurement by the source's own answer, however far off its stamp is."""
+        """Confirm a measurement by the source's answer, whatever its stamp."""
         if measurement.incarnation == self.incarnation:
             self._of_source.add(measurement.number)
 
     def resume(self, incarnation: int, next_measurement: int) -> None:
-        """Skip the measurements of `incarnation` before `next_measurement`, consumed by an earlier
-        process.
-        """
+        """Skip measurements of `incarnation` consumed by an earlier process."""
         self.incarnation = incarnation
         self.next_measurement = next_measurement
         waiting = self._later.pop(incarnation, {}) | self._waiting
@@ -55,8 +53,7 @@ class Inbox:
     def refusal(self, measurement: Measurement) -> str | None:
         """Why a measurement cannot belong to this stream; None if it can.
 
-        Incarnations follow one another, each begins with its only initial pose, and no stamp
-        precedes that one's.
+        Incarnations follow one another and begin with their only initial pose, the earliest stamp.
         """
         if isinstance(measurement, InitialPose) != (measurement.number == 0):
             what = type(measurement).__name__
@@ -126,7 +123,7 @@ class Inbox:
     def gap(self) -> tuple[int, int, int] | None:
         """Incarnation, first and last measurement of the gap before the earliest waiting one.
 
-        If only a later incarnation has arrived, the gap is at its beginning.
+        With only a later incarnation, the gap is at its beginning.
         """
         if self._waiting:
             first = min(self._waiting)
@@ -151,8 +148,8 @@ class Inbox:
         """Incarnation, first and last measurement to request from the source: a gap, or everything
         up to the end.
 
-        The source has no measurements after the end, or of an incarnation other than the present
-        and the last.
+        The source has nothing after the end, or of incarnations other than the present and the
+        last.
         """
         gap = self.gap
         if end is None:

@@ -17,8 +17,8 @@ LONGEST_NS = 2**62
 class StreamJudge:
     """Checks one incarnation of a sensor stream against the time of its last odometry.
 
-    A stamp `jump_s` ahead of the odometry is refused, and so is the odometry itself, until the next
-    interval confirms that the clock has jumped.
+    A stamp `jump_s` ahead of the odometry is refused, even of odometry, until the next interval
+    confirms that the clock has jumped.
     """
 
     def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
