@@ -2,7 +2,7 @@
 
 `benchmarks/NAME.json` has the `command`, where it was `measured`, and for each of its `figures` the
 `value`, the direction that is `better` ("less" or "more"), and the `tolerance`: the share by which
-a figure may be worse. Ratios of two halves of one run hold on any machine.
+it may be worse. Ratios within one run hold on any machine.
 """
 
 import json
@@ -57,7 +57,7 @@ def worse(figures: Mapping[str, float], name: str) -> list[str]:
 def concluded(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
     """Print the figures, write them to `file` if given, and compare them with the baseline.
 
-    wrong: further faults of the run. Returns the exit status: 1 for any fault.
+    wrong: further faults. Returns the exit status: 1 for any fault.
     """
     text = json.dumps(figures, indent=1)
     print(text)

@@ -2,9 +2,9 @@
 
     python -m benchmarks.chart FOLDER
 
-FOLDER/benchmarks.png: each figure and its worst allowed value, in units of the committed value.
-FOLDER/growth.png: a tick of the centre over its number of submaps; growth_large.png: the same of
-ten robots among a thousand landmarks.
+benchmarks.png: each figure and its worst allowed value, in units of the committed value.
+growth.png: a tick of the centre over its number of submaps; growth_large.png: of ten robots among a
+thousand landmarks.
 """
 
 import argparse

@@ -2,8 +2,7 @@
 
     python -m benchmarks.every [NAME …] [--output DIR]        or `make bench`
 
-Each runs by the `command` of its baseline; its figures are written to DIR/NAME.json. Exit status 1
-if a figure is worse or a benchmark failed.
+Figures are written to DIR/NAME.json. Exit status 1 if a figure is worse or a benchmark failed.
 """
 
 import argparse

@@ -1,10 +1,10 @@
 """Measure the latency from a submap's arrival to the maps and priors that contain it.
 
 `python -m benchmarks.fresh [LOG…] [--json FILE]`, of logs of `launch` at any pace, or of a run of
-its own at ten times real time. By wall time, for each submap but those of the last second: until
-the first map (a centre's, or any peer's) and the first prior of another robot that contain it. The
-latency must be within three times the round trip (median from a submap to the centre's credit for
-it) plus the solution time that the centre reports.
+its own at ten times real time. Wall time from each submap but those of the last second to the first
+map (a centre's or a peer's) and the first prior of another robot that contain it. It must be within
+three times the round trip (median from a submap to the centre's credit) plus the reported solution
+time.
 """
 
 import argparse
@@ -99,7 +99,7 @@ def launched(folder: Path) -> Path:
 
 
 def main() -> int:
-    """Measure and print; without a log, compare an own run with the committed baseline."""
+    """Measure and print; without a log, compare an own run with the baseline."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("logs", nargs="*", type=Path)
     parser.add_argument("--json", type=Path)

@@ -3,13 +3,12 @@
     python -m benchmarks.growth [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
                                 [--identities hidden]
 
-Synthetic submaps about a known truth go through the rule `join` without a network: all robots end a
-window in each tick, then comes a broadcast. At each size: CPU per tick with its broadcast (median
-of the last WINDOW), resident memory, bytes of the map and of all priors, and the map's error.
-`ratio_*` compare the ends of one run, so they hold on any machine. Exit status 1 if a figure is
-worse than growth.json allows. Without identities each submap renumbers its landmarks, the centre
-associates them, the error is to the nearest true landmark, and `window_ms` is a robot's cost to
-associate one window of WINDOW scans.
+Synthetic submaps about a known truth go through the rule `join` without a network: in each tick all
+robots end a window, then comes a broadcast. At each size: CPU per tick (median of the last WINDOW),
+resident memory, bytes of the map and of all priors, and the map's error. `ratio_*` compare the ends
+of one run, so they hold on any machine. Exit status 1 if a figure is worse than growth.json allows.
+Without identities each submap renumbers its landmarks, the error is to the nearest true landmark,
+and `window_ms` is a robot's cost to associate one window of WINDOW scans.
 """
 
 import argparse

@@ -2,10 +2,9 @@
 
     python -m benchmarks.importing [--messages 40000] [--damaged 1000000] [--json FILE]
 
-A bag of odometry and detections is written as .mcap and .db3, read plainly (every message
-deserialised by rosbags), and imported to a folder. Then damaged payloads are decoded: each is
-refused or a sound message after all. Exit status 1 if another error was raised or a figure is worse
-than benchmarks/importing.json allows.
+A bag of odometry and detections is written as .mcap and .db3, read plainly (deserialised by
+rosbags), and imported. Damaged payloads must be refused or sound. Exit status 1 if another error
+was raised or a figure is worse than benchmarks/importing.json allows.
 """
 
 import argparse

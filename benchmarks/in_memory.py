@@ -2,11 +2,10 @@
 
     python -m benchmarks.in_memory [--robots 50,400] [--steps 24] [--json FILE]
 
-Robots and landmarks of `random-50` in an area that grows with their number, so each robot detects
-equally many. Each size runs in its own process. cpu_ms: of one robot, the world's simulation
-included. verify_ms: to compute all of it again. equal: share of the messages of all sizes that are
-recomputed to the last bit. growth_*: the largest size over the smallest, so they hold on any
-machine. Exit status 1 if one is worse than in_memory.json allows.
+`random-50` at constant density, so each robot detects equally many landmarks. Each size runs in its
+own process. cpu_ms: of one robot, with the world's simulation. verify_ms: to compute all of it
+again. equal: share of messages recomputed to the last bit. growth_*: the largest size over the
+smallest, so they hold on any machine. Exit status 1 if one is worse than in_memory.json allows.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.peers [--json FILE] [--picture FILE]`: peers without estimators, each of which
 closes a submap of 1.2 kB every 10 s for 300 s of team time and exchanges messages every second. The
-star is a centre's traffic per robot. A run compares itself with `benchmarks/peers.json`.
+star is a centre's traffic per robot. A run is compared with `benchmarks/peers.json`.
 """
 
 import argparse
@@ -56,7 +56,7 @@ def submap(robot: str, sequence: int) -> m.Submap:
 
 def reach_of(topology: str, robots: int) -> Reach:
     """Reach by topology: all, along a line or a ring, in pairs for 5 s a minute, or two halves cut
-    apart for 100 s.
+    for 100 s.
     """
 
     def index(name: str) -> int:

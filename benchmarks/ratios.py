@@ -5,9 +5,9 @@
 in_a_run: an odometry interval through the segmenter, against direct composition. improved: a step
 of FastSLAM 2.0 against one of 1.0, 100 particles and four known landmarks. innovation: the NIS of
 that step against the step. node_us: an odometry interval at 70 Hz, decoded and processed by a
-robot's node [us], with its share of a scan every half second and of keyframes; without a baseline,
-since it depends on the machine. The halves of a ratio alternate, each is the least of its rounds.
-Exit status 1 if one is worse than benchmarks/ratios.json allows.
+robot's node [us], with its share of a scan every half second and of keyframes; machine-dependent,
+without a baseline. Halves of a ratio alternate, each is the least of its rounds. Exit status 1 if
+one is worse than benchmarks/ratios.json allows.
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     python -m benchmarks.recorder [--robots 10] [--hz 100] [--seconds 60] [--json FILE]
 
-Real processes in real time: a router, `teamslam record`, and publishers of each robot's odometry
-and observations at this rate. Per key, published = recorded, and the log is sound. Exit status 1 if
-a message was lost or a figure is worse than benchmarks/recorder.json allows.
+Real processes in real time: a router, `teamslam record`, and publishers of odometry and
+observations. Per key, published = recorded, and the log is sound. Exit status 1 if a message was
+lost or a figure is worse than benchmarks/recorder.json allows.
 """
 
 import argparse

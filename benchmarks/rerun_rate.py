@@ -2,9 +2,9 @@
 
     python -m benchmarks.rerun_rate LOG … [--json FILE]
 
-For each log: `rerun --verify` in measurements per second and as a multiple of real time, and the
-rate at which the mcap library alone reads the same file's messages (one core each, file in the
-cache). Exit status 1 if a result differs or five robots are computed slower than 35 × real time.
+For each log: measurements per second and multiple of real time, and the rate at which the mcap
+library alone reads the messages (one core each, file in the cache). Exit status 1 if a result
+differs or five robots are slower than 35 × real time.
 """
 
 import argparse

@@ -2,13 +2,12 @@
 
     python -m benchmarks.security [--messages 20000] [--rounds 5] [--json FILE]
 
-Links: a router, a publisher and a receiver, each a process with Zenoh on loopback; alternately open
-over TCP, and with certificates and access control over TLS. Throughput: observations of five
-landmarks at the receiver's rate. Latency: one message there and one back, at rest. Boundary: a node
-that processes the same samples with `team.containment` and without it; CPU time, the least of
-alternating turns.
+Links: router, publisher and receiver, each a process with Zenoh on loopback; alternately over open
+TCP, and over TLS with access control. Throughput: observations of five landmarks at the receiver's
+rate. Latency: round trip of one message at rest. Boundary: a node with `team.containment` and
+without it; CPU time, the least of alternating turns.
 
-Only ratios have a baseline in benchmarks/security.json: both halves depend on the machine.
+Only ratios have a baseline (benchmarks/security.json): both halves depend on the machine.
 """
 
 import argparse
@@ -146,8 +145,7 @@ class Sink:
 def handling(count: int) -> tuple[float, float]:
     """CPU seconds per message, decoded and handled by a node: without, and with the boundary.
 
-    The halves alternate, and the least of a half's turns counts, which excludes the machine's other
-    load.
+    The least of alternating turns excludes the machine's other load.
     """
     samples = [
         Sample(ch.OBSERVATIONS.key("r1"), encoded(observations(i)), i, 0, i) for i in range(count)

@@ -3,10 +3,10 @@
     python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus; command_first_s: from the start of the command `launch`, the least of three.
-cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone: resident memory, that
-without pages of files, and CPU of a router, recorder and robot started by hand, ready and idle.
-Only ratios of times have a baseline in benchmarks/start.json: both halves depend on the machine.
+measurement on the bus; command_first_s: from the start of `launch`, the least of three. cpu_s,
+pss_mb, peak_rss_mb: as in a launch's JSON. alone: resident memory, that without pages of files, and
+CPU of a router, recorder and robot started by hand, ready and idle. Only ratios of times have a
+baseline (benchmarks/start.json): both halves depend on the machine.
 """
 
 import argparse
