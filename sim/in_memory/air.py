@@ -62,8 +62,8 @@ def meetings(windows: Sequence[Meeting]) -> Reach:
 
 @dataclass
 class Air:
-    """loss, duplicates: probabilities per message. delay_ns: least and greatest; messages overtake
-    each other. bytes_per_s: per link; None: no limit.
+    """loss, duplicates: probabilities per message. delay_ns: least and greatest; messages overtake.
+    bytes_per_s: per link.
     """
 
     reach: Reach = always

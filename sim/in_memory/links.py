@@ -1,7 +1,7 @@
 """Simulated links in team time: delay, loss, partitions, a centre that dies.
 
-Under the delivery mode `all` a lost submap is sent again. So under the rule `join` none of this can
-change the final map (law 2), only earlier maps.
+Under the delivery `all` a lost submap is sent again. So under the rule `join` none of this can
+change the final map (law 2).
 """
 
 import heapq
@@ -71,9 +71,9 @@ class Partition:
 class Conditions:
     """Conditions of a team's links.
 
-    loss: probability that a submap's transmission to the centre is lost. delay_ns: of submaps to
-    the centre. down_ns: interval without a centre; the next centre starts empty and requests
-    everything from the robots.
+    loss: probability per transmission of a submap to the centre. delay_ns: of submaps to the
+    centre. down_ns: interval without a centre; the next one starts empty and requests everything
+    from the robots.
     """
 
     delay_ns: int = 0

@@ -38,8 +38,8 @@ def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
 
 @dataclass
 class _Seat:
-    """listens, overhears: channels that its node subscribes to under its own name (a centre under
-    any), and under every name.
+    """listens, overhears: channels of its subscriptions under its own name (a centre: any), and
+    under every name.
     """
 
     node: PeerRobot | PeerCentre
@@ -57,8 +57,7 @@ class _Seat:
 class PeerTeam:
     """Peers in a world, and the radio between them; `run` yields a recorder's samples.
 
-    seats: by robot, and that of a centre if there is one. complete_ns: team time of each robot's
-    final map.
+    seats: robots and centre by name. complete_ns: team time of each robot's final map.
     """
 
     def __init__(self, scenario: Scenario, air: Air, make: Make = peer_of) -> None:
@@ -103,7 +102,7 @@ class PeerTeam:
         """Run until all peers have the same final map and no message is in flight; yields the
         messages.
 
-        steps: called once a round; may remove and add peers.
+        steps: called every round; may remove and add peers.
         """
         self._world, self._world_boundary = world, Boundary("world")
         self._source(world.begin())
@@ -136,9 +135,7 @@ class PeerTeam:
         self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
 
     def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
-        """Restart a robot with its stored set; it requests the later measurements from its
-        source.
-        """
+        """Restart a robot with its stored set; it requests later measurements."""
         world = self._world
         assert isinstance(world, WorldNode)
         self.seat(config)
@@ -181,7 +178,7 @@ class PeerTeam:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _catch_up(self, robot: str, seat: _Seat) -> None:
-        """Send a new node the world's last messages, such as the end of the streams."""
+        """Send a new node the world's last messages."""
         for channel, sample in self._latest.values():
             if channel.name in seat.listens:
                 self._say(robot, seat.boundary.take(seat.node, sample))

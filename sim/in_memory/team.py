@@ -21,8 +21,8 @@ from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.digest import configured
 
 ROUND_S = 1.0
-"""Team time [s] of one round: all robots get a round's measurements before the next, so none is
-windows ahead of its teammates' messages, as in real time.
+"""Team time [s] of one round, which keeps robots within a window of each other's messages, as in
+real time.
 """
 
 SHARED = 16
@@ -105,7 +105,7 @@ def run_nodes(
 ) -> Iterator[Sample]:
     """Run the scenario's robots and centre in a world until no message is in flight.
 
-    conditions: of the links and the centre; None: every message arrives at once.
+    conditions: of links and centre; None: messages arrive at once.
     """
     conditions = Conditions() if conditions is None else conditions
     network = MemoryNetwork()

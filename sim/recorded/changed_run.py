@@ -18,7 +18,7 @@ from team.wire.bus import Sample
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     """Samples of the changed run, as of a recorder.
 
-    Raises ScenarioError for a meaningless change, RerunError for a log that lacks measurements.
+    Raises ScenarioError for a meaningless change, RerunError for missing measurements.
     """
     world = RecordedWorld(log, changes.without)
     scenario = changed_scenario(world.scenario, changes)

@@ -10,10 +10,10 @@ Span = tuple[float, float]
 class Changes:
     """Changes of a run on the log's measurements.
 
-    without: robots left out. seed: of the estimators and of the losses. loss, delay_s: of submaps
-    to the centre. no_centre: the time without a centre. partitions: robots that the centre cannot
-    reach, and when. unsafe_feedback: see `unsafe_robot`. noise: factors on the robots' assumed
-    standard deviations, by kind (`sim.recorded.noise`).
+    without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
+    centre. no_centre: time without a centre. partitions: robots that the centre cannot reach, and
+    when. unsafe_feedback: see `unsafe_robot`. noise: factors on assumed standard deviations, by
+    kind (`sim.recorded.noise`).
     """
 
     without: tuple[str, ...] = ()

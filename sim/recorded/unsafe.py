@@ -19,9 +19,8 @@ from team.wire.arrays import check_packed_covariance
 def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
     """A robot whose submaps begin with the team's map instead of with zero information.
 
-    The map contains the robot's earlier measurements, and everyone's; each submap sends them again,
-    so they are counted again with every exchange. The mean hardly moves; the covariance loses its
-    meaning. No scenario can choose it.
+    The map contains everyone's earlier measurements; each exchange counts them again. The mean
+    hardly moves; the covariance loses its meaning. No scenario can choose it.
     """
     return RobotNode(config, exchange, replaced=_with_the_map)
 

@@ -16,10 +16,10 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 
 
 def export_utias(log: Log, folder: Path) -> list[str]:
-    """Write the data set into `folder`; the robots in the order of their numbers 1, 2, …
+    """Write the data set into `folder`, robots in the order of their numbers 1, 2, …
 
-    The format has one stream per robot: the first incarnation of each. Raises `LogError` for a log
-    without measurements or without those that the format needs.
+    The format has one stream per robot: each one's first incarnation. Raises `LogError` for missing
+    measurements.
     """
     messages = list(_sound(log))
     measurements = [each for each in messages if isinstance(each, m.Measurement)]

@@ -46,8 +46,8 @@ def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measureme
 class RecordedWorld:
     """Messages of a log's world, for some of its robots, in the order of team time.
 
-    Each robot's measurements come in the order of their counters. Raises RerunError for a missing
-    one, after which no robot could continue.
+    Each robot's measurements come in order. Raises RerunError for a missing one, after which no
+    robot could continue.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
@@ -99,9 +99,7 @@ class RecordedWorld:
         return loads(self._configured.configuration)
 
     def announce(self, scenario: Scenario) -> None:
-        """Set the scenario for `begin`; raises RerunError if it needs a map that is not in the
-        log.
-        """
+        """Set the scenario for `begin`; raises RerunError if its known map is not in the log."""
         if scenario.estimator in NEEDS_MAP:
             truth = [o.message for o in self._outgoing if isinstance(o.message, m.TruthLandmarks)]
             if not truth:
@@ -116,8 +114,8 @@ class RecordedWorld:
         self._outgoing.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
 
     def begin(self) -> list[Outgoing]:
-        """First messages: the scenario, the true landmarks for the evaluator, and the known map if
-        robots only localise.
+        """First messages: scenario, true landmarks, and the known map of robots that only
+        localise.
         """
         return self._outgoing
 
