@@ -38,7 +38,7 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
     by_recorder = log.metadata.get("scenario")  # of a team without a world
     configurations = configurations or ([] if by_recorder is None else [by_recorder])
     if not configurations:
-        raise ScenarioError(f"{path}: the log does not say the world's scenario")
+        raise ScenarioError(f"{path}: the log has no scenario of its world")
     scenario = loads(configurations[-1])
     clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
     try:

@@ -30,7 +30,9 @@ def export_utias(log: Log, folder: Path) -> list[str]:
         )
     sighted = {n for each in measurements if isinstance(each, m.Sightings) for n in each.teammates}
     if sighted - robots:
-        what = f"it sights {', '.join(sorted(sighted - robots))}, of whom it has no measurements"
+        what = (
+            f"it has sightings of {', '.join(sorted(sighted - robots))} but not their measurements"
+        )
         raise LogError(log.path, what, "`teamslam log merge` puts the robots' logs together")
     try:
         world = recorded_streams(messages, log.path.name)

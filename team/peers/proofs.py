@@ -118,7 +118,7 @@ class Proofs:
         node = f"robot-{robot}"
         issued = list(self._issued_to(node, replica.certificates_of(robot)))
         if not issued:
-            return f"no certificate of {robot} is here yet"
+            return f"no certificate of {robot} was received yet"
         least = max(self._signer.revoked(node) + 1, *(each.generation for each, _ in issued))
         signed_with = [
             each

@@ -147,7 +147,7 @@ class Replica:
         share = self.streams.get(stream)
         if share is None:
             if sum(robot == stream[0] for robot, _ in self.streams) >= MOST_STREAMS:
-                raise RefusedError(f"{stream[0]} has {MOST_STREAMS} incarnations here already")
+                raise RefusedError(f"{stream[0]} has {MOST_STREAMS} incarnations already")
             share = self.streams[stream] = StreamShare()
         match message:
             case m.InitialPose():
@@ -162,7 +162,9 @@ class Replica:
                 look = message.stamp_ns, message.teammate
                 factors = share.factors.setdefault(sequence, {})
                 if look not in factors and len(factors) >= MOST_LOOKS:
-                    raise RefusedError(f"submap {sequence} of {stream[0]} has {MOST_LOOKS} looks")
+                    raise RefusedError(
+                        f"submap {sequence} of {stream[0]} has {MOST_LOOKS} measurements"
+                    )
                 return self._put(share, sequence, factors, look, member)
             case _:
                 raise RefusedError("no member of a stream")
@@ -195,7 +197,7 @@ class Replica:
         alike = sum((kind == "verdict") == verdict for kind, _ in among)
         if there is None and alike >= most:
             what = "verdicts" if verdict else "statements"
-            raise RefusedError(f"{most} {what} about {robot} are here already")
+            raise RefusedError(f"{most} {what} about {robot} are stored already")
         among[name] = member
         return "new" if there is None else "replaced"
 

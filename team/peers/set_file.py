@@ -133,7 +133,7 @@ class SetFile:
             content = path.read_bytes() if path.exists() else b""
             found = list(records_in(content))
             if _is_foreign(content) and not found:
-                raise SetFileError(f"{path} is no set of a peer: give --set another file")
+                raise SetFileError(f"{path} is not a peer's set: give --set another file")
             self.members = [each.member for each in found if each.member is not None]
             self._open(content, found)
         except OSError as error:
@@ -213,10 +213,10 @@ def _replace(path: Path, content: bytes) -> None:
 def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> str:
     places, damaged = max(len(holes), 1), sum(holes)
     lacks = missing_in(members)
-    missing = f"; of what is known it lacks {', '.join(lacks)}" if lacks else ""
+    missing = f"; it lacks at least {', '.join(lacks)}" if lacks else ""
     return (
         f"{path} was damaged in {places} place{'s' * (places != 1)}: {damaged} bytes are lost, "
-        f"{len(members)} members are intact{missing}; the rest of the set is asked for again"
+        f"{len(members)} members are intact{missing}; the rest of the set is requested again"
     )
 
 
@@ -242,7 +242,7 @@ class Keeper:
     def warnings(self) -> tuple[str, ...]:
         """Members missing in the file, for the status of its process."""
         lost = "" if self._store is None else self._store.lost
-        failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not kept"
+        failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not stored"
         return tuple(text for text in (failure, lost) if text)
 
     def append(self, members: Sequence[Member]) -> None:
@@ -259,12 +259,12 @@ class Keeper:
             self._store.append(self._waiting)
         except SetFileError as error:
             if not self._failure:
-                _LOG.error("the set is not kept: %s; trying again every %g s", error, RETRY_S)
+                _LOG.error("the set is not stored: %s; trying again every %g s", error, RETRY_S)
             self._failure = str(error)
             self._retry_s = time.monotonic() + RETRY_S
             return
         if self._failure:
-            _LOG.warning("the set is kept again, with %d members", len(self._waiting))
+            _LOG.warning("the set is stored again, with %d members", len(self._waiting))
         self._waiting, self._failure, self._retry_s = [], "", 0.0
 
     def close(self) -> None:
@@ -272,6 +272,6 @@ class Keeper:
         if self._store is not None:
             self._write()
             if self._waiting:
-                _LOG.error("%d members of the set are not kept", len(self._waiting))
+                _LOG.error("%d members of the set are not stored", len(self._waiting))
             self._store.close()
             self._store = None

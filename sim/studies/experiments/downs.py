@@ -352,9 +352,9 @@ TABLE_5_1 = PrintedTable(
     ),
     (
         _DIFFERS,
-        "Ours is the same filter with measurements sampled to half a second. The text explains his "
-        "errors by linearisation; most of them is a turn of the whole map, which alignment takes "
-        "away: the start heading and the odometry's first metres decide it.",
+        "Ours is the same filter with measurements sampled to half a second. The text explains "
+        "his errors by linearisation; most of the error is a rotation of the whole map, which "
+        "alignment removes: the start heading and the first metres of odometry determine it.",
     ),
     SIMULATED_5_1,
     sample=_HIS_EKF,
@@ -372,8 +372,8 @@ TABLE_5_2 = PrintedTable(
     (
         _DIFFERS,
         "The printed paths are some eight times better than the printed maps that they were made "
-        "with, in one frame; how a path can be right within 0.04 m in a map that lies wrong by "
-        "0.3 m the source does not say. Rows 3 and 8 of the printed table are the same.",
+        "with, in one frame; the source does not explain how a path can be right within 0.04 m in "
+        "a map that is wrong by 0.3 m. Rows 3 and 8 of the printed table are equal.",
     ),
     SIMULATED_5_2,
 )
@@ -394,9 +394,9 @@ TABLE_5_3 = PrintedTable(
     _pair(_JOINED, _joined_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
-        "A printed error of 0.0000 m is below what the survey of the landmarks is good for, and "
-        "rows 6 and 7 of the printed table are the same: not to be taken as verified. "
-        "The t-test of the 45 printed pairs gives another p than the text has.",
+        "A printed error of 0.0000 m is below the accuracy of the landmarks' survey, and rows 6 "
+        "and 7 of the printed table are equal: these figures are not verified. The t-test of the "
+        "45 printed pairs gives another p than the text.",
     ),
     SIMULATED_5_3,
     Compared(
@@ -414,8 +414,8 @@ TABLE_5_4 = PrintedTable(
     _pair(_JOINED, lambda k, _: _joined_row(k, "position_rmse"), (HIS, OURS), ("position_rmse",)),
     (
         _DIFFERS,
-        "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's own millimetre, so no "
-        "estimate can be measured to be that good: it is most likely not a distance to the truth.",
+        "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's accuracy of a "
+        "millimetre, so it cannot be a measured distance to the truth.",
     ),
     SIMULATED_5_4,
 )
@@ -432,9 +432,9 @@ TABLE_5_5 = PrintedTable(
     _pair((_each(_spherical), _each(_team)), _team_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
-        "He exchanges maps at each mutual sighting. Here the robots' whole maps are tied once, by "
-        "singular values over the landmarks that they share and the robots' own places at every "
-        "mutual sighting. Ours joins all submaps in one frame, with sightings of teammates.",
+        "He exchanges maps at each mutual sighting. Here the robots' whole maps are aligned once, "
+        "by singular values over the common landmarks and the robots' own positions at every "
+        "mutual sighting. Ours joins all submaps in one frame, with inter-robot measurements.",
     ),
     SIMULATED_5_5,
     Compared(

@@ -174,8 +174,8 @@ def sample_picture(name: str, title: str, sample: Figures) -> Picture:
     """A map of the EKF, as his figure 5.1."""
     return Picture(
         name,
-        f"As figure 5.1, a map of the EKF: {title}, {sample['robot']}. Ellipses hold 95 % of what "
-        "the map believes; crosses are the true landmarks, grey the true path.",
+        f"As figure 5.1, a map of the EKF: {title}, {sample['robot']}. Ellipses: 95 % of "
+        "the map's covariances; crosses are the true landmarks, grey the true path.",
         partial(_draw_sample, title, sample),
     )
 

@@ -71,9 +71,9 @@ class ErrorFigure(NamedTuple):
             if found:
                 caption = (
                     f"{self.title}: {dataset.name}. Above: medians over {options.seed_count} "
-                    "and the band of four fifths of them. Below: the run of seed "
-                    f"{options.seeds[0]} within its own 3σ bound. Where a robot sees no landmark, "
-                    "the filters say no pose, and the curve stands."
+                    "with the 10 … 90 % band. Below: the run of seed "
+                    f"{options.seeds[0]} within its own 3σ bound. Without landmarks "
+                    "the filters publish no pose, and the curve is flat."
                 )
                 draw = drawing(f"{self.title}: {dataset.name}", panel, found, "frame")
                 pictures.append(Picture(dataset.name, caption, draw))
@@ -128,18 +128,18 @@ def _mean(curves: Curves) -> Float[np.ndarray, " S"]:
 _PROGRAM = (
     "The report names neither parameters nor the set. Its program does: the start is that of set "
     "2, every α is 0.1 at 0.02 s, σ are 0.13 m and 0.027 rad; the particles are its default, 100 "
-    "(its last configuration says 1). Printed are means over the run, read from the text."
+    "(its last configuration has 1). Printed figures are means over the run, from the text."
 )
 _RAW = (
-    "The odometry is taken as logged, as the program does. In these sets the base drives 5 % "
-    "faster than logged and turns 6 % less, with a fourth of a second of delay: errors that last, "
-    "which the α of independent errors can not express. Ours has learnt them, and its errors are "
-    "smaller for that reason too, not for its fusion alone."
+    "The odometry is as logged, as in the program. In these sets the base drives 5 % faster than "
+    "logged and turns 6 % less, with a delay of a quarter of a second: persistent errors, which "
+    "the α of independent errors cannot represent. Our profile models them, so our errors are "
+    "smaller for that reason, too, not by fusion alone."
 )
 _POSES = (
     "As in the report several robots are better than one (measured on set 2). One filter over the "
-    "poses of all robots with so few particles wears thin, though: each resampling throws away "
-    "paths of all of them for the sake of one, and the stated σ is far too small (NEES)."
+    "poses of all robots with so few particles degenerates, however: each resampling discards "
+    "paths of all robots, and the reported σ is far too small (NEES)."
 )
 FIGURE_4A = ErrorFigure(
     "Ma & Ma, figure 4(a): path, dead reckoning against single FastSLAM",

@@ -60,7 +60,7 @@ class PathFigure(NamedTuple):
             if runs:
                 caption = (
                     f"{self.title}: {dataset.name}, seed {options.seeds[0]}. Grey: true paths; "
-                    "crosses: true landmarks; ellipses hold 95 % of what is believed; light blue: "
+                    "crosses: true landmarks; ellipses: 95 % of the covariances; light blue: "
                     "particles at eight times."
                 )
                 draw = _Drawing(f"{self.title}: {dataset.name}", tuple(runs))
@@ -141,6 +141,6 @@ FIGURE_3 = PathFigure(
 FIGURE_5 = PathFigure(
     "Ma & Ma, figure 5",
     (MULTI_3, MULTI_5),
-    "The report shows three robots and names a video of five. The poses are the centre's, said at "
+    "The report shows three robots and names a video of five. The poses are the centre's, at "
     "measurements of landmarks; its particles are not sent, so the picture has none.",
 )

@@ -62,7 +62,7 @@ class PlainCost:
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
     ) -> None:
         if graph.biases:
-            raise NotImplementedError("the judge knows no biases: front_end.biases must be []")
+            raise NotImplementedError("this cost has no biases: front_end.biases must be []")
         self.free: Indices = np.flatnonzero(~fixed)
         self._terms_of: Kinds = [
             *_submaps(graph, covariance_factor), *_sightings(graph), *_priors(graph)

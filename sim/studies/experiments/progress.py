@@ -17,7 +17,7 @@ LINE_S = 10.0
 def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
     """A function to call with every finished task; failures are printed at once."""
     console = Console(stderr=True)
-    of = f"{len(tasks)} runs" + (f", {found} more are kept from before" if found else "")
+    of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
     # The bar advances by expected cost, which differs widely between runs.
     cost = sum(task.cost for task in tasks)
     bar = Progress(

@@ -98,9 +98,9 @@ def judged(
     """Figures of an island in the truth's frame, with plain squares and without biases."""
     graph, settings = island.graph, island.settings
     if settings.robust_c is not None:
-        raise NotImplementedError("the judge has plain squares: central.robust_c must be left out")
+        raise NotImplementedError("this cost has plain squares: central.robust_c must be left out")
     if settings.joined_ranges:
-        raise NotImplementedError("the judge knows no central.joined_ranges: leave it out")
+        raise NotImplementedError("this cost has no central.joined_ranges: leave it out")
     fixed = np.repeat(graph.fixed, np.diff(graph.offset))
     cost = PlainCost(graph, settings.covariance_factor, fixed)
     ours = cost.of(island.state)

@@ -115,7 +115,7 @@ class ErrorFigure(NamedTuple):
             Picture(
                 panel.name.partition(",")[0].replace(" ", "-") or "errors",
                 f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
-                f"{options.seed_count} and the band of four fifths of them. Below: the run "
+                f"{options.seed_count} with the 10 … 90 % band. Below: the run "
                 f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
                 drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
             )

@@ -99,8 +99,8 @@ class MapFigure(NamedTuple):
             letter = chr(ord("a") + k) if len(self.steps) > 1 else ""
             title = f"{self.title}{f' ({letter})' if letter else ''}: {label}"
             caption = (
-                f"{title}, seed {seed}, step {shot['step']}. Ellipses hold 95 % of what the map "
-                "believes; crosses are the true landmarks, grey the true paths."
+                f"{title}, seed {seed}, step {shot['step']}. Ellipses: 95 % of the map's "
+                "covariances; crosses are the true landmarks, grey the true paths."
             )
             file = f"{name}-{letter}-step-{shot['step']}" if letter else name
             drawing = partial(_draw_shot, title, shot, run["landmarks"])
@@ -213,12 +213,12 @@ _READ: Mapping[Reading, str] = {
     "stated": "as stated", "exact": "true controls", "coded": "as coded",
 }  # fmt: skip
 _PRINTED = (
-    "The thesis prints the maps without figures. They are those of its program, whose controls are "
-    "exact and whose particles hardly spread (xu-4.4); as stated, with the noise of section 4.4.2 "
-    "in the odometry, the same filters end far from the truth."
+    "The thesis prints the maps without figures. They are those of its program, with exact "
+    "controls and a tiny spread of the particles (xu-4.4); as stated, with the noise of section "
+    "4.4.2 in the odometry, the same filters end far from the truth."
 )
 _ROBOT_1 = (
-    "The text of figures 4.1 and 4.2 has the robot start at the lower left, (10, 40); that is "
+    "In the text of figures 4.1 and 4.2 the robot starts at the lower left, (10, 40); that is "
     "robot 2's start in the appendix. Here, as in figure 4.3 and in the appendix, robot 1 starts "
     "at the right, (80, 40)."
 )

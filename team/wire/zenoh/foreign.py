@@ -65,7 +65,7 @@ class ForeignKeys:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise BusError(f"nobody answers at {connect} ({patience_s:g} s): {error}") from None
+            raise BusError(f"no answer at {connect} ({patience_s:g} s): {error}") from None
         self._announced: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
         self._first = [

@@ -21,9 +21,9 @@ _ALERTS = {
     "UNKNOWN_CA": "it is of another authority than the router's: copy ca.pem and both files of "
     "this node from one folder",
     "CERTIFICATE_EXPIRED": "it has expired by the router's clock: renew it, or put the clock right",
-    "CERTIFICATE_REQUIRED": "it wants one: give --keys DIR",
-    "CERTIFICATE_UNKNOWN": "it does not take it for one of its team",
-    "BAD_CERTIFICATE": "it does not take it for one of its team",
+    "CERTIFICATE_REQUIRED": "it requires one: give --keys DIR",
+    "CERTIFICATE_UNKNOWN": "it is not one of its team",
+    "BAD_CERTIFICATE": "it is not one of its team",
     "DECRYPT_ERROR": "it is of another authority than the router's, of the same name",
 }
 _NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL", "HTTP_REQUEST")
@@ -74,7 +74,7 @@ def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> 
         tls = context.wrap_socket(link, server_hostname=host)
     except ssl.SSLCertVerificationError as error:
         return Examined(
-            f"{connect}: the router's certificate is not good: {error.verify_message}. If the host "
+            f"{connect}: the router's certificate is invalid: {error.verify_message}. If the host "
             "is not in it: `teamslam keys TEAM -o DIR --router HOST`; if it is of another "
             f"authority than {keys.authority}: copy both from one folder"
         )
@@ -116,6 +116,4 @@ def _without_keys(link: socket.socket, connect: str) -> Examined:
             pass
     except OSError:
         return Examined(waits_for="connections are accepted and not answered")
-    return Examined(
-        f"{connect}: the router there has keys and refuses whoever has none: give --keys DIR"
-    )
+    return Examined(f"{connect}: the router there requires keys: give --keys DIR")

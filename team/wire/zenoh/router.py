@@ -98,7 +98,7 @@ def router(
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
         locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
         if not (locators and locators[0]):
-            raise BusError(f"the router at {listen} does not tell its endpoint")
+            raise BusError(f"the router at {listen} does not report its endpoint")
         yield str(locators[0][0])
 
 
