@@ -36,7 +36,6 @@ def baselines() -> dict[str, dict[str, Any]]:
 
 
 def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held]:
-    """Each figure of the baseline with its value in this run."""
     rows = []
     for name, of in baseline["figures"].items():
         sign = 1.0 if of["better"] == "less" else -1.0
@@ -46,7 +45,6 @@ def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held
 
 
 def worse(figures: Mapping[str, float], name: str) -> list[str]:
-    """Describe the figures worse than the baseline `name` allows."""
     return [
         f"{row.name} is {row.value:.4g}, it was {row.was:.4g} and may be {row.bound:.4g}"
         for row in held(figures, baselines()[name])

@@ -16,7 +16,7 @@ from benchmarks.baseline import Held, baselines, held
 
 
 def found(name: str, command: str, output: Path) -> dict[str, float]:
-    """Figures that a benchmark writes; it may exit with 1 where some are worse."""
+    """Run a benchmark; status 1 means that some figures are worse."""
     page = output / f"{name}.json"
     page.unlink(missing_ok=True)
     program, *options = shlex.split(command)

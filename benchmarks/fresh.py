@@ -88,7 +88,6 @@ def _first(
 
 
 def launched(folder: Path) -> Path:
-    """Run `waypoints` at ten times real time."""
     words = ["launch", "waypoints", "--speed", "10", "--no-report", "--no-views"]
     subprocess.run(
         [sys.executable, "-P", "-m", "sim", *words, "--output", str(folder)],

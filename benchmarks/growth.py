@@ -52,7 +52,6 @@ BASELINES: Mapping[tuple[int, int, int, str | None], str] = {
     (10, 1000, 2000, None): "growth-large",
     (5, 50, 2000, "hidden"): "growth-hidden",
 }
-"""Baseline by robots, landmarks, largest number of submaps and identities."""
 
 
 class World:
@@ -152,7 +151,6 @@ def window_ms(world: World) -> float:
 def measured(
     robots: int, landmarks: int, at: list[int], hidden: bool = False
 ) -> list[dict[str, float]]:
-    """A row of figures at each number of submaps."""
     world = World(robots, landmarks, hidden=hidden)
     lengths = profile_for(Sensor(range_sigma=SIGMAS[2], bearing_sigma=1e-6), 1.0)
     config = CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S, association=lengths)
@@ -189,13 +187,11 @@ def measured(
 
 
 def _bytes(out: list[Outgoing]) -> tuple[int, int]:
-    """Bytes of the published maps and priors."""
     maps = sum(len(encoded(o.message)) for o in out if isinstance(o.message, m.FusedMap))
     return maps, sum(len(encoded(o.message)) for o in out if isinstance(o.message, m.Prior))
 
 
 def _rmse(out: list[Outgoing], world: World) -> float:
-    """RMS landmark error of the newest map."""
     fused = next((o.message for o in out if isinstance(o.message, m.FusedMap)), None)
     if fused is None:
         return float("nan")

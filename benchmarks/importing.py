@@ -30,7 +30,6 @@ ODOMETRY_PER_SCAN = 9
 
 
 def drive(count: int) -> list[ros.Message]:
-    """Nine poses and a scan of four tags, repeated."""
     found: list[ros.Message] = []
     for k in range(count):
         at = (k + 1) * PERIOD_NS

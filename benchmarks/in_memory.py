@@ -35,7 +35,6 @@ from team.recording.recorder import Recorder
 BASE = 50
 LANDMARKS = 18
 MEASURED = "50,400"
-"""Numbers of robots that the baseline compares."""
 
 
 def scaled(robots: int, steps: int) -> Scenario:
@@ -85,7 +84,6 @@ def run(robots: int, steps: int) -> dict[str, float]:
 
 
 def figures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Growth of a robot's cost from the smallest to the largest team, and the verified share."""
     small, large = rows[0], rows[-1]
     return {
         "growth_cpu": large["cpu_ms"] / small["cpu_ms"],

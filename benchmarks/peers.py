@@ -97,7 +97,6 @@ class Team:
         self._count = 0
 
     def begin(self) -> None:
-        """Give each robot an initial pose that no other node has yet."""
         for name in self.names:
             pose = m.InitialPose(
                 stamp_ns=0, robot=name, incarnation=1, number=0, pose=b"", covariance=b""
@@ -108,7 +107,6 @@ class Team:
     def send(
         self, sender: str, to: str, what: m.Message | Member, now_ns: int, size: int = 0
     ) -> None:
-        """Send by radio, with a delay of 50 ms."""
         size = size or (what.size if isinstance(what, Member) else len(encoded(what)))
         for at_ns in self.air.arrivals(sender, to, size, now_ns):
             self._count += 1
@@ -126,7 +124,6 @@ class Team:
                     self.send(name, other, each.message, now_ns, size)
 
     def second(self, now_s: int) -> None:
-        """Advance by one second of team time."""
         now_ns = now_s * SECOND_NS
         if 0 < now_s <= DRIVE_S and now_s % WINDOW_S == 0:
             for name in self.names:
@@ -134,7 +131,6 @@ class Team:
         self.talk(now_ns, SECOND_NS)
 
     def close(self, name: str, sequence: int, now_ns: int) -> None:
-        """Close a submap of a robot, and publish it."""
         message = submap(name, sequence)
         member = Member(ch.SUBMAP.key(name), encoded(message), message)
         self.nodes[name].take(member, name)
@@ -180,7 +176,6 @@ class Team:
 
 
 def measured(topology: str, robots: int) -> dict[str, float]:
-    """Bytes per robot and second against the star, and the time of agreement."""
     team = Team(topology, robots)
     team.begin()
     healed_s = CUT_S[1] if topology == "partition" else DRIVE_S
@@ -202,7 +197,6 @@ def measured(topology: str, robots: int) -> dict[str, float]:
 
 
 def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
-    """Bytes per robot and second over the number of robots, a line per topology."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -234,7 +228,6 @@ def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
 
 
 def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
-    """Measure, print, compare with the baseline; 1 if a figure is worse."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--json", type=Path)
     options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))

@@ -56,7 +56,6 @@ def composed_at_once() -> None:
 
 
 def composed_in_a_run() -> None:
-    """Compose the same intervals through the segmenter, read at the end."""
     segmenter = Segmenter(MOTION, Sensor(), 0.0)
     segmenter.begin(0)
     for k in range(1, INTERVALS + 1):
@@ -96,7 +95,6 @@ def steps() -> list[Callable[[], None]]:
 
 
 def driving() -> Callable[[], None]:
-    """A robot's node that processes odometry and scans."""
     front_end = FrontEnd(particles=PARTICLES, keyframe_s=0.5, window_s=10.0)
     config = RobotConfig("r1", MOTION, SENSOR, front_end)
     start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")

@@ -24,7 +24,6 @@ LEAST = 35.0
 
 
 def plain(path: Path) -> tuple[int, float]:
-    """Messages in the file and the mcap library's seconds to read them."""
     began = time.process_time()
     with path.open("rb") as file:
         count = sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))

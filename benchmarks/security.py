@@ -62,7 +62,6 @@ def entered(endpoint: str, folder: Path | None, node: str) -> ZenohBus:
 
 
 def serve(folder: Path | None) -> None:
-    """The router's process: until its input ends."""
     own = folder and (credentials_of(folder, "router"), load_roster(folder))
     with router("tls/127.0.0.1:0" if folder else "tcp/127.0.0.1:0", own) as endpoint:
         print(endpoint, flush=True)
@@ -95,7 +94,7 @@ def take(endpoint: str, folder: Path | None, count: int) -> None:
 
 
 def link(folder: Path | None, count: int) -> tuple[float, float]:
-    """Messages per second, and the median round trip [s]."""
+    """Messages per second, and median round trip [s]."""
     more = [] if folder is None else ["--keys", str(folder)]
     hub = subprocess.Popen(
         [*_HERE, "--serve", *more], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -133,7 +132,7 @@ def ping(bus: ZenohBus, stamp_ns: int) -> float:
 
 
 class Sink:
-    """A node that does nothing, to measure what surrounds it."""
+    """A node that does nothing."""
 
     taken = 0
 

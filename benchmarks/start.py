@@ -57,12 +57,10 @@ def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> 
 
 
 def first_ns(log: Path) -> int:
-    """Wall time of a log's first published measurement."""
     return min(sample.wall_ns for sample in open_log(log).samples(SENSORS))
 
 
 def command_first_s(words: list[str], folder: Path) -> float:
-    """Time [s] from the start of `teamslam launch` to the first measurement."""
     began_ns = time.time_ns()
     command = [*PROGRAM, "launch", *words, "--no-views", "--no-report", "--output", str(folder)]
     subprocess.run(command, check=True, capture_output=True)
@@ -70,7 +68,7 @@ def command_first_s(words: list[str], folder: Path) -> float:
 
 
 def alone(folder: Path) -> dict[str, dict[str, float]]:
-    """Resources of a router, a recorder and a robot, each started by hand, ready and idle."""
+    """Resources of a router, a recorder and a robot, ready and idle."""
     folder.mkdir()
     log = str(folder / "log.mcap")
     words = {
@@ -98,7 +96,6 @@ def alone(folder: Path) -> dict[str, dict[str, float]]:
 
 
 def said(process: "subprocess.Popen[str]", words: str) -> str:
-    """Read a process's output until a line with these words."""
     assert process.stdout is not None
     return next(line for line in process.stdout if words in line)
 

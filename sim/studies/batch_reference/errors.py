@@ -62,7 +62,7 @@ def bias_key(chain: int) -> int:
 
 
 def detections_of(chains: Sequence[Chain]) -> list[Look]:
-    """All measurements in the order of chain, pose and landmark."""
+    """All measurements in order."""
     looks: list[Look] = []
     for c, chain in enumerate(chains):
         last: dict[int, tuple[int, int]] = {}
@@ -137,12 +137,12 @@ def profile_graph(
 
 
 def has_biases(chain: Chain) -> bool:
-    """Whether the centre would estimate this robot's sensor biases."""
+    """Whether this robot's sensor has biases."""
     return bool(set(BIASES) & set(chain.config.front_end.biases))
 
 
 def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
-    """Add error states and biases at zero, and the bases at their sensors' poses."""
+    """Add zero error states and biases, and the bases."""
     for c, i in _bases(chains):
         pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
         values.insert(_base_key(chains[c], c, i), pose)
@@ -211,7 +211,7 @@ def _base_key(chain: Chain, number: int, pose: int) -> int:
 
 
 def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
-    """(chain, pose) of the base's poses with inter-robot measurements."""
+    """(chain, pose) of bases with inter-robot measurements."""
     times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
     return [
         (c, i)

@@ -39,7 +39,7 @@ def load_gtsam() -> Any:
 
 
 def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
-    """Newton step of a linear graph, and its length in standard deviations."""
+    """A linear graph's Newton step, and its length in standard deviations."""
     step = linear.optimize()
     gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
     return step, float(np.sqrt(max(2.0 * gain, 0.0)))

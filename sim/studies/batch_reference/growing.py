@@ -89,7 +89,7 @@ class GrowingBatch:
             raise UnsolvableError(str(error).strip()) from error
 
     def converged(self, least_decrement: float) -> bool:
-        """Whether the next step is no longer than that."""
+        """Whether the next step is short enough."""
         return self.newton_decrement <= least_decrement
 
     @cached_property
@@ -145,7 +145,7 @@ class GrowingBatch:
 def initial_state(
     starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None
 ) -> GrowingBatch:
-    """Robots' initial poses alone; raises NotInstalledError without GTSAM."""
+    """Robots' initial poses alone; raises NotInstalledError."""
     load_gtsam()
     mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
     return GrowingBatch(dict(starts), robust_c, (), mean, {})
@@ -176,9 +176,7 @@ def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
 
 
 def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> GrowingBatch:
-    """Iterate Levenberg-Marquardt until convergence or the limit (see `converged`); raises
-    `UnsolvableError`.
-    """
+    """Iterate Levenberg-Marquardt until `converged` or the limit; raises `UnsolvableError`."""
     for scale in _scales(batch.robust_c):
         left = iterations
         while left > 0 and not (scale == batch.robust_c and batch.converged(least_decrement)):
@@ -227,7 +225,7 @@ def _descended(
 
 
 def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
-    """Mean and joint marginal covariance of all landmarks."""
+    """Mean and joint covariance of all landmarks."""
     ids = batch.ids
     means = np.array([batch.landmarks[id_] for id_ in ids.tolist()]).reshape(-1, 2)
     n = len(ids)
@@ -253,7 +251,7 @@ def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
 def trajectory(
     batch: GrowingBatch, robot: str
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """Poses of the robot from its start on, each with its marginal covariance in (x, y, θ)."""
+    """Poses of the robot with marginal covariances in (x, y, θ)."""
     own = batch.places(robot)
     return batch.poses[own], np.array([_covariance(batch, place) for place in own])
 

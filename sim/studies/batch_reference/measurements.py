@@ -86,17 +86,17 @@ class Chain:
         return np.array(self.config.sensor.mount)
 
     def of_sensor(self, base: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """Sensor's poses for these poses of the base."""
+        """The sensor's poses."""
         return np.array([compose(pose, self.mount) for pose in base]).reshape(-1, 3)
 
     def of_base(self, poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """Base's poses for these poses of the sensor."""
+        """The base's poses."""
         away = inverse(self.mount)
         return np.array([compose(pose, away) for pose in poses]).reshape(-1, 3)
 
     @property
     def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
-        """Poses by odometry alone, in the frame of the first."""
+        """Poses by odometry alone, in the first one's frame."""
         poses = [np.zeros(3)]
         for increment in self.increments:
             poses.append(compose(poses[-1], increment.mean))

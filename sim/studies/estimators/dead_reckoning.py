@@ -39,7 +39,7 @@ def filter_step(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> DeadReckoning:
-    """Compose the pose with the increment; measurements are not used."""
+    """Compose the pose with the increment."""
     return DeadReckoning(state.pose.then(increment))
 
 

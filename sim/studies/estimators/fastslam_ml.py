@@ -34,7 +34,7 @@ class FastSlamMl:
 
 
 def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
-    """Particles with these poses and logarithms of weights, and no landmark."""
+    """Particles without landmarks; logs: of the weights."""
     particles = len(poses)
     return FastSlamMl(
         poses=poses,
@@ -83,7 +83,7 @@ class _Scan:
         self._took: list[Int64[np.ndarray, " M"]] = []
 
     def take(self, r: float, b: float, sensor: Sensor, gate: float) -> None:
-        """Assign a detection in each particle to its likeliest free landmark, or to a new one."""
+        """Assign a detection in each particle to its likeliest free landmark, or a new one."""
         x, y, heading = self._state.poses.T
         particles = np.arange(len(x))
         dx, dy = self._means[..., 0] - x[:, None], self._means[..., 1] - y[:, None]
@@ -208,7 +208,7 @@ def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) 
 
 
 def taken(state: FastSlamMl) -> Int64[np.ndarray, " N"]:
-    """Landmark number of each detection in the heaviest particle."""
+    """Landmark of each detection in the heaviest particle."""
     numbers: Int64[np.ndarray, " N"] = UNNAMED + state.took[int(np.argmax(state.logs))]
     return numbers
 

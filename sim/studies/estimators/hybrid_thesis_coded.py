@@ -100,7 +100,7 @@ def pose_gaussian(state: CodedState) -> PoseGaussian:
 
 
 def landmark_gaussian(state: CodedState) -> LandmarkGaussian:
-    """Means, and the 2 × 2 blocks of eq. 4.6; landmarks are reported as independent."""
+    """Means, and the 2 × 2 blocks of eq. 4.6."""
     found = landmark_moments(state.drawn)
     blocks = np.kron(np.eye(len(found.ids)), np.ones((2, 2)))
     return LandmarkGaussian(found.ids, found.means, found.covariance * blocks)

@@ -113,7 +113,6 @@ def landmark_gaussian(state: JointFastSlam) -> LandmarkGaussian:
 
 
 def _seen_by(state: JointFastSlam, index: int) -> Particles:
-    """Particles with the poses of one robot, as in single-robot FastSLAM."""
     return Particles(
         state.poses[index], state.log_weights, state.ids, state.means, state.covariances
     )

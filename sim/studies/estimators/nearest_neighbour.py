@@ -23,7 +23,7 @@ from team.estimation.models import Increment
 
 @dataclass(frozen=True)
 class NearestNeighbour:
-    """The filter, and the landmark number of each detection so far, in order."""
+    """The filter, and the landmark of each detection so far."""
 
     slam: EkfSlam
     took: tuple[Int64[np.ndarray, " _"], ...] = ()
@@ -43,9 +43,7 @@ def filter_step(
     bearings: Float[np.ndarray, " n"],
     gate: float = GATE,
 ) -> NearestNeighbour:
-    """Move, associate the detections (ids from UNNAMED on), and update by all measurements at
-    once.
-    """
+    """Move, associate detections (ids from UNNAMED on), and update at once."""
     unnamed = np.flatnonzero(ids >= UNNAMED)
     if not len(unnamed):
         slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)

@@ -59,14 +59,14 @@ def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
 
 @dataclass(frozen=True, eq=False)
 class SubmapJoining:
-    """Submaps of one or more robots with known starts, and their least-squares map."""
+    """Submaps of robots with known starts, and their least-squares map."""
 
     fold: Fold
     weighting: Weighting
 
 
 def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> SubmapJoining:
-    """No submap yet; every robot's start pose is exactly known."""
+    """No submaps; start poses are exact."""
     fold = EMPTY_FOLD
     for robot, pose in poses.items():
         fold = joining.started(fold, InitialPoseFactor(robot, 0, pose))
@@ -74,7 +74,7 @@ def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") 
 
 
 def filter_step(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining:
-    """Add a robot's next submap, which begins at the end of its last one, and iterate."""
+    """Add a robot's next submap and iterate."""
     count = len(state.fold.contributions)
     sequence = state.fold.next_sequence((robot, 0))
     taken = Contribution(robot, 0, sequence, count, weighted(local, state.weighting))
@@ -100,7 +100,7 @@ def variance_factor(state: SubmapJoining) -> float:
 
 
 def pose_gaussian(state: SubmapJoining, robot: str) -> PoseGaussian:
-    """End of a robot's last submap; raises KeyError for a robot without submaps."""
+    """End of a robot's last submap; raises KeyError without submaps."""
     graph = state.fold.main.graph
     mean, covariance = joint_marginal(state.fold.main, [graph.streams[robot, 0][-1]])
     return PoseGaussian(mean, variance_factor(state) * covariance)

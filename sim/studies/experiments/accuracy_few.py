@@ -47,12 +47,12 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each world and number of landmarks, with and without inter-robot measurements."""
+    """Worlds by number of landmarks, with and without inter-robot measurements."""
     return [task for case in _cases(options).values() for task in case]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Frequency of wrong maps, with and without a warning."""
+    """Frequency of wrong maps, warned and silent."""
     figures: dict[str, Figures] = {}
     for name, case in _cases(options).items():
         figures[name] = few_figures(results.of_all(case))
@@ -109,7 +109,6 @@ def few_figures(runs: list[Figures]) -> Figures:
 
 
 def _alarmed(run: Figures) -> bool:
-    """Whether a warning concerns more than the covariances."""
     return any(not any(words in text for words in WIDE) for text in run["reasons"])
 
 

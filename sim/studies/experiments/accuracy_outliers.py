@@ -43,7 +43,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Figures of every kind of outlier beside the clean runs."""
+    """Figures by kind of outlier beside the clean runs."""
     figures: dict[str, dict[str, Figures]] = {}
     goals = []
     for world in WORLDS:

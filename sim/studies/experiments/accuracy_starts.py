@@ -30,7 +30,7 @@ def is_wrong(chi2: float) -> bool:
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each world and seed with and without known starts."""
+    """Each world and seed, with known and unknown starts."""
     return [task for world in WORLDS for pair in _pairs(world, options) for task in pair]
 
 

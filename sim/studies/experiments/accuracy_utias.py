@@ -58,7 +58,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Figures of each set, and of each robot in it."""
+    """Figures of sets and robots."""
     if not options.datasets:
         return Outcome(
             "real data", {"utias": {}}, missing=(without_datasets("figures on real data"),)
@@ -128,7 +128,7 @@ def set_figures(run: Figures) -> Figures:
 
 
 def team_on(dataset: Dataset) -> Task:
-    """The team on a set, with the batch under the profile's noise."""
+    """The team on a set, with the batch."""
     return team_task(load("utias"), dataset=dataset, batch=True, noise="profile")
 
 

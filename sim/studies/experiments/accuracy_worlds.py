@@ -75,7 +75,7 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Runs of all worlds, rules and seeds."""
+    """All worlds, rules and seeds."""
     return [task for cells in _cells(options).values() for runs in cells.values() for task in runs]
 
 

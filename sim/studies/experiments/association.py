@@ -213,7 +213,7 @@ def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) 
 
 
 def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
-    """Six panels; a system has the same colour in all of them."""
+    """Six panels, with one colour per system."""
     shown = [each for each in FIGURES if each[0] not in ("wrong_percent", "gospa")]
     made = figure(12.0, 6.0)
     colours = {system.name: f"C{k}" for k, system in enumerate(SYSTEMS)}

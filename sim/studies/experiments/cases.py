@@ -22,17 +22,17 @@ from team.extras import install_command
 FOLDER = "cases"
 _STORED = "output.pkl"
 IDLE_S = 5
-"""Time [s] after which an idle worker ends."""
+"""Timeout [s] of an idle worker."""
 Cached = Callable[..., dict[str, Any]]
 
 
 class SchedulerError(ValueError):
-    """An unusable scheduler; the text gives the reason and the remedy."""
+    """An unusable scheduler; the text gives reason and remedy."""
 
 
 @dataclass(frozen=True)
 class Done:
-    """A finished case: its result, or the error in a line and the traceback."""
+    """A finished case: its result, or an error with traceback."""
 
     task: Task
     result: dict[str, Any] | None

@@ -97,7 +97,7 @@ def curves_run(
 def true_landmarks(
     samples: Iterable[Sample],
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Ids and positions [m] of the world's landmarks; empty if unknown."""
+    """Ids and positions [m] of the world's landmarks, if known."""
     for message in messages(samples, ch.TRUTH_LANDMARKS.key()):
         if isinstance(message, m.TruthLandmarks):
             return translate.landmarks_of(message)
@@ -110,7 +110,7 @@ def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
 
 
 def a_step_late(streams: WorldStreams) -> WorldStreams:
-    """The streams with each message of landmarks replaced by the one before it."""
+    """Delay each message of landmarks by one."""
     return replace(streams, streams=tuple(_a_step_late(stream) for stream in streams.streams))
 
 
@@ -136,7 +136,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
 def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """Poses and covariances on these keys; at equal times those of the last key."""
+    """Poses and covariances on these keys; the last key has precedence."""
     by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in by_stamp:

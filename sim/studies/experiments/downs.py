@@ -87,7 +87,7 @@ class PrintedTable(NamedTuple):
     sample: Callable[[Options, Dataset], Task] | None = None
 
     def tasks(self, options: Options) -> list[Task]:
-        """Runs of every method on every set and in the simulator."""
+        """Runs of every method, on sets and simulator."""
         found = self.simulated.tasks(options)
         found += [
             task
@@ -98,7 +98,7 @@ class PrintedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Rows of each set and of the simulator, their picture, the t-tests."""
+        """Rows and pictures of sets and simulator, the t-tests."""
         simulated = self.simulated.outcome(self.title, options, results)
         return combined(self.title, (self._of_sets(options, results), simulated))
 

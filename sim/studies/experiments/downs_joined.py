@@ -85,14 +85,12 @@ def his_protocol(scenario: Scenario) -> Scenario:
 
 
 def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str = "") -> Task:
-    """Every robot's own map and path, such as those of `ekf-slam` with `alone`."""
+    """Task of every robot's own map and path, such as those of `ekf-slam`."""
     return _task("whole_run", scenario, dataset, note)
 
 
 def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
-    """Every robot's submaps joined by his method under his protocol, and the robots' maps
-    aligned.
-    """
+    """Task of his method under his protocol."""
     return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
 
 
@@ -110,7 +108,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """By robot, errors of its last own map and online path; the map of one robot."""
+    """Errors of the robots' last own maps and online paths; the map of one."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -200,7 +198,6 @@ def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
 
 
 def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
-    """The robot's known initial pose, or else the origin of its own frame."""
     for sample in samples:
         if sample.key == ch.START.key(robot):
             message = opened(sample)[2]
@@ -213,7 +210,7 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
 def _joined(
     robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
 ) -> SubmapJoining:
-    """All submaps joined at once: the limit of joining them one by one."""
+    """All submaps joined at once: the limit of joining one by one."""
     initial_state = svd_joining.initial_state({robot: start})
     contributions = [
         Contribution(robot, 0, k, k, weighted(translate.local_map_of(s).without_nodes, "identity"))
@@ -269,7 +266,7 @@ def _mutual(
 def _looks(
     samples: Sequence[Sample], robot: str, sensor: Sensor
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """By teammate and step, the last (range [m], bearing [rad]) of that step, calibrated."""
+    """Last calibrated (range [m], bearing [rad]) by teammate and step."""
     found: dict[str, dict[int, tuple[float, float]]] = {}
     for message in messages(samples, ch.SIGHTINGS.key(robot)):
         if isinstance(message, m.Sightings):

@@ -53,7 +53,7 @@ class Pair(NamedTuple):
 
 
 def tasks(options: Options) -> list[Task]:
-    """Two robots in his simulator by seed, and all robots of the sets."""
+    """Two robots in his simulator, and all robots of the sets."""
     return [task for _, task in _runs(options)]
 
 
@@ -156,7 +156,7 @@ def profile_with_covariances(pair: Pair, turns: Float[np.ndarray, " K"]) -> Floa
 
 
 def minima(costs: Float[np.ndarray, " K"]) -> int:
-    """Number of local minima of a closed curve; equal neighbours count as one point."""
+    """Number of local minima of a closed curve; plateaus count once."""
     moves = np.sign(np.diff(np.append(costs, costs[0])))
     moves = moves[moves != 0]
     return int(((moves < 0) & (np.roll(moves, -1) > 0)).sum())

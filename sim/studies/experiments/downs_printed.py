@@ -63,6 +63,6 @@ TEAM_MAPS: Mapping[str, float] = {
 }  # fmt: skip
 """Table 5.5: joined maps of five robots."""
 P_EKF_JOINED = 3.04e-4
-"""Chapter 5: of the paired t-test of tables 5.1 and 5.3."""
+"""Chapter 5: paired t-test of tables 5.1 and 5.3."""
 P_JOINED_TEAM = 0.1018
-"""Chapter 5: of the paired t-test of tables 5.3 and 5.5."""
+"""Chapter 5: paired t-test of tables 5.3 and 5.5."""

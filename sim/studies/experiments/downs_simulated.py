@@ -80,7 +80,7 @@ class SimulatedTable(NamedTuple):
     sample: bool = False
 
     def tasks(self, options: Options) -> list[Task]:
-        """Every world, method and seed, with the runs that only the t-tests need."""
+        """Every world, method and seed, and runs for the t-tests."""
         found = [
             _task(world, method, options, seed)
             for world in WORLDS
@@ -90,7 +90,7 @@ class SimulatedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, title: str, options: Options, results: Results) -> Outcome:
-        """Errors over the seeds, their t-tests, and every run as a dot."""
+        """Errors over the seeds, t-tests, and every run as a dot."""
         errors = self._errors(options, results)
         if not errors:
             return Outcome(title, {})

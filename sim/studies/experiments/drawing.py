@@ -36,7 +36,7 @@ class Curves:
         *,
         stepwise: bool,
     ) -> Self:
-        """Sample the runs at these times. stepwise: a value holds until the next one."""
+        """Sample the runs at these times. stepwise: hold values."""
         nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
         return cls(
             times_s,
@@ -61,9 +61,7 @@ class Curves:
 def sampled(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
-    """Sample a curve at these times; stepwise: a value holds until the next one, else linear
-    interpolation.
-    """
+    """Sample a curve at these times; stepwise: hold values instead of linear interpolation."""
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)

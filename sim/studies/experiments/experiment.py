@@ -24,13 +24,13 @@ class Dataset:
 
 
 def seed_count(count: int) -> str:
-    """A number of seeds with its noun: `1 seed`, `3 seeds`."""
+    """A number with its noun: `1 seed`, `3 seeds`."""
     return f"{count} seed{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the command line: seeds, small or full, data sets."""
+    """Options of the command line."""
 
     seeds: tuple[int, ...]
     quick: bool = False
@@ -38,13 +38,13 @@ class Options:
 
     @property
     def seed_count(self) -> str:
-        """The number of seeds with its noun."""
+        """The number with its noun."""
         return seed_count(len(self.seeds))
 
 
 @dataclass(frozen=True)
 class Results:
-    """Results of the runs by the tasks' names; a failed run has none."""
+    """Results of the runs by task name, except failed ones."""
 
     by_name: Mapping[str, dict[str, Any]]
 
@@ -53,13 +53,13 @@ class Results:
         return self.by_name.get(task.name)
 
     def of_all(self, tasks: Sequence[Task]) -> list[dict[str, Any]]:
-        """Existing results, in the order of the tasks."""
+        """Existing results, in task order."""
         return [self.by_name[task.name] for task in tasks if task.name in self.by_name]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column is the row's name. note: an explanation."""
+    """A table as text; the first column names the row."""
 
     title: str
     columns: tuple[str, ...]
@@ -69,9 +69,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture: its file's name without suffix, its caption, and the function that draws the
-    PNG.
-    """
+    """A picture: file name without suffix, caption, drawing function."""
 
     name: str
     caption: str
@@ -89,7 +87,7 @@ class Goal:
 
     @property
     def passed(self) -> bool | None:
-        """Whether the bounds hold; None without a value."""
+        """Whether the bounds hold, if there is a value."""
         if self.value is None:
             return None
         return isfinite(self.value) and self.least <= self.value <= self.most
@@ -124,7 +122,7 @@ class Experiment(Protocol):
 
 
 def combined(title: str, parts: Sequence[Outcome]) -> Outcome:
-    """Combine several outcomes; their figures differ in name."""
+    """Combine several outcomes with different figures."""
     return Outcome(
         title,
         {name: figure for part in parts for name, figure in part.figures.items()},

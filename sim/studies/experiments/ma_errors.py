@@ -52,7 +52,7 @@ class ErrorFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Medians and bands over the seeds beside the printed figures, for each set."""
+        """Medians and bands beside the printed figures, for each set."""
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         figures, rows, pictures = {}, [], []

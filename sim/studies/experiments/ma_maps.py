@@ -29,14 +29,14 @@ CLOUD_COLOUR = SKY
 
 
 class PathFigure(NamedTuple):
-    """Paths of some methods side by side, of the first seed's run on each set."""
+    """Paths of some methods side by side, of the first seed."""
 
     title: str
     methods: tuple[Method, ...]
     remark: str
 
     def tasks(self, options: Options) -> list[Task]:
-        """One run of each method on each set."""
+        """One run per method and set."""
         return [
             ma_task(dataset, method, options.seeds[0])
             for dataset in options.datasets
@@ -44,7 +44,7 @@ class PathFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """A picture for each set, and the robots' mean errors."""
+        """A picture per set, and mean errors."""
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         figures, rows, pictures = {}, [], []

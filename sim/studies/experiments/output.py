@@ -84,7 +84,7 @@ def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, An
 def write(
     all_concluded: Sequence[Concluded], folder: Path, page: str, provenance: Mapping[str, str]
 ) -> Path:
-    """Write each experiment's JSON and pictures and a common page; returns the page's path."""
+    """Write JSON, pictures and a common page; returns the page's path."""
     folder.mkdir(parents=True, exist_ok=True)
     sections = []
     for concluded in all_concluded:

@@ -40,7 +40,7 @@ DAMPING = 1e-3
 
 
 class Solution(NamedTuple):
-    """A state, its cost, and whether the solver converged there."""
+    """A state, its cost, and whether it converged."""
 
     state: Values
     cost: float
@@ -56,7 +56,7 @@ class Whitened(NamedTuple):
 
 
 class PlainCost:
-    """Cost of a graph's states. fixed: coordinates of the state that are not solved for."""
+    """Cost of a graph's states. fixed: coordinates that are not solved for."""
 
     def __init__(
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
@@ -77,12 +77,12 @@ class PlainCost:
         return float(r @ r)
 
     def residuals(self, state: Values) -> Values:
-        """Whitened residuals, kind by kind; the sum of their squares is the cost."""
+        """Whitened residuals, kind by kind."""
         found = [each.residuals.ravel() for each in self._terms(state)]
         return np.concatenate([np.zeros(0), *found])
 
     def jacobian(self, state: Values) -> sparse.csr_array:
-        """Jacobian of the whitened residuals with respect to the free coordinates."""
+        """Jacobian of the residuals by the free coordinates."""
         entries, rows, columns, begin = [np.zeros(0)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for each in self._terms(state):
             row = begin + np.arange(each.residuals.size).reshape(*each.residuals.shape, 1)
@@ -194,7 +194,7 @@ class _Sightings(NamedTuple):
     at: Int64[np.ndarray, "K 6"]
 
     def whitened(self, state: Values) -> Whitened:
-        """Predicted less measured range and bearing of the teammate."""
+        """Predicted less measured range and bearing."""
         pose = state[self.at]
         x, y = pose[:, 3] - pose[:, 0], pose[:, 4] - pose[:, 1]
         distance = np.hypot(x, y)

@@ -15,7 +15,7 @@ LINE_S = 10.0
 
 @contextmanager
 def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
-    """A function to call with every finished task; failures are printed at once."""
+    """Yields a function to call with every finished task."""
     console = Console(stderr=True)
     of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
     # The bar advances by expected cost, which differs widely between runs.

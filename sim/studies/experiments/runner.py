@@ -67,7 +67,7 @@ def computed(
     progress: Progress,
     scheduler: str | None = None,
 ) -> list[Concluded]:
-    """Outcomes of all plans; their tasks run together, common ones once."""
+    """Outcomes of all plans; common tasks run once."""
     folder.mkdir(parents=True, exist_ok=True)
     tasks = {task.name: task for plan in plans for task in plan.tasks}
     cases = Cases(folder)
@@ -101,7 +101,7 @@ def _write_failures(path: Path, failures: Sequence[Done]) -> None:
 
 
 def dataset(path: Path) -> Dataset:
-    """A data set with its checksum; raises DatasetError where there is none."""
+    """A data set with its checksum; raises DatasetError."""
     with open_data_set(str(path), "Barcodes.dat"):
         pass
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())

@@ -77,7 +77,7 @@ BATCH = "graph based"
 
 
 def tasks(options: Options) -> list[Task]:
-    """Every pair in every world, and FastSLAM with few and many particles."""
+    """Every pair and world; FastSLAM with few and many particles."""
     pairs = [task for world in WORLDS for pair in PAIRS for task in _runs(world, pair, options)]
     return pairs + [task for count in PARTICLES for task in _fastslam(count, options)]
 
@@ -135,7 +135,6 @@ def _timed(figures: Figures) -> Figures:
 
 
 def _runs(world: str, pair: tuple[Estimator, FusionRule], options: Options) -> list[Task]:
-    """The same runs as those of `accuracy`."""
     return [
         team_task(
             with_options(load(world), seed=seed, estimator=pair[0], fusion=pair[1]),

@@ -33,13 +33,13 @@ class Task:
 
     @cached_property
     def name(self) -> str:
-        """Digest of the function's name and the parameters."""
+        """Digest of function name and parameters."""
         text = json.dumps([self.work, self.parameters], sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
     def program(self) -> str:
-        """Digest of the function's sources and of the libraries' versions."""
+        """Digest of sources and library versions."""
         return program_of(self.work.partition(":")[0])
 
     def run(self) -> dict[str, Any]:

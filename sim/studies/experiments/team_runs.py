@@ -135,7 +135,7 @@ class TimedRun:
             yield sample
 
     def figures(self) -> Figures:
-        """Total times, and times per odometry interval and per fused map."""
+        """Times in total, per odometry interval and per fused map."""
         return {
             "robot_seconds": self._robots.seconds,
             "centre_seconds": self._centre.seconds,
@@ -261,19 +261,19 @@ class Figure(NamedTuple):
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """Mean of the values that are not None."""
+    """Mean of the known values."""
     known = [value for value in values if value is not None]
     return fmean(known) if known else None
 
 
 def middle(values: Iterable[float | None]) -> float | None:
-    """Median of the values that are not None."""
+    """Median of the known values."""
     known = [value for value in values if value is not None]
     return median(known) if known else None
 
 
 def rms(values: Iterable[float | None]) -> float | None:
-    """Root mean square of the values that are not None."""
+    """Root mean square of the known values."""
     square = mean(None if value is None else value * value for value in values)
     return None if square is None else square**0.5
 
@@ -306,7 +306,7 @@ OVER_SEEDS = (
 
 
 def over_seeds(runs: Sequence[Figures]) -> Figures:
-    """Figures over several runs, under the runs' names, with the number of runs."""
+    """Figures over several runs, with their number."""
     return {"seeds": len(runs)} | {
         figure.name: figure.over_seeds(run.get(figure.source) for run in runs)
         for figure in OVER_SEEDS

@@ -73,7 +73,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 
 
 def final_fold(samples: Iterable[Sample]) -> Fold:
-    """The centre's final fold, computed from the submaps and inter-robot measurements of a log."""
+    """The centre's final fold, recomputed from a log."""
     log = Recorded()
     for sample in samples:
         log.take(sample)

@@ -94,7 +94,7 @@ class ErrorFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Medians and bands over the seeds beside the printed figures."""
+        """Medians and bands beside the printed figures."""
         found = {panel.name: self._curves(panel, options, results) for panel in self.panels}
         rows = [
             (f"{panel.name}: {method.name}" if panel.name else method.name, *row(panel, method, c))
@@ -142,7 +142,7 @@ class ErrorFigure(NamedTuple):
 
 
 def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -> Task:
-    """Run of one method in one panel's world; shots: the steps whose maps are drawn."""
+    """Run of a method in a panel's world; shots: steps whose maps are drawn."""
     scenario = with_options(
         load("thesis"),
         seed=seed,

@@ -66,7 +66,7 @@ ERRORS = ErrorFigure(
 
 
 def tasks(options: Options) -> list[Task]:
-    """The three steps, a start anywhere and the errors over 500 steps."""
+    """The three steps, a start anywhere, the errors."""
     return [
         *(_stages_task(options, seed) for seed in options.seeds),
         *(_anywhere_task(options, seed) for seed in options.seeds),
@@ -75,7 +75,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Three pictures of the steps, one of the start anywhere, one of the errors."""
+    """Pictures of the steps, the start anywhere, the errors."""
     stages = results.of_all([_stages_task(options, seed) for seed in options.seeds])
     anywhere = results.of_all([_anywhere_task(options, seed) for seed in options.seeds])
     errors = ERRORS.outcome(options, results)
@@ -164,7 +164,6 @@ def _alone(seed: int, particles: int) -> Scenario:
 
 
 def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
-    """A run of one seed; only the first one's clouds are stored."""
     return Task(
         f"sim.studies.experiments.xu_localisation:{work}",
         {"world": msgspec.to_builtins(scenario), "clouds": seed == options.seeds[0]},

@@ -49,7 +49,7 @@ class MapFigure(NamedTuple):
     remarks: tuple[str, ...]
 
     def tasks(self, options: Options) -> list[Task]:
-        """A run of each drawn method, and those of the error figures."""
+        """Runs of the drawn methods and of the error figures."""
         return [
             each
             for method, reading in self.shown
@@ -60,7 +60,7 @@ class MapFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """A picture and a row for each method."""
+        """A picture and a row per method."""
         rows, pictures, figures = [], [], {}
         for method, reading in self.shown:
             run = results.of(self._drawn(method, reading, options))
@@ -166,7 +166,7 @@ class PathFigure(NamedTuple):
     errors: ErrorFigure
 
     def tasks(self, options: Options) -> list[Task]:
-        """Runs of the error figure, and one of each panel and method."""
+        """Runs of the error figure, and one per panel and method."""
         drawn = [
             self._run(panel, method, options)
             for panel in self.errors.panels

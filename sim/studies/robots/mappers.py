@@ -79,7 +79,7 @@ class ExchangingMapper(Mapper):
         """Ignore a known map: Hybrid-SLAM makes its own."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
-        """Replace the landmarks of the own map by the fused ones; submaps are unaffected."""
+        """Replace the own map's landmarks by the fused ones."""
         self.own_map.whole = absorbed(self.own_map.whole, *landmarks)
 
 
@@ -101,7 +101,7 @@ class StreamMapper(ExchangingMapper):
         self.ledger.used, self.joint = self.estimator.used, self.estimator.joint
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Raise ValueError: there are no submaps to resume from."""
+        """Raise ValueError: there are no submaps."""
         raise ValueError(f"the estimator {self.config.estimator} has no submaps to resume from")
 
     @property
@@ -131,7 +131,7 @@ class StreamMapper(ExchangingMapper):
         self.estimator.absorb(landmarks)
 
     def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
-        """Process an odometry interval; it never closes a window."""
+        """Process an odometry interval."""
         interval, rejected = self.judge_interval(measurement, is_near)
         estimates = None
         if interval is not None:

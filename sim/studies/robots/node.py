@@ -87,7 +87,7 @@ class ExchangingRobot(RobotNode):
         return msgspec.structs.replace(progress, measurements=count)
 
     def statement(self) -> m.Done:
-        """The account of the incarnation, with the sequence of its last map."""
+        """The account of the incarnation, with its last map's sequence."""
         return msgspec.structs.replace(super().statement(), last_map=self.mapper.exchange.last)
 
     def _close_incarnation(self) -> None:
@@ -97,7 +97,7 @@ class ExchangingRobot(RobotNode):
 
 
 class StreamRobot(ExchangingRobot):
-    """A robot whose estimator has one state over its whole stream."""
+    """A robot with one state over its whole stream."""
 
     makes = StreamMapper
 

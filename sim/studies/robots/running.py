@@ -221,7 +221,6 @@ class RunningEstimator:
 
 
 def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
-    """Initial pose of the sensor, whose poses are the filter's states."""
     covariance = np.zeros((3, 3)) if initial.covariance is None else initial.covariance
     if initial.pose is None:
         return initial
@@ -230,7 +229,7 @@ def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
 
 
 class AbsorbingEstimator(RunningEstimator):
-    """An estimator whose landmarks are replaced by the fused ones, under a rule with feedback."""
+    """An estimator that absorbs fused landmarks."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the landmarks by the fused ones."""

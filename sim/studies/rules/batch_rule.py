@@ -50,7 +50,7 @@ class BatchCentre(MeasurementCentre):
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """The number of poses, and the joint cost of the last map."""
+        """Number of poses, and cost of the last map."""
         if not self.models:
             return {}
         figures = {"poses": float(len(self._batch.poses))}
@@ -60,7 +60,7 @@ class BatchCentre(MeasurementCentre):
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """Persistent errors treated as white, and whether the final map has converged."""
+        """Errors treated as white, and missing convergence."""
         return tuple(self._findings)
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
@@ -105,7 +105,6 @@ class BatchCentre(MeasurementCentre):
             )
 
     def _solved(self, grown: GrowingBatch, iterations: int, decrement: float) -> GrowingBatch:
-        """The solution, or without one the estimate before it."""
         with suppress(UnsolvableError, ArithmeticError), np.errstate(all="ignore"):
             solution = batch.solved(grown, iterations, decrement)
             _ = solution.marginals
@@ -114,7 +113,6 @@ class BatchCentre(MeasurementCentre):
         return grown
 
     def _poses(self) -> list[Outgoing]:
-        """Newest pose of each robot that has moved since the last map."""
         outgoing = [
             self.pose(each, batch.pose_gaussian(self._batch, robot))
             for robot, each in sorted(self._newest.items())

@@ -38,7 +38,7 @@ class NewestMapsCentre(ComparisonCentre):
         self._starts: dict[Stream, m.InitialPose] = {}
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """Store an initial pose, or a map that is newer than the robot's last one."""
+        """Store an initial pose, or a newer map."""
         match message:
             case m.InitialPose():
                 self._starts[message.robot, message.incarnation] = message
@@ -51,7 +51,7 @@ class NewestMapsCentre(ComparisonCentre):
         return []
 
     def has_received(self, done: m.Done) -> bool:
-        """Whether the robot's last map and the initial pose of its stream have arrived."""
+        """Whether the robot's last map and initial pose have arrived."""
         found = self._maps.get(done.robot)
         last = (done.incarnation, done.last_map)
         return done.last_map < 0 or (
@@ -156,7 +156,7 @@ class LatestCentre(NewestMapsCentre):
 
 
 class AloneCentre(NewestMapsCentre):
-    """No fusion: publishes a final map for single-robot teams only."""
+    """No fusion: a final map for single-robot teams only."""
 
     def fuse(
         self,
@@ -187,7 +187,7 @@ class AloneCentre(NewestMapsCentre):
 
 
 def is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
-    """Whether a map is in the team's frame: its stream's initial pose is known."""
+    """Whether the initial pose of a map's stream is known."""
     start = starts.get((estimate.robot, estimate.incarnation))
     return start is not None and bool(start.pose)
 

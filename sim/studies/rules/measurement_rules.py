@@ -77,7 +77,7 @@ class MeasurementCentre(ComparisonCentre):
         """The map of all steps so far."""
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """File a measurement, a robot's models or the last counters."""
+        """File a measurement, models or the last counters."""
         match message:
             case m.Measurement():
                 self._keyframes.put(message)
@@ -99,7 +99,7 @@ class MeasurementCentre(ComparisonCentre):
 
     @property
     def has_all_measurements(self) -> bool:
-        """Whether every measurement of every stream has been used."""
+        """Whether all measurements have been used."""
         return self._keyframes.complete
 
     def requests(self) -> list[m.MeasurementsRequest]:
@@ -127,7 +127,7 @@ class MeasurementCentre(ComparisonCentre):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute everything from the whole stream, since each map changes the next."""
+        """Recompute from the whole stream, since each map changes the next."""
         for message in _inputs_in_order(log):
             self.file(message)
         yield from self.publish_due()
@@ -166,7 +166,6 @@ class MeasurementCentre(ComparisonCentre):
     def _sensors_start(
         self, robot: str, pose: Pose, covariance: Matrix | None
     ) -> tuple[Pose, Matrix | None]:
-        """Initial pose of the robot's sensor, whose poses the keyframes are."""
         sensor = self.models[robot].sensor
         if not sensor.is_mounted:
             return pose, covariance
@@ -202,7 +201,7 @@ class MeasurementCentre(ComparisonCentre):
         return self._take(step, turns)
 
     def pose_is_due(self, each: RobotKeyframe) -> bool:
-        """Whether the robot's `pose_s` have passed since its last pose."""
+        """Whether a pose is due, by the robot's `pose_s`."""
         last_ns = self._pose_ns.get(each.robot)
         pose_ns = self.models[each.robot].pose_s * 1e9
         return last_ns is None or each.stamp_ns - last_ns >= pose_ns

@@ -124,7 +124,6 @@ class SvdFold(SubmapFold):
         )
 
     def _believed(self, message: m.InitialPose) -> Pose | None:
-        """Initial pose of a stream, if known and within the bounds."""
         start = translate.start_of(message)
         if start is None or start_beyond(start, self.config.bounds) is not None:
             return None

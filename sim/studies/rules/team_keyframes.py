@@ -47,7 +47,7 @@ class _Stream:
 
     @property
     def complete(self) -> bool:
-        """Whether every measurement of it has been used."""
+        """Whether all measurements have been used."""
         end = self.end
         return self.broken or (end is not None and self.inbox.complete(end))
 
@@ -107,7 +107,7 @@ class TeamKeyframes:
         self._streams = {robot: _Stream(robot) for robot in sorted(robots)}
 
     def configure(self, robot: str, config: RobotConfig) -> None:
-        """Set the models of a robot, which its measurements need."""
+        """Set a robot's models."""
         if robot in self._streams and self._streams[robot].config is None:
             self._streams[robot].config = config
 
@@ -128,7 +128,7 @@ class TeamKeyframes:
 
     @property
     def starts(self) -> dict[str, tuple[RobotConfig, m.InitialPose]] | None:
-        """Every robot's models and initial pose; None until complete."""
+        """Every robot's models and initial pose, once complete."""
         found = {}
         for name, stream in self._streams.items():
             stream.take()
@@ -145,11 +145,11 @@ class TeamKeyframes:
 
     @property
     def complete(self) -> bool:
-        """Whether every measurement of every stream has been used."""
+        """Whether all measurements have been used."""
         return all(stream.complete for stream in self._streams.values())
 
     def steps(self) -> Iterator[list[RobotKeyframe]]:
-        """Complete keyframes, those of one team time together."""
+        """Complete keyframes by team time."""
         for stream in self._streams.values():
             stream.take()
         horizon = min(stream.covered_ns for stream in self._streams.values())

@@ -66,7 +66,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
         _rule("ask at the door", "ingress", ("query",), door),
         _rule("be told at the door", "egress", ("reply",), door),
     ]
-    # Nodes without a rule of their own, such as those with a revoked certificate, learn it here.
+    # Answers nodes without a rule of their own, such as those with a revoked certificate.
     subjects: list[dict[str, object]] = [{"id": "any certificate", "link_protocols": ["tls"]}]
     policies = [
         {"rules": ["ask at the door", "be told at the door"], "subjects": ["any certificate"]}
