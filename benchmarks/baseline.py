@@ -1,8 +1,8 @@
-"""The committed figures of a benchmark, and whether a run is worse than they allow.
+"""Compare the figures of a benchmark with its committed baseline.
 
-`benchmarks/NAME.json` has the `command`, where it was `measured`, and of each of its `figures` the
-`value`, which direction is `better` ("less" or "more"), and the `tolerance`: the share by which a
-figure may be worse. Ratios of two halves of one run hold on any machine; others say on which.
+`benchmarks/NAME.json` has the `command`, where it was `measured`, and for each of its `figures` the
+`value`, the direction that is `better` ("less" or "more"), and the `tolerance`: the share by which
+it may be worse. Ratios within one run hold on any machine.
 """
 
 import json
@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 
 
 class Held(NamedTuple):
-    """A figure beside its baseline: at worst it may be `bound`."""
+    """A figure with its baseline; `bound` is the worst allowed."""
 
     name: str
     value: float
@@ -25,19 +25,17 @@ class Held(NamedTuple):
 
     @property
     def is_worse(self) -> bool:
-        """Beyond its bound, or no number at all."""
+        """Beyond its bound, or NaN."""
         within = self.value <= self.bound if self.better == "less" else self.value >= self.bound
         return not within
 
 
 def baselines() -> dict[str, dict[str, Any]]:
-    """All that are committed, by the benchmark's name."""
     read = {path.stem: json.loads(path.read_text()) for path in sorted(HERE.glob("*.json"))}
     return {name: told for name, told in read.items() if "figures" in told}
 
 
 def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held]:
-    """Each figure of the baseline beside what a run has found."""
     rows = []
     for name, of in baseline["figures"].items():
         sign = 1.0 if of["better"] == "less" else -1.0
@@ -47,7 +45,6 @@ def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held
 
 
 def worse(figures: Mapping[str, float], name: str) -> list[str]:
-    """What is worse than the baseline `name` allows, in words."""
     return [
         f"{row.name} is {row.value:.4g}, it was {row.was:.4g} and may be {row.bound:.4g}"
         for row in held(figures, baselines()[name])
@@ -56,9 +53,9 @@ def worse(figures: Mapping[str, float], name: str) -> list[str]:
 
 
 def concluded(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
-    """Print the figures, write them to `file` if there is one, and judge them by the baseline.
+    """Print the figures, write them to `file` if given, and compare them with the baseline.
 
-    wrong: what else the run has found wrong. Returns the exit status: 1 if anything is.
+    wrong: further faults. Returns the exit status: 1 for any fault.
     """
     text = json.dumps(figures, indent=1)
     print(text)

@@ -1,10 +1,10 @@
-"""Pictures of the committed baselines for the documentation.
+"""Draw the committed baselines for the documentation.
 
     python -m benchmarks.chart FOLDER
 
-FOLDER/benchmarks.png: each figure and what it may be at worst, in units of its committed value.
-FOLDER/growth.png: a tick of the centre over the submaps that it has, before and since 0074.
-FOLDER/growth_large.png: the same of ten robots among a thousand landmarks, before and since 0117.
+benchmarks.png: each figure and its worst allowed value, in units of the committed value.
+growth.png: a tick of the centre over its number of submaps; growth_large.png: of ten robots among a
+thousand landmarks.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from benchmarks.baseline import baselines
 
 
 def draw_baselines(picture: Path) -> None:
-    """A row for each figure: a point at 1, a line to the worst that is allowed."""
+    """A row per figure: a point at 1, a line to the worst allowed."""
     rows = [
         (f"{name}: {figure} ({of['value']:g})", of)
         for name, told in baselines().items()
@@ -36,7 +36,6 @@ def draw_baselines(picture: Path) -> None:
 
 
 def draw_growth(name: str, goal_ms: float, picture: Path) -> None:
-    """CPU of a tick with its broadcast, by the curves of this baseline."""
     curves = baselines()[name]["curves"]
     figure = Figure(figsize=(6.5, 3.4), layout="constrained")
     axes = figure.add_subplot()

@@ -1,9 +1,8 @@
-"""Runs the benchmarks that have a committed baseline, and says what is worse than it allows.
+"""Run the benchmarks that have a committed baseline, and report figures worse than it allows.
 
     python -m benchmarks.every [NAME …] [--output DIR]        or `make bench`
 
-One after the other, each by the `command` that stands in its baseline. What they found is kept as
-DIR/NAME.json. Exit status 1 if a figure is worse, or a benchmark failed.
+Figures are written to DIR/NAME.json. Exit status 1 if a figure is worse or a benchmark failed.
 """
 
 import argparse
@@ -17,7 +16,7 @@ from benchmarks.baseline import Held, baselines, held
 
 
 def found(name: str, command: str, output: Path) -> dict[str, float]:
-    """The figures that a benchmark writes; it may exit with 1 where some are worse."""
+    """Run a benchmark; status 1 means that some figures are worse."""
     page = output / f"{name}.json"
     page.unlink(missing_ok=True)
     program, *options = shlex.split(command)
@@ -30,7 +29,6 @@ def found(name: str, command: str, output: Path) -> dict[str, float]:
 
 
 def line(name: str, row: Held) -> str:
-    """One figure: what it is, what it was, what it may be."""
     sign = "≤" if row.better == "less" else "≥"
     verdict = "WORSE" if row.is_worse else "ok"
     return (

@@ -1,11 +1,10 @@
-"""How fresh the team's map is: from a submap's arrival to the map and the priors that hold it.
+"""Measure the latency from a submap's arrival to the maps and priors that contain it.
 
 `python -m benchmarks.fresh [LOG…] [--json FILE]`, of logs of `launch` at any pace, or of a run of
-its own at ten times real time. By wall time, of
-each submap but those of the last second: until the first map (a centre's, or any peer's) that has
-it, and until the first prior of another robot that rests on it. The measure is the round trip (the
-median from a submap to the centre's credit for it) and the time of a solution (the centre's own
-word): fresh is within three times their sum.
+its own at ten times real time. Wall time from each submap but those of the last second to the first
+map (a centre's or a peer's) and the first prior of another robot that contain it. It must be within
+three times the round trip (median from a submap to the centre's credit) plus the reported solution
+time.
 """
 
 import argparse
@@ -29,7 +28,7 @@ Submap = tuple[str, int, int]
 
 
 def measured(log: Path) -> dict[str, Any]:
-    """Seconds until the map, until a teammate's prior; the round trip and a solution's time."""
+    """Seconds until the map and until a teammate's prior; the round trip and the solution time."""
     arrived: dict[Submap, float] = {}
     mapped: dict[Submap, float] = {}
     told: dict[Submap, float] = {}
@@ -89,7 +88,6 @@ def _first(
 
 
 def launched(folder: Path) -> Path:
-    """The log of a run of `waypoints` at ten times real time."""
     words = ["launch", "waypoints", "--speed", "10", "--no-report", "--no-views"]
     subprocess.run(
         [sys.executable, "-P", "-m", "sim", *words, "--output", str(folder)],
@@ -100,7 +98,7 @@ def launched(folder: Path) -> Path:
 
 
 def main() -> int:
-    """Measure and print; without a log, of a run of its own against the committed baseline."""
+    """Measure and print; without a log, compare an own run with the baseline."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("logs", nargs="*", type=Path)
     parser.add_argument("--json", type=Path)

@@ -1,16 +1,14 @@
-"""How the centre's cost grows with the length of a run: time, memory and bytes per broadcast.
+"""Measure how the centre's time, memory and bytes per broadcast grow with a run's length.
 
     python -m benchmarks.growth [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
                                 [--identities hidden]
 
-Synthetic submaps, drawn about a known truth, go through the rule `join` without a network: all
-robots end a window in each tick, then comes a broadcast. At each size: CPU per tick with its
-broadcast (the median of the last WINDOW), resident memory, bytes of the map and of all priors, and
-how far the map is from the truth. `ratio_*` compare the ends of one run, so they hold on any
-machine; growth.json has the baseline with direction and tolerance. Exit status 1 if a figure is
-worse than that allows. Without identities the submaps' landmarks are numbered anew in each, the
-centre associates them, the error is that from the nearest true landmark, and `window_ms` is what
-the association of one window of WINDOW scans costs its robot.
+Synthetic submaps about a known truth go through the rule `join` without a network: in each tick all
+robots end a window, then comes a broadcast. At each size: CPU per tick (median of the last WINDOW),
+resident memory, bytes of the map and of all priors, and the map's error. `ratio_*` compare the ends
+of one run, so they hold on any machine. Exit status 1 if a figure is worse than growth.json allows.
+Without identities each submap renumbers its landmarks, the error is to the nearest true landmark,
+and `window_ms` is a robot's cost to associate one window of WINDOW scans.
 """
 
 import argparse
@@ -41,24 +39,23 @@ from team.wire.codec import encoded
 
 TICK_S = 10.0
 WINDOW = 25
-"""Ticks of which the median is told."""
+"""Ticks per median."""
 SEEN = 8
-"""Landmarks that a robot sees in a window on average."""
+"""Mean number of landmarks that a robot detects in a window."""
 SPACING_M = 10.0
-"""Between neighbouring landmarks."""
+"""Spacing of neighbouring landmarks."""
 SIGMAS = (0.1, 0.02, 0.2)
-"""Of a submap: end position [m], end heading [rad], landmark [m]."""
+"""Standard deviations of a submap: end position [m], end heading [rad], landmark [m]."""
 
 BASELINES: Mapping[tuple[int, int, int, str | None], str] = {
     (5, 50, 2500, None): "growth",
     (10, 1000, 2000, None): "growth-large",
     (5, 50, 2000, "hidden"): "growth-hidden",
 }
-"""The committed figures of robots, landmarks, largest number of submaps and identities."""
 
 
 class World:
-    """Landmarks in a square, and robots that wander in it; submaps tick by tick."""
+    """Landmarks in a square, and robots on random paths; submaps tick by tick."""
 
     def __init__(self, robots: int, landmarks: int, seed: int = 1, hidden: bool = False) -> None:
         self.hidden = hidden
@@ -71,7 +68,6 @@ class World:
         self._ticks = 0
 
     def starts(self) -> Iterator[m.InitialPose]:
-        """Where the robots begin, exactly."""
         for r, pose in enumerate(self._poses):
             yield m.InitialPose(
                 stamp_ns=0,
@@ -83,7 +79,6 @@ class World:
             )
 
     def tick(self) -> list[m.Submap]:
-        """One submap of each robot."""
         made = [self._submap(r) for r in range(len(self._poses))]
         self._ticks += 1
         return made
@@ -119,7 +114,7 @@ class World:
         return translate.submap_message(f"r{r}", 1, k, counters, ends, bytes(8), local)
 
     def window(self) -> Scans:
-        """What one robot detects in a window: WINDOW scans of what surrounds it, on one step."""
+        """One robot's detections in a window: WINDOW scans along one step."""
         rng, pose = self._rng, self._poses[0]
         offsets = self.landmarks - pose[:2]
         seen = offsets[np.hypot(*offsets.T) < self._reach]
@@ -138,7 +133,6 @@ class World:
 
 
 def resident_mb() -> float:
-    """Resident memory of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
@@ -157,7 +151,6 @@ def window_ms(world: World) -> float:
 def measured(
     robots: int, landmarks: int, at: list[int], hidden: bool = False
 ) -> list[dict[str, float]]:
-    """A row of figures at each number of submaps."""
     world = World(robots, landmarks, hidden=hidden)
     lengths = profile_for(Sensor(range_sigma=SIGMAS[2], bearing_sigma=1e-6), 1.0)
     config = CentralConfig(tick_s=TICK_S, broadcast_s=TICK_S, association=lengths)
@@ -194,13 +187,11 @@ def measured(
 
 
 def _bytes(out: list[Outgoing]) -> tuple[int, int]:
-    """Of the maps and of the priors that went out."""
     maps = sum(len(encoded(o.message)) for o in out if isinstance(o.message, m.FusedMap))
     return maps, sum(len(encoded(o.message)) for o in out if isinstance(o.message, m.Prior))
 
 
 def _rmse(out: list[Outgoing], world: World) -> float:
-    """Of the newest map's landmarks."""
     fused = next((o.message for o in out if isinstance(o.message, m.FusedMap)), None)
     if fused is None:
         return float("nan")
@@ -213,12 +204,11 @@ def _rmse(out: list[Outgoing], world: World) -> float:
 
 
 def _shown(out: list[Outgoing]) -> int:
-    """Number of landmarks of the newest map."""
     return max(len(ids(o.message.ids, "ids")) for o in out if isinstance(o.message, m.FusedMap))
 
 
 def figures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """What the baseline is about: the largest size, and its ratio to 500 submaps or the least.
+    """Figures of the baseline: the largest size, and its ratio to 500 submaps or the least.
 
     kb_per_submap: between the last two sizes.
     """

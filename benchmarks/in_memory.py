@@ -1,13 +1,11 @@
-"""A team in memory over its size: the CPU of a run, its memory, and whether its log verifies.
+"""Measure CPU, memory and verification of a team in memory over its size.
 
     python -m benchmarks.in_memory [--robots 50,400] [--steps 24] [--json FILE]
 
-Robots and landmarks of `random-50` in a place that grows with their number, so that a robot sees
-as much in a team of a thousand as in one of fifty. Each size is run in a process of its own.
-cpu_ms: of one robot, the world's simulation included. verify_ms: to compute all of it again.
-equal: of the messages of all sizes the share that is computed again to the last bit. The growth_*
-compare the largest size with the smallest, so they hold on any machine; in_memory.json has them for
-the sizes above, and exit status 1 says that one is worse than that allows.
+`random-50` at constant density, so each robot detects equally many landmarks. Each size runs in its
+own process. cpu_ms: of one robot, with the world's simulation. verify_ms: to compute all of it
+again. equal: share of messages recomputed to the last bit. growth_*: the largest size over the
+smallest, so they hold on any machine. Exit status 1 if one is worse than in_memory.json allows.
 """
 
 import argparse
@@ -37,11 +35,10 @@ from team.recording.recorder import Recorder
 BASE = 50
 LANDMARKS = 18
 MEASURED = "50,400"
-"""The numbers of robots that the baseline compares."""
 
 
 def scaled(robots: int, steps: int) -> Scenario:
-    """`random-50` with so many robots, as dense."""
+    """`random-50` with so many robots at the same density."""
     scenario = with_options(load("random-50"), robots=robots)
     world = scenario.world
     assert isinstance(world, SimulatedWorld)
@@ -57,7 +54,6 @@ def scaled(robots: int, steps: int) -> Scenario:
 
 
 def run(robots: int, steps: int) -> dict[str, float]:
-    """One run and its verification, in this process."""
     run_small_team("hybrid", "join")
     scenario = scaled(robots, steps)
     began = time.process_time()
@@ -88,7 +84,6 @@ def run(robots: int, steps: int) -> dict[str, float]:
 
 
 def figures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """What a robot costs more in the largest team than in the smallest, and what is verified."""
     small, large = rows[0], rows[-1]
     return {
         "growth_cpu": large["cpu_ms"] / small["cpu_ms"],

@@ -1,9 +1,8 @@
-"""What a set that spreads costs: bytes of each robot, and the time until all agree, by topology.
+"""Measure a spreading set by topology: bytes of each robot, and the time until all agree.
 
 `python -m benchmarks.peers [--json FILE] [--picture FILE]`: peers without estimators, each of which
-closes a submap of 1.2 kB every 10 s for 300 s of team time; every second they talk. The star is
-what a centre would receive of each robot. `benchmarks/peers.json` is what was measured; a run
-compares itself with it.
+closes a submap of 1.2 kB every 10 s for 300 s of team time and exchanges messages every second. The
+star is a centre's traffic per robot. A run is compared with `benchmarks/peers.json`.
 """
 
 import argparse
@@ -38,7 +37,6 @@ TOLERANCE = 0.05
 
 
 def submap(robot: str, sequence: int) -> m.Submap:
-    """A submap of LANDMARKS landmarks."""
     n = 3 + 2 * LANDMARKS
     end_ns = (sequence + 1) * WINDOW_S * SECOND_NS
     return m.Submap(
@@ -57,8 +55,8 @@ def submap(robot: str, sequence: int) -> m.Submap:
 
 
 def reach_of(topology: str, robots: int) -> Reach:
-    """Who reaches whom: all, along a line or a ring, two by two for 5 s a minute, or two halves
-    that are cut apart for 100 s.
+    """Reach by topology: all, along a line or a ring, in pairs for 5 s a minute, or two halves cut
+    for 100 s.
     """
 
     def index(name: str) -> int:
@@ -87,7 +85,7 @@ def reach_of(topology: str, robots: int) -> Reach:
 
 
 class Team:
-    """Peers and the air between them; said: bytes of each, a broadcast once."""
+    """Peers and the radio between them; said: bytes of each, a broadcast once."""
 
     def __init__(self, topology: str, robots: int) -> None:
         self.names = [f"r{i + 1}" for i in range(robots)]
@@ -99,7 +97,6 @@ class Team:
         self._count = 0
 
     def begin(self) -> None:
-        """Each robot has an initial pose, which nobody else knows yet."""
         for name in self.names:
             pose = m.InitialPose(
                 stamp_ns=0, robot=name, incarnation=1, number=0, pose=b"", covariance=b""
@@ -110,7 +107,6 @@ class Team:
     def send(
         self, sender: str, to: str, what: m.Message | Member, now_ns: int, size: int = 0
     ) -> None:
-        """By the air, with 50 ms on the way."""
         size = size or (what.size if isinstance(what, Member) else len(encoded(what)))
         for at_ns in self.air.arrivals(sender, to, size, now_ns):
             self._count += 1
@@ -118,7 +114,7 @@ class Team:
             heapq.heappush(self._way, (at_ns + WAY_NS, self._count, sender, to, what))
 
     def spread(self, name: str, out: list[Outgoing], now_ns: int) -> None:
-        """What a node says: a question to one, all else to everyone in reach."""
+        """Send a node's messages: a request to one node, all else to everyone in reach."""
         for each in out:
             size = len(encoded(each.message))
             self.said[name] += size
@@ -128,7 +124,6 @@ class Team:
                     self.send(name, other, each.message, now_ns, size)
 
     def second(self, now_s: int) -> None:
-        """One second of team time."""
         now_ns = now_s * SECOND_NS
         if 0 < now_s <= DRIVE_S and now_s % WINDOW_S == 0:
             for name in self.names:
@@ -136,7 +131,6 @@ class Team:
         self.talk(now_ns, SECOND_NS)
 
     def close(self, name: str, sequence: int, now_ns: int) -> None:
-        """A robot has closed a submap, and says it."""
         message = submap(name, sequence)
         member = Member(ch.SUBMAP.key(name), encoded(message), message)
         self.nodes[name].take(member, name)
@@ -146,7 +140,7 @@ class Team:
                 self.send(name, other, member, now_ns)
 
     def talk(self, now_ns: int, length_ns: int) -> None:
-        """What peers have to say now, and what reaches them within the time."""
+        """Exchange the peers' due messages, and deliver those that arrive within the time."""
         for name, node in self.nodes.items():
             self.spread(name, node.tick(now_ns * 1e-9), now_ns)
         while self._way and self._way[0][0] < now_ns + length_ns:
@@ -154,7 +148,7 @@ class Team:
             self._arrive(sender, to, what, at_ns)
 
     def held(self, aims: Mapping[str, int]) -> dict[str, int]:
-        """How many of the first so many submaps of each robot each node has."""
+        """Number of the first `aims` submaps of each robot that each node has."""
         return {
             name: sum(min(node.replica.share_of((r, 1)).count, n) for r, n in aims.items())
             for name, node in self.nodes.items()
@@ -177,12 +171,11 @@ class Team:
 
     @property
     def agrees(self) -> bool:
-        """Whether all sets are one."""
+        """Whether all sets are equal."""
         return len({node.replica.digest for node in self.nodes.values()}) == 1
 
 
 def measured(topology: str, robots: int) -> dict[str, float]:
-    """Bytes per robot and second against the star, and when all agree."""
     team = Team(topology, robots)
     team.begin()
     healed_s = CUT_S[1] if topology == "partition" else DRIVE_S
@@ -204,7 +197,6 @@ def measured(topology: str, robots: int) -> dict[str, float]:
 
 
 def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
-    """Bytes per robot and second over the number of robots, a line for each topology."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -236,7 +228,6 @@ def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
 
 
 def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
-    """Measure, print, compare with the baseline; 1 where something has become dearer."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--json", type=Path)
     options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))

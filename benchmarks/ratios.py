@@ -1,14 +1,13 @@
-"""What takes seconds: parts of a robot's step against each other, in one run.
+"""Compare CPU times of parts of a robot's step, in one run of seconds.
 
     python -m benchmarks.ratios [--rounds 7] [--json FILE]
 
-in_a_run: an interval of odometry as the segmenter takes it, against composing it at once.
-improved: a step of FastSLAM 2.0 against one of 1.0, 100 particles and four known landmarks.
-innovation: the NIS of that step against the step.
-node_us: an interval of odometry at 70 Hz, decoded and taken by a robot's node [us], with its share
-of a scan every half second and of keyframes; it is the machine's and has no baseline.
-CPU time, the halves of a ratio alternate, each is the least of its rounds. Held against
-benchmarks/ratios.json; exit status 1 if one is worse.
+in_a_run: an odometry interval through the segmenter, against direct composition. improved: a step
+of FastSLAM 2.0 against one of 1.0, 100 particles and four known landmarks. innovation: the NIS of
+that step against the step. node_us: an odometry interval at 70 Hz, decoded and processed by a
+robot's node [us], with its share of a scan every half second and of keyframes; machine-dependent,
+without a baseline. Halves of a ratio alternate, each is the least of its rounds. Exit status 1 if
+one is worse than benchmarks/ratios.json allows.
 """
 
 import argparse
@@ -39,7 +38,7 @@ DRIVEN, SCANNED = 600, 33
 
 
 def least(parts: list[Callable[[], None]], rounds: int) -> list[float]:
-    """CPU seconds of each part, the least of all rounds; the parts take turns."""
+    """CPU seconds of each part, the least of all rounds; the parts alternate."""
     took = [[_cpu_s(part) for part in parts] for _ in range(rounds + 1)]
     return np.min(took[1:], axis=0).tolist()  # the first round compiles or loads
 
@@ -51,14 +50,12 @@ def _cpu_s(part: Callable[[], None]) -> float:
 
 
 def composed_at_once() -> None:
-    """Each interval's motion is made and composed by itself."""
     motion = Increment.identity()
     for _ in range(INTERVALS):
         motion = motion.then(increment_of(MOTION, INTERVAL_NS * 1e-9, 0.3, 0.1))
 
 
 def composed_in_a_run() -> None:
-    """The same intervals through the segmenter, which is asked at the end."""
     segmenter = Segmenter(MOTION, Sensor(), 0.0)
     segmenter.begin(0)
     for k in range(1, INTERVALS + 1):
@@ -98,7 +95,6 @@ def steps() -> list[Callable[[], None]]:
 
 
 def driving() -> Callable[[], None]:
-    """A robot's node takes odometry and scans."""
     front_end = FrontEnd(particles=PARTICLES, keyframe_s=0.5, window_s=10.0)
     config = RobotConfig("r1", MOTION, SENSOR, front_end)
     start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
@@ -140,7 +136,6 @@ def driving() -> Callable[[], None]:
 
 
 def measured(rounds: int) -> dict[str, float]:
-    """The ratios."""
     (node,) = least([driving()], rounds)
     at_once, in_a_run = least([composed_at_once, composed_in_a_run], rounds)
     plain, improved, judged = least(steps(), rounds)

@@ -1,11 +1,10 @@
-"""The recorder under load: is everything that was published in the log, and what does it cost?
+"""Measure the recorder's completeness and cost under load.
 
     python -m benchmarks.recorder [--robots 10] [--hz 100] [--seconds 60] [--json FILE]
 
-Real processes in real time: a router, `teamslam record`, and publishers that send each robot's
-odometry and observations at this rate. Then, per key, published = recorded, and the log is sound.
-The figures are held against benchmarks/recorder.json (what they were, which way is good, how far
-they may be off); exit status 1 if something was lost or a figure is worse.
+Real processes in real time: a router, `teamslam record`, and publishers of odometry and
+observations. Per key, published = recorded, and the log is sound. Exit status 1 if a message was
+lost or a figure is worse than benchmarks/recorder.json allows.
 """
 
 import argparse
@@ -33,14 +32,12 @@ from team.wire.zenoh.bus import ZenohBus
 
 PUBLISHERS = 2
 LANDMARKS = 5
-"""Seen in one observation."""
+"""Landmarks per observation."""
 _COMMAND = [sys.executable, "-m", "sim"]
 
 
 def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds: float) -> None:
-    """A publisher's process: each robot's measurements at its time; prints what it published by
-    key.
-    """
+    """A publisher's process: sends each robot's measurements on time; prints counts by key."""
     rng = np.random.default_rng(0)
     period_ns = round(1e9 / hz)
     counts: dict[str, int] = {}
@@ -90,14 +87,12 @@ def cpu_s(pid: int) -> float:
 
 
 def peak_mib(pid: int) -> float:
-    """The most memory that it had."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     (line,) = [line for line in lines if line.startswith("VmHWM")]
     return int(line.split()[1]) / 1024.0
 
 
 def measured(robots: int, hz: float, seconds: float, folder: Path) -> dict[str, Any]:
-    """One run; the figures."""
     scenario = with_options(load("thesis"), robots=robots)
     told = folder / "scenario.json"
     told.write_text(dumps(scenario))
@@ -173,7 +168,7 @@ def _figures(log: Path, said: list[dict[str, Any]], cpu: float, memory: float) -
 
 
 def _wait_for_recorder(bus: ZenohBus) -> None:
-    """Until the recorder says that it is there."""
+    """Wait for the recorder's status."""
     bus.subscribe(ch.STATUS)
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
@@ -183,7 +178,7 @@ def _wait_for_recorder(bus: ZenohBus) -> None:
 
 
 def _no_map() -> m.FusedMap:
-    """The message after which a recorder ends when nobody is left."""
+    """The message after which a recorder without a team ends."""
     empty = from_floats([])
     return m.FusedMap(
         stamp_ns=0,

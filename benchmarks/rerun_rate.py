@@ -1,10 +1,10 @@
-"""How fast a log is computed again, against how fast it can be read at all.
+"""Measure the rate of `rerun --verify` against plain reading of a log.
 
     python -m benchmarks.rerun_rate LOG … [--json FILE]
 
-For each log: `rerun --verify` in measurements per second and as a multiple of real time, and the
-rate at which the mcap library alone reads the same file's messages (one core each, file in the
-cache). Exit status 1 if anything differs or if five robots are computed slower than 35 × real time.
+For each log: measurements per second and multiple of real time, and the rate at which the mcap
+library alone reads the messages (one core each, file in the cache). Exit status 1 if a result
+differs or five robots are slower than 35 × real time.
 """
 
 import argparse
@@ -24,7 +24,6 @@ LEAST = 35.0
 
 
 def plain(path: Path) -> tuple[int, float]:
-    """Messages in the file and the seconds that the mcap library takes to read them."""
     began = time.process_time()
     with path.open("rb") as file:
         count = sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
@@ -32,7 +31,7 @@ def plain(path: Path) -> tuple[int, float]:
 
 
 def figures(path: Path) -> dict[str, Any]:
-    """Of one log; CPU time of this process, which is that of one core."""
+    """Figures of one log; CPU time of this process, which is that of one core."""
     log = open_log(path)
     messages, measurement_s = plain(log.path)
     began = time.process_time()

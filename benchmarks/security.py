@@ -1,14 +1,13 @@
-"""What keys and the fault boundary cost: messages per second and latency, as ratios in one run.
+"""Measure the cost of keys and of the fault boundary, as ratios in one run.
 
     python -m benchmarks.security [--messages 20000] [--rounds 5] [--json FILE]
 
-Links: a router, a publisher and a receiver, each a process with Zenoh on loopback; once open over
-TCP, once with certificates and access control over TLS, alternating. Throughput: observations of
-five landmarks, as fast as they are taken. Latency: one message there and one back, at rest.
-Boundary: a node that takes the same samples through `team.containment`, and without it; CPU time,
-the least of turns that alternate.
+Links: router, publisher and receiver, each a process with Zenoh on loopback; alternately over open
+TCP, and over TLS with access control. Throughput: observations of five landmarks at the receiver's
+rate. Latency: round trip of one message at rest. Boundary: a node with `team.containment` and
+without it; CPU time, the least of alternating turns.
 
-Only the ratios are held against benchmarks/security.json: the machine is in both of their halves.
+Only ratios have a baseline (benchmarks/security.json): both halves depend on the machine.
 """
 
 import argparse
@@ -41,7 +40,7 @@ from team.wire.zenoh.router import router
 TEAM = "bench"
 PINGS = 500
 A_TURN = 500
-"""Messages in a row with the boundary, or without: some 10 ms, so that a turn is not cut often."""
+"""Messages per turn with the boundary, or without: some 10 ms, which is seldom interrupted."""
 _HERE = [sys.executable, "-m", "benchmarks.security"]
 
 
@@ -63,7 +62,6 @@ def entered(endpoint: str, folder: Path | None, node: str) -> ZenohBus:
 
 
 def serve(folder: Path | None) -> None:
-    """The router's process: until its input ends."""
     own = folder and (credentials_of(folder, "router"), load_roster(folder))
     with router("tls/127.0.0.1:0" if folder else "tcp/127.0.0.1:0", own) as endpoint:
         print(endpoint, flush=True)
@@ -96,7 +94,7 @@ def take(endpoint: str, folder: Path | None, count: int) -> None:
 
 
 def link(folder: Path | None, count: int) -> tuple[float, float]:
-    """Messages per second, and the median time there and back [s]."""
+    """Messages per second, and median round trip [s]."""
     more = [] if folder is None else ["--keys", str(folder)]
     hub = subprocess.Popen(
         [*_HERE, "--serve", *more], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -122,7 +120,7 @@ def link(folder: Path | None, count: int) -> tuple[float, float]:
 
 
 def ping(bus: ZenohBus, stamp_ns: int) -> float:
-    """One message there and one back; sent again while the link is still coming up."""
+    """One round trip; sent again while the link is still coming up."""
     began = time.perf_counter()
     bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=stamp_ns, streams=())))
     while True:
@@ -134,7 +132,7 @@ def ping(bus: ZenohBus, stamp_ns: int) -> float:
 
 
 class Sink:
-    """A node that does nothing, so that what is around it shows."""
+    """A node that does nothing."""
 
     taken = 0
 
@@ -144,11 +142,9 @@ class Sink:
 
 
 def handling(count: int) -> tuple[float, float]:
-    """CPU seconds for each message, decoded at the door and handed to a node: without, and with the
-    boundary.
+    """CPU seconds per message, decoded and handled by a node: without, and with the boundary.
 
-    The halves take turns, some messages at a time, and the least of a half's turns counts: what
-    else the machine does is then in neither of them.
+    The least of alternating turns excludes the machine's other load.
     """
     samples = [
         Sample(ch.OBSERVATIONS.key("r1"), encoded(observations(i)), i, 0, i) for i in range(count)

@@ -1,13 +1,12 @@
-"""What the processes of a launch cost: forked from the warm template, and each from scratch.
+"""Measure the cost of a launch's processes: forked from the warm template, and from scratch.
 
     python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
 The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus; command_first_s: from the start of the command `launch`, the least of three.
-cpu_s, pss_mb, peak_rss_mb: of the processes, as in a launch's JSON. alone: router, recorder and
-robot started by hand, when they are ready and nothing comes: their resident memory, that without
-pages of files, and their CPU. Of times only ratios are held against benchmarks/start.json: the
-machine is in both halves.
+measurement on the bus; command_first_s: from the start of `launch`, the least of three. cpu_s,
+pss_mb, peak_rss_mb: as in a launch's JSON. alone: resident memory, that without pages of files, and
+CPU of a router, recorder and robot started by hand, ready and idle. Only ratios of times have a
+baseline (benchmarks/start.json): both halves depend on the machine.
 """
 
 import argparse
@@ -32,7 +31,7 @@ from team.wire.channels import SENSORS
 
 
 def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> dict[str, Any]:
-    """What one launch took."""
+    """Figures of one launch."""
     folder.mkdir()
     plan = Plan(
         scenario=scenario,
@@ -58,12 +57,10 @@ def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> 
 
 
 def first_ns(log: Path) -> int:
-    """When the first measurement of a log was published, by the wall clock."""
     return min(sample.wall_ns for sample in open_log(log).samples(SENSORS))
 
 
 def command_first_s(words: list[str], folder: Path) -> float:
-    """Time [s] from the start of `teamslam launch` to the first measurement."""
     began_ns = time.time_ns()
     command = [*PROGRAM, "launch", *words, "--no-views", "--no-report", "--output", str(folder)]
     subprocess.run(command, check=True, capture_output=True)
@@ -71,7 +68,7 @@ def command_first_s(words: list[str], folder: Path) -> float:
 
 
 def alone(folder: Path) -> dict[str, dict[str, float]]:
-    """The resources of a router, a recorder and a robot, each started by hand, ready and idle."""
+    """Resources of a router, a recorder and a robot, ready and idle."""
     folder.mkdir()
     log = str(folder / "log.mcap")
     words = {
@@ -99,13 +96,12 @@ def alone(folder: Path) -> dict[str, dict[str, float]]:
 
 
 def said(process: "subprocess.Popen[str]", words: str) -> str:
-    """The line with these words of what a process says."""
     assert process.stdout is not None
     return next(line for line in process.stdout if words in line)
 
 
 def settled(pid: int) -> dict[str, float]:
-    """The memory and the CPU of a process at rest: a tenth of a core at most, for a second."""
+    """Memory and CPU of a process at rest: at most a tenth of a core for a second."""
     ticks = [-100]
     while ticks[-1] - ticks[0] > 10 or len(ticks) < 2:
         time.sleep(1.0)
@@ -118,7 +114,7 @@ def settled(pid: int) -> dict[str, float]:
 
 
 def bare_cpu_s() -> float:
-    """The least CPU of three starts of Python with NumPy."""
+    """Least CPU of three starts of Python with NumPy."""
     took = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -129,7 +125,7 @@ def bare_cpu_s() -> float:
 
 
 def bare_s() -> float:
-    """The least wall time of three starts of Python with NumPy."""
+    """Least wall time of three starts of Python with NumPy."""
     took = []
     for _ in range(3):
         began = time.monotonic()
@@ -141,7 +137,7 @@ def bare_s() -> float:
 def measured(scenario: Scenario, words: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         pair = (scenario.estimator, scenario.fusion)
-        launched(scenario, Path(folder) / "first", pair)  # compiles what is not compiled
+        launched(scenario, Path(folder) / "first", pair)  # compiles what is not compiled yet
         forked = launched(scenario, Path(folder) / "forked", pair)
         scratch = launched(scenario, Path(folder) / "scratch", None)
         first_s = min(command_first_s(words, Path(folder) / f"command-{k}") for k in range(3))

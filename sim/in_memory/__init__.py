@@ -1,1 +1,1 @@
-"""A whole team in one process, and simulated links for its messages."""
+"""A whole team in one process, with simulated links."""

@@ -1,6 +1,4 @@
-"""A simulated radio in team time, seeded: who reaches whom, delay, loss, duplicates, and the
-capacity of each link.
-"""
+"""A seeded, simulated radio in team time: reach, delay, loss, duplicates, and link capacity."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,13 +14,13 @@ Reach = Callable[[str, str, int], bool]
 
 
 def always(one: str, other: str, now_ns: int) -> bool:
-    """Every node reaches every other."""
+    """Reach between all nodes."""
     return True
 
 
 @dataclass(frozen=True)
 class Meeting:
-    """These nodes reach each other from begin_ns until end_ns, whatever their distance."""
+    """Nodes that reach each other from begin_ns until end_ns at any distance."""
 
     nodes: frozenset[str]
     begin_ns: int
@@ -52,7 +50,7 @@ def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
 
 
 def meetings(windows: Sequence[Meeting]) -> Reach:
-    """Reach in the given windows only, between the nodes that they name."""
+    """Reach within the given meetings only."""
 
     def reach(one: str, other: str, now_ns: int) -> bool:
         return any(
@@ -64,8 +62,8 @@ def meetings(windows: Sequence[Meeting]) -> Reach:
 
 @dataclass
 class Air:
-    """loss, duplicates: probabilities per message. delay_ns: the least and the greatest; messages
-    overtake each other. bytes_per_s: of each link; None: no limit.
+    """loss, duplicates: probabilities per message. delay_ns: least and greatest; messages overtake.
+    bytes_per_s: per link.
     """
 
     reach: Reach = always
@@ -79,7 +77,7 @@ class Air:
     _number: int = 0
 
     def arrivals(self, sender: str, to: str, size: int, now_ns: int) -> list[int]:
-        """The arrival times of a message: none if it is lost, two if it is duplicated."""
+        """Arrival times of a message: none if lost, two if duplicated."""
         if not self.reach(sender, to, now_ns):
             return []
         self.sent[sender, to] = self.sent.get((sender, to), 0) + size

@@ -1,7 +1,7 @@
 """Simulated links in team time: delay, loss, partitions, a centre that dies.
 
-No submap is lost for good: with the delivery mode `all` it is sent again. So under the rule `join`
-none of this can change the final map (law 2), only the maps before it.
+Under the delivery `all` a lost submap is sent again. So under the rule `join` none of this can
+change the final map (law 2).
 """
 
 import heapq
@@ -15,7 +15,7 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
 
 RESEND_NS = 1_000_000_000
-"""A lost submap is sent again after this time, as often as needed."""
+"""A lost submap is sent again after this time."""
 PATIENCE_NS = 3_000_000_000
 """Time after which the centre considers a robot lost."""
 _FROM_ROBOTS = (ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
@@ -23,7 +23,7 @@ _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Delivers the messages to a node at their arrival times; at equal times liveliness tokens come
+    """Deliver messages to a node at their arrival times; at equal times liveliness tokens come
     first.
     """
 
@@ -33,12 +33,12 @@ class Link:
         self._sent = 0
 
     def say(self, at_ns: int, message: m.Liveliness) -> None:
-        """Let the node notice at this time that another one left or came back."""
+        """Deliver a node's liveliness token at this time."""
         sample = Sample(ch.ALIVE.key(message.node), encoded(message), 0, 0, 0)
         self._hold(at_ns, sample, sent=False)
 
     def arrived(self, samples: Sequence[Sample], now_ns: int) -> list[Sample]:
-        """The messages that have arrived by now, given what was sent since the last call."""
+        """Messages that have arrived by now, given those sent since the last call."""
         if self._arrival_ns is None:
             return list(samples)
         for sample in samples:
@@ -54,13 +54,13 @@ class Link:
 
     @property
     def next_ns(self) -> int | None:
-        """Arrival time of the next message that is on its way."""
+        """Arrival time of the next message in flight."""
         return self._in_flight[0][0] if self._in_flight else None
 
 
 @dataclass(frozen=True)
 class Partition:
-    """These robots and the centre do not reach one another from begin_ns until end_ns."""
+    """These robots and the centre do not reach each other from begin_ns until end_ns."""
 
     robots: frozenset[str]
     begin_ns: int
@@ -69,11 +69,11 @@ class Partition:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions of a team's links.
+    """Conditions of a team's links.
 
-    loss: the probability that a submap's transmission to the centre is lost. delay_ns: of submaps
-    to the centre. down_ns: from when until when there is no centre; the next centre starts empty
-    and requests everything from the robots.
+    loss: probability per transmission of a submap to the centre. delay_ns: of submaps to the
+    centre. down_ns: interval without a centre; the next one starts empty and requests everything
+    from the robots.
     """
 
     delay_ns: int = 0
@@ -92,7 +92,7 @@ class Conditions:
         return 0 if self.down_ns is None else self.down_ns[1]
 
     def to_centre(self, robots: Sequence[str]) -> Link:
-        """The link by which the robots reach the centre."""
+        """The robots' link to the centre."""
         if not (self.delay_ns or self.loss or self.partitions):
             return Link()
         link = Link(self._arrival_at_centre)
@@ -106,7 +106,7 @@ class Conditions:
         return link
 
     def to_robot(self, robot: str) -> Link:
-        """The link by which the centre reaches a robot."""
+        """The centre's link to a robot."""
         cuts = [cut for _, cut in self._cuts([robot])]
         if not cuts:
             return Link()

@@ -1,4 +1,4 @@
-"""A team without a centre in one process: the nodes of real peers, a simulated radio, team time.
+"""A team without a centre in one process: real peer nodes, a simulated radio, team time.
 
 The world reaches every robot, as its own sensors do; robots reach each other as `Air` determines.
 """
@@ -26,20 +26,20 @@ from team.wire.codec import encoded
 from team.wire.digest import configured
 
 AFTER_S = 3600.0
-"""Team time [s] after the streams' end at which peers that lack something give up."""
+"""Team time [s] after the streams' end at which incomplete peers give up."""
 Make = Callable[[Scenario, RobotConfig], PeerRobot]
 
 
 def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
-    """A robot of a scenario that is its own centre."""
+    """Make a robot of a scenario without a centre."""
     names = [each.id for each in scenario.robots]
     return PeerRobot(config, scenario.central, names, scenario.exchange)
 
 
 @dataclass
 class _Seat:
-    """listens, overhears: names of the channels that its node subscribes to under its own name (a
-    centre under any), and under every name.
+    """listens, overhears: channels of its subscriptions under its own name (a centre: any), and
+    under every name.
     """
 
     node: PeerRobot | PeerCentre
@@ -55,10 +55,9 @@ class _Seat:
 
 
 class PeerTeam:
-    """Peers in a world, and the radio between them; `run` yields what a recorder would record.
+    """Peers in a world, and the radio between them; `run` yields a recorder's samples.
 
-    seats: by robot, and that of a centre if there is one. complete_ns: team time at which each
-    robot had its final map.
+    seats: robots and centre by name. complete_ns: team time of each robot's final map.
     """
 
     def __init__(self, scenario: Scenario, air: Air, make: Make = peer_of) -> None:
@@ -82,7 +81,7 @@ class PeerTeam:
         self.seats[config.id] = _Seat(node, Boundary(node.name))
 
     def seat_centre(self, restored: Iterable[Member] = ()) -> None:
-        """Add a centre, one more peer, with the set that it has stored on disk."""
+        """Add a centre, one more peer, with its set from disk."""
         names = [each.id for each in self.scenario.robots]
         seat = _Seat(PeerCentre(self.scenario.central, names), Boundary(CENTRE))
         seat.node.keep(restored)
@@ -91,7 +90,7 @@ class PeerTeam:
         self._catch_up(CENTRE, seat)
 
     def leave(self, name: str) -> list[Member]:
-        """Remove a robot or the centre; returns the set that it had stored."""
+        """Remove a robot or the centre; returns its stored set."""
         seat = self.seats.pop(name)
         for other in self.seats.values():
             other.reached.discard(name)
@@ -100,10 +99,10 @@ class PeerTeam:
     def run(
         self, world: World, steps: Callable[["PeerTeam"], None] | None = None
     ) -> Iterator[Sample]:
-        """Run until all peers have the same final map and nothing is on its way; yields the
+        """Run until all peers have the same final map and no message is in flight; yields the
         messages.
 
-        steps: called once a round; it may remove and add peers.
+        steps: called every round; may remove and add peers.
         """
         self._world, self._world_boundary = world, Boundary("world")
         self._source(world.begin())
@@ -136,9 +135,7 @@ class PeerTeam:
         self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
 
     def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
-        """Start a robot again after its death, with the set that it had stored; it requests the
-        measurements after those from its source.
-        """
+        """Restart a robot with its stored set; it requests later measurements."""
         world = self._world
         assert isinstance(world, WorldNode)
         self.seat(config)
@@ -165,8 +162,6 @@ class PeerTeam:
         seat = self.seats[name]
         self._say(name, seat.boundary.take(seat.node, sample))
 
-    # The world.
-
     def _source(self, outgoing: Sequence[Outgoing]) -> None:
         for each in outgoing:
             sample = self._sample(each)
@@ -183,9 +178,7 @@ class PeerTeam:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _catch_up(self, robot: str, seat: _Seat) -> None:
-        """Give a node that joins the last of the world's messages, such as the end of the
-        streams.
-        """
+        """Send a new node the world's last messages."""
         for channel, sample in self._latest.values():
             if channel.name in seat.listens:
                 self._say(robot, seat.boundary.take(seat.node, sample))
@@ -194,12 +187,8 @@ class PeerTeam:
         sample = self._sample(out)
         self._world_boundary.take(self._world, sample)
 
-    # The air.
-
     def _say(self, robot: str, outgoing: Sequence[Outgoing]) -> None:
-        """Deliver a robot's messages to the world, and to others as far as the radio
-        carries them.
-        """
+        """Deliver a robot's messages to the world, and to others in radio reach."""
         for out in outgoing:
             if out.channel is ch.MEMBERS:
                 request = Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
@@ -237,7 +226,7 @@ class PeerTeam:
             self._say(to, seat.boundary.take(seat.node, sample))
 
     def _see(self) -> None:
-        """Tell every node which others have come into reach or left it."""
+        """Deliver liveliness of nodes that came into reach or left it."""
         for robot, seat in self.seats.items():
             for other in self.seats:
                 if other == robot:
@@ -252,7 +241,7 @@ class PeerTeam:
 
     @property
     def _agree(self) -> bool:
-        """Whether all have a final map and the same set, and nothing is on its way."""
+        """Whether all have a final map and the same set, and no message is in flight."""
         finals = [seat.node.final for seat in self.seats.values()]
         if len(self.seats) < len(self.scenario.robots):
             return False

@@ -21,12 +21,12 @@ from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from team.wire.digest import configured
 
 ROUND_S = 1.0
-"""Team time [s] of one round: every robot gets its measurements of a round before the next, so that
-none is windows ahead of its teammates' messages, as in real time.
+"""Team time [s] of one round, which keeps robots within a window of each other's messages, as in
+real time.
 """
 
 SHARED = 16
-"""Number of the last samples whose messages are kept for their other receivers."""
+"""Number of recent samples whose decoded messages are cached for other receivers."""
 
 
 @runtime_checkable
@@ -35,20 +35,20 @@ class World(Protocol):
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
-        """The channels that it subscribes to."""
+        """Subscribed channels."""
 
     @property
     def now_ns(self) -> int:
         """Team time: the stamp up to which it has published."""
 
     def begin(self) -> list[Outgoing]:
-        """Its first messages."""
+        """First messages."""
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next measurements; nothing when it waits or has ended."""
+        """Next measurements; none while it waits or after its end."""
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take one message."""
+        """Handle one message."""
 
 
 @dataclass
@@ -77,7 +77,7 @@ class _Seat:
 
 @lru_cache(maxsize=SHARED)
 def _opened(sample: Sample) -> m.Message:
-    """The message of a sample, which nobody changes: opened once for all that receive it."""
+    """Decode a sample once for all its receivers, which do not change it."""
     return opened(sample)[2]
 
 
@@ -87,9 +87,7 @@ def run_team(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
-    """Run the team to its final map; returns the samples that a recorder would record, in its
-    order.
-    """
+    """Run the team to its final map; yields a recorder's samples, in order."""
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
     announced = configured("world", 0, 0, scenario)
     world = WorldNode(
@@ -105,9 +103,9 @@ def run_nodes(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
-    """Run the scenario's robots and centre in a world until no message is on its way.
+    """Run the scenario's robots and centre in a world until no message is in flight.
 
-    conditions: of the links and the centre; None: every message arrives at once.
+    conditions: of links and centre; None: messages arrive at once.
     """
     conditions = Conditions() if conditions is None else conditions
     network = MemoryNetwork()
@@ -151,7 +149,7 @@ def run_nodes(
         coming += [] if up else [conditions.centre_back_ns]
         if not coming:
             return
-        now_ns = min(coming)  # the world has nothing more to say: time goes on to what comes next
+        now_ns = min(coming)  # the world has ended or waits: advance to the next arrival
 
 
 def _enter(seat: _Seat, token: str) -> None:

@@ -1,1 +1,1 @@
-"""A recorded run as a world again: its streams, a data set of them, a run with changes."""
+"""A recorded run as a world: its streams, a data set of them, a run with changes."""

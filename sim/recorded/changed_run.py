@@ -1,4 +1,4 @@
-"""Runs the recorded team's nodes again in memory, on the same measurements with changes."""
+"""Run the recorded team's nodes in memory, on the same measurements with changes."""
 
 import msgspec
 
@@ -16,10 +16,9 @@ from team.wire.bus import Sample
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
-    """The samples of the changed run, as a recorder would record them.
+    """Samples of the changed run, as of a recorder.
 
-    Raises ScenarioError for a change that has no meaning, RerunError for a log that lacks
-    measurements.
+    Raises ScenarioError for a meaningless change, RerunError for missing measurements.
     """
     world = RecordedWorld(log, changes.without)
     scenario = changed_scenario(world.scenario, changes)

@@ -1,4 +1,4 @@
-"""The changes of a run that is computed again."""
+"""Changes of a recomputed run."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """The changes; the measurements are the log's in any case.
+    """Changes of a run on the log's measurements.
 
-    without: robots that are left out. seed: of the estimators and of the losses. loss, delay_s: of
-    submaps on their way to the centre. no_centre: the times without a centre. partitions: robots
-    that the centre can not reach, and when. unsafe_feedback: see `unsafe_robot`. noise: factors on
-    the standard deviations that the robots assume, by kind (`sim.recorded.noise`).
+    without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
+    centre. no_centre: time without a centre. partitions: robots that the centre cannot reach, and
+    when. unsafe_feedback: see `unsafe_robot`. noise: factors on assumed standard deviations, by
+    kind (`sim.recorded.noise`).
     """
 
     without: tuple[str, ...] = ()

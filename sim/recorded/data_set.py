@@ -1,4 +1,4 @@
-"""Runs a team on a data set in memory; the run is read as its log would be."""
+"""Run a team on a data set in memory; the run is read like a log."""
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -13,7 +13,7 @@ from team.wire.channels import Channel, channel_of
 
 
 class DataSetRun:
-    """All messages of the team on a data set, with the data set's own scenario.
+    """All messages of a team on a data set, with the data set's own scenario.
 
     Raises DatasetError, ScenarioError.
     """
@@ -24,7 +24,7 @@ class DataSetRun:
         self._samples = list(run_team(scenario, streams_of(scenario)))
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
-        """The samples of these channels; None: of all."""
+        """Samples of these channels; None: all."""
         for sample in self._samples:
             found = channel_of(sample.key)
             if channels is None or (found is not None and found[0] in channels):

@@ -1,4 +1,4 @@
-"""Odometry and scans of a log in the forms in which they were measured; a stream may mix forms."""
+"""Odometry and scans of a log in their measured forms; a stream may mix forms."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,11 +21,11 @@ FORM_NAMES = {
     m.Points: "points",
     m.Detections: "detections without identities",
 }
-"""The forms of measurements, in words."""
+"""Names of the forms of measurements."""
 
 
 def forms_of(messages: Sequence[m.Measurement]) -> str:
-    """The forms of these messages with their counts, where they are of several; else nothing."""
+    """The forms of these messages with their counts if there are several; else ""."""
     kinds = [type(each) for each in messages]
     counts = {kind: kinds.count(kind) for kind in FORM_NAMES if kind in kinds}
     if len(counts) < 2:
@@ -34,9 +34,9 @@ def forms_of(messages: Sequence[m.Measurement]) -> str:
 
 
 def intervals_of(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: float) -> Intervals:
-    """The intervals, each in its own form; raises ValueError where speeds are of two kinds.
+    """Intervals in their own forms; raises ValueError where speeds are of two kinds.
 
-    clock_offset_s: the offset of the odometry's clock [s] that is corrected.
+    clock_offset_s: corrected offset of the odometry's clock [s].
     """
     ends = [translate.team_time_of(each, clock_offset_s) for each in odometry]
     speeds = np.zeros((len(odometry), 2))
@@ -70,7 +70,7 @@ def intervals_of(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: 
 def landmarks_of(
     messages: Sequence[m.AnyScan | m.Detections], labels: m.TruthLabels | None
 ) -> Detections:
-    """The scans, message by message, with names and without; labels: of those without."""
+    """Scans, message by message, with and without identities; labels: for those without."""
     named = [each for each in messages if not isinstance(each, m.Detections)]
     unnamed = [each for each in messages if isinstance(each, m.Detections) and each.ranges]
     seen = _scans(named, [translate.scan_of(each) for each in named])
@@ -97,7 +97,6 @@ def landmarks_of(
 
 
 def _by_time(labels: m.TruthLabels) -> Mapping[int, UInt32[np.ndarray, " R"]]:
-    """The labels of each scan by its stamp."""
     ends = np.cumsum(ids(labels.counts, "counts").astype(np.int64))
     parts = np.split(ids(labels.labels, "labels").astype(np.uint32), ends[:-1])
     return dict(zip(stamps(labels.stamps, "stamps").tolist(), parts, strict=True))

@@ -1,4 +1,4 @@
-"""Robots that assume more or less noise of their odometry or sensor than the log's did."""
+"""Scale the noise that robots assume for their odometry or sensor."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -15,11 +15,11 @@ KINDS: Mapping[str, str] = MappingProxyType(
         "bearing": "the bearing's standard deviation",
     }
 )
-"""The kinds of noise, and the parameters that are multiplied."""
+"""Kinds of noise, and the scaled parameters."""
 
 
 def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
-    """The robot with its standard deviations times the factor of their kind (see KINDS)."""
+    """Scale the robot's standard deviations by the factor of their kind (see KINDS)."""
     motion = _motion(robot.motion, factors.get("odometry", 1.0))
     by_range = factors.get("range", 1.0)
     sensor: Sensor = msgspec.structs.replace(
@@ -32,9 +32,7 @@ def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
 
 
 def _motion(motion: MotionModel, factor: float) -> MotionModel:
-    """The motion model with its noise multiplied: the α are variances, all else is a standard
-    deviation.
-    """
+    """Scale the motion noise: the α are variances, all else is a standard deviation."""
 
     def scaled(noise: MotionNoise) -> MotionNoise:
         return MotionNoise(noise.per_s * factor, noise.per_m * factor, noise.per_rad * factor)

@@ -1,4 +1,4 @@
-"""The measurement streams of a log, as a world has them."""
+"""Measurement streams of a log, as of a world."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,9 +28,9 @@ PART = "`teamslam log cut LOG --from S --to S -o PART.mcap` makes a log of a par
 
 
 def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
-    """The measurements of a log with its scenario: its world's, or the recorder's.
+    """Measurements of a log with its scenario: its world's, or the recorder's.
 
-    Of each robot the first incarnation is used. Raises LogError, ScenarioError.
+    Uses the first incarnation of each robot. Raises LogError, ScenarioError.
     """
     log = open_log(path)
     messages = [opened(sample)[2] for sample in log.samples(CHANNELS)]
@@ -38,7 +38,7 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
     by_recorder = log.metadata.get("scenario")  # of a team without a world
     configurations = configurations or ([] if by_recorder is None else [by_recorder])
     if not configurations:
-        raise ScenarioError(f"{path}: the log does not say the world's scenario")
+        raise ScenarioError(f"{path}: the log has no scenario of its world")
     scenario = loads(configurations[-1])
     clocks = {robot.id: robot.clock_offset_s for robot in scenario.robots}
     try:
@@ -50,9 +50,9 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
 def recorded_streams(
     messages: Sequence[m.Message], source: str, clocks: Mapping[str, float] | None = None
 ) -> WorldStreams:
-    """The streams of the measurements among these messages.
+    """Streams of the measurements among these messages.
 
-    clocks: the offset of each robot's odometry clock [s] that is corrected; absent: none.
+    clocks: corrected offset of each robot's odometry clock [s]; absent: none.
     """
     offsets = {} if clocks is None else clocks
     measurements: dict[str, dict[int, m.Measurement]] = {}

@@ -1,4 +1,4 @@
-"""Demonstrates a violation of law 1: a robot that sends the team's map as its own information."""
+"""Demonstrate a violation of law 1: a robot that sends the team's map as its own information."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,9 +19,8 @@ from team.wire.arrays import check_packed_covariance
 def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
     """A robot whose submaps begin with the team's map instead of with zero information.
 
-    The map contains the robot's earlier measurements, and everyone's; each submap sends them again,
-    so they are counted again with every exchange. The mean hardly moves; the covariance loses its
-    meaning. For demonstration only: no scenario can choose it.
+    The map contains everyone's earlier measurements; each exchange counts them again. The mean
+    hardly moves; the covariance loses its meaning. No scenario can choose it.
     """
     return RobotNode(config, exchange, replaced=_with_the_map)
 
@@ -33,7 +32,7 @@ def _with_the_map(
         return closed
     pending = submaps[max(prior.sequence + 1, 0) :]
     fed = _fed(translate.prior_of(prior), pending, closed.local)
-    return replace(closed, local=fed, sightings=())  # of its pose nodes none is left
+    return replace(closed, local=fed, sightings=())  # its pose nodes are gone
 
 
 def _fed(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:

@@ -1,4 +1,4 @@
-"""A log written as a data set in the UTIAS MRCLAM format."""
+"""Export a log as a data set in the UTIAS MRCLAM format."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +16,10 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 
 
 def export_utias(log: Log, folder: Path) -> list[str]:
-    """Write the data set into `folder`; the robots in the order of their numbers 1, 2, …
+    """Write the data set into `folder`, robots in the order of their numbers 1, 2, …
 
-    The format has one stream per robot: the first incarnation of each is written. Raises `LogError`
-    for a log that has no measurements, or not those that the format needs.
+    The format has one stream per robot: each one's first incarnation. Raises `LogError` for missing
+    measurements.
     """
     messages = list(_sound(log))
     measurements = [each for each in messages if isinstance(each, m.Measurement)]
@@ -30,7 +30,9 @@ def export_utias(log: Log, folder: Path) -> list[str]:
         )
     sighted = {n for each in measurements if isinstance(each, m.Sightings) for n in each.teammates}
     if sighted - robots:
-        what = f"it sights {', '.join(sorted(sighted - robots))}, of whom it has no measurements"
+        what = (
+            f"it has sightings of {', '.join(sorted(sighted - robots))} but not their measurements"
+        )
         raise LogError(log.path, what, "`teamslam log merge` puts the robots' logs together")
     try:
         world = recorded_streams(messages, log.path.name)
@@ -52,4 +54,4 @@ def _sound(log: Log) -> Iterator[m.Message]:
         try:
             yield opened(sample)[2]
         except WireError:
-            continue  # no node would have let it in either; `teamslam log check` counts it
+            continue  # every node rejects it, too; `teamslam log check` counts it

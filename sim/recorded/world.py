@@ -1,4 +1,4 @@
-"""A world from a log: its measurements and its truth again, second by second of team time."""
+"""A world from a log: its measurements and its truth, second by second of team time."""
 
 from collections import deque
 from collections.abc import Collection, Iterable
@@ -17,7 +17,7 @@ from team.wire.codec import WireError
 from team.wire.digest import configured
 
 STEP_NS = 1_000_000_000
-"""Team time between two looks at the nodes' answers."""
+"""Team time between two checks of the nodes' answers."""
 _TRUTH = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
 _SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.END)
 
@@ -27,11 +27,11 @@ class Samples(Protocol):
     """A source of a run's samples: a log, or a run in memory."""
 
     def samples(self, channels: Collection[ch.Channel] | None = None) -> Iterable[Sample]:
-        """The samples of these channels; None: of all."""
+        """Samples of these channels; None: all."""
 
 
 def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measurement:
-    """The measurement of a team that never had these robots: a sighting of them is left out."""
+    """Remove sightings of these robots from a measurement."""
     if not isinstance(measurement, m.Sightings) or not {*measurement.teammates} & {*robots}:
         return measurement
     kept = [k for k, teammate in enumerate(measurement.teammates) if teammate not in robots]
@@ -44,10 +44,10 @@ def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measureme
 
 
 class RecordedWorld:
-    """The messages of a log's world, for some of its robots, in the order of team time.
+    """Messages of a log's world, for some of its robots, in the order of team time.
 
-    Each robot's measurements come in the order of their counters. Raises RerunError where one is
-    not in the log, since no robot could continue after it.
+    Each robot's measurements come in order. Raises RerunError for a missing one, after which no
+    robot could continue.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
@@ -93,15 +93,13 @@ class RecordedWorld:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of the recorded run; raises RerunError, ScenarioError."""
+        """Scenario of the recorded run; raises RerunError, ScenarioError."""
         if self._configured is None:
             raise RerunError("the log has no scenario: its world was not recorded")
         return loads(self._configured.configuration)
 
     def announce(self, scenario: Scenario) -> None:
-        """Set the scenario for `begin`; raises RerunError if it needs a map that is not in
-        the log.
-        """
+        """Set the scenario for `begin`; raises RerunError if its known map is not in the log."""
         if scenario.estimator in NEEDS_MAP:
             truth = [o.message for o in self._outgoing if isinstance(o.message, m.TruthLandmarks)]
             if not truth:
@@ -116,13 +114,13 @@ class RecordedWorld:
         self._outgoing.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
 
     def begin(self) -> list[Outgoing]:
-        """The first messages: the scenario, the true landmarks for the evaluator, and the known map
-        if robots only localise themselves.
+        """First messages: scenario, true landmarks, and the known map of robots that only
+        localise.
         """
         return self._outgoing
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next STEP_NS of team time; with the last of them the end."""
+        """The next STEP_NS of team time; the last of them with the end."""
         if self._ended:
             return []
         until_ns = self.now_ns + STEP_NS
@@ -141,14 +139,12 @@ class RecordedWorld:
         return out or self.publish(clock_s)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Ignore a message: the measurements of a log do not depend on it."""
+        """Ignore a message: a log's measurements do not depend on it."""
         return []
 
 
 def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...]:
-    """The last incarnation of every robot and its count; raises RerunError for a gap in any
-    incarnation.
-    """
+    """The last incarnation of every robot and its count; raises RerunError for a gap in any."""
     counts: dict[tuple[str, int], int] = {}
     for robot, incarnation, measurement in sorted(published):
         if measurement != counts.setdefault((robot, incarnation), 0):

@@ -1,4 +1,4 @@
-"""Batch MAP over all measurements of a team: what `team.batch_map` computes."""
+"""Batch MAP over all measurements of a team, for `team.batch_map`."""
 
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest

@@ -11,8 +11,8 @@ from sim.cli.options import FAILED, fail, warn_of_holes
 Noise = Annotated[
     Literal["white", "profile"],
     typer.Option(
-        help="white: each measurement's error is its own, no inter-robot measurements; profile: "
-        "the scenario's errors that persist, biases, and inter-robot measurements."
+        help="white: independent errors, no inter-robot measurements; profile: the scenario's "
+        "persistent errors, biases, and inter-robot measurements."
     ),
 ]
 Source = Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")]
@@ -27,7 +27,9 @@ def batch_reference(
     json_file: JsonFile = None,
     g2o: Annotated[
         Path | None,
-        typer.Option(help="Write the problem for other optimisers here, and solve nothing."),
+        typer.Option(
+            help="Write the problem to this file for other optimisers, without solving it."
+        ),
     ] = None,
 ) -> None:
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""

@@ -1,4 +1,4 @@
-"""The commands that the studies add to `teamslam`."""
+"""Commands that the studies add to `teamslam`."""
 
 import typer
 

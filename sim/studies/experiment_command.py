@@ -1,4 +1,4 @@
-"""The commands `teamslam experiment NAME`: one for each of the catalogue, and `all`."""
+"""The commands `teamslam experiment NAME`: one per entry of the catalogue, and `all`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,6 @@ app = typer.Typer(
 
 FOLDER = Path("runs") / "experiments"
 FILE_WIDTH = 120
-"""Columns of the tables where they are not shown in a terminal."""
 MOST_SEEDS = 100_000
 ALL = "all"
 Seeds = Annotated[
@@ -31,15 +30,13 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures
 Output = Annotated[
     Path,
     typer.Option(
-        "--output", "-o", help="Folder of results and pictures; the same one again goes on."
+        "--output", "-o", help="Folder of results and pictures; stored results are reused."
     ),
 ]
 Jobs = Annotated[int | None, typer.Option(help="Processes; default: one per core.", min=1)]
 Scheduler = Annotated[
     str | None,
-    typer.Option(
-        help="Send the runs to a Dask scheduler, a cluster's too.", metavar="tcp://HOST:PORT"
-    ),
+    typer.Option(help="Compute the runs on a Dask scheduler's workers.", metavar="tcp://HOST:PORT"),
 ]
 Datasets = Annotated[
     list[Path] | None,
@@ -50,8 +47,6 @@ Check = Annotated[bool, typer.Option("--check", help="Exit status 1 if a goal is
 
 
 def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
-    """One command for these experiments."""
-
     def run(
         seeds: Seeds = None,
         first: First = 1,
@@ -84,7 +79,7 @@ def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Asked:
-    """The options of a command, but for its seeds."""
+    """Options of a command, except its seeds."""
 
     json_file: Path | None
     output: Path
@@ -129,7 +124,7 @@ def _run(
         fail(str(error), WRONG_USE)
     except KeyboardInterrupt:
         fail(
-            f"interrupted; what was computed is kept in {asked.output}: run it again to go on",
+            f"interrupted; results so far are in {asked.output}: repeat the command to continue",
             FAILED,
         )
     origin = provenance()
@@ -143,7 +138,7 @@ def _run(
         contents = {each.entry.name: to_json(each, origin) for each in concluded}
         content = contents if name == ALL else contents[name]
         asked.json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
-    typer.echo(f"{page}: all of it with its pictures; JSON and PNG beside it")
+    typer.echo(f"{page}: results with pictures; JSON and PNG files beside it")
     failed = sum(len(each.failed) for each in concluded)
     if failed:
         fail(f"{failed} runs failed; {asked.output / FAILURES} has their tracebacks", FAILED)
@@ -154,4 +149,4 @@ def _run(
 
 for _entry in ENTRIES:
     _command(_entry.name, _entry.summary, [_entry])
-_command(ALL, "All of them, as one page that can be browsed.", ENTRIES)
+_command(ALL, "All experiments, on one page.", ENTRIES)

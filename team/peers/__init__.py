@@ -1,1 +1,1 @@
-"""The team's set of members at each peer: contents, exchange between peers, and file."""
+"""The team's set of members at each peer: contents, exchange and file."""

@@ -1,4 +1,4 @@
-"""The requests of one peer to another, given the other's summary, and their answers."""
+"""Requests between peers, given the other's summary, and their answers."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
@@ -17,25 +17,23 @@ from team.store import Stream
 from team.wire import messages as m
 
 MOST_REQUESTED = 64
-"""Most intervals in one request."""
+"""Most intervals per request."""
 MOST_ASKED = 512
-"""Most submaps in one request."""
+"""Most submaps per request."""
 ANSWER_BYTES = 1 * 2**20
-"""Most bytes of members in one answer, except for a single member that is larger; the rest takes
-a further request."""
+"""Most bytes of members per answer, unless a single member is larger."""
 BATCH_BYTES = 64 * 2**10
-"""Bytes of members in one message of an answer."""
+"""Bytes of members per message of an answer."""
 
 
 def make_request(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
-    """The request for the members that the summary's node has and this replica lacks; None where
-    there are none.
+    """Request the members of the summary's node that this replica lacks; None where there are none.
 
-    not_now: (stream, sequence) that were requested from another peer a moment ago. A stream of
-    which both have the same sequences with different digests is requested whole: its robot has
-    contradicted itself, and all peers keep the smaller of two members.
+    not_now: (stream, sequence) requested recently from another peer. A stream with equal sequences
+    and different digests is requested whole: its robot has contradicted itself, and all peers keep
+    the smaller of two members.
     """
     if summary.digest == replica.digest:
         return None
@@ -86,7 +84,7 @@ def make_request(
 
 
 def is_oversized(replica: Replica, summary: m.SetSummary) -> bool:
-    """Whether a summary names more than any peer of this team can have."""
+    """Whether a summary exceeds the bounds of this team's set."""
     return (
         len(summary.holdings) > MOST_STREAMS * len(replica.robots)
         or len(summary.statements) > len(replica.robots)
@@ -95,7 +93,7 @@ def is_oversized(replica: Replica, summary: m.SetSummary) -> bool:
 
 
 def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
-    """The (stream, sequence) of a request, as `not_now` takes them."""
+    """The (stream, sequence) of a request, as in `not_now`."""
     for each in request.requested:
         stream = each.robot, each.incarnation
         yield stream, -2
@@ -106,9 +104,7 @@ def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
 
 
 def _contradicts(replica: Replica, holding: m.Holding) -> bool:
-    """Whether a node's members of a stream differ from the replica's although their sequences
-    are equal.
-    """
+    """Whether members of a stream differ although their sequences are equal."""
     stream = holding.robot, holding.incarnation
     mine = replica.announced_of(stream)
     same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)
@@ -122,7 +118,7 @@ Sign = Callable[[Member], bytes]
 def make_answer(
     replica: Replica, request: m.MembersRequest, node: str, sign: Sign | None = None
 ) -> list[m.Members]:
-    """The requested members that are here, in portions; the statements first.
+    """Answer a request in batches, statements first.
 
     sign: where there are keys; members without a signature yet are left out.
     """

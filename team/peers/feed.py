@@ -1,4 +1,4 @@
-"""The order of members for a fold: orders, streams by time, `Done`, robots given up."""
+"""Order of members for a fold: orders, streams by time, `Done`, robots given up."""
 
 from collections.abc import Iterator
 
@@ -8,21 +8,21 @@ from team.wire import messages as m
 
 
 def feed_order(message: m.Message) -> int:
-    """Where a statement is given to a fold: before the streams (negative) or after them."""
+    """Rank of a statement in a fold's input: before the streams (negative) or after them."""
     match message:
         case m.Withdrawal() | m.Verdict():
             return -1
-        case m.GivenUp():  # whose stream has ended all the same is not lost
+        case m.GivenUp():  # a given-up robot whose stream has ended is complete
             return 2
         case _:
             return 1
 
 
 def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
-    """What streams have beyond the submaps that were given, which `fed` counts from now on: the
-    initial poses, then the submaps by their ends, each after the inter-robot measurements from it.
+    """Yield members of streams that `fed` does not count yet: initial poses, then submaps by end
+    time, each after its inter-robot measurements.
 
-    A fold in the order of time takes back nothing.
+    A fold in the order of time undoes nothing.
     """
     parcels: list[tuple[int, Stream, int]] = []
     for stream, share in sorted(replica.streams.items()):

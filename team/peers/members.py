@@ -1,8 +1,8 @@
-"""A member of the team's set: the original bytes of a message and its name in the set.
+"""A member of the team's set: a message's original bytes and its name in the set.
 
-Members are the inputs of a map: initial poses, submaps with the inter-robot measurements from them,
-orders (withdrawals, robots that are given up), verdicts on identities and `Done`. `Concluded` is a
-member, too, and no input.
+Members are the inputs of a map: initial poses, submaps and their inter-robot measurements, orders
+(withdrawals, robots given up), verdicts on identities and `Done`; and `Concluded`, which is no
+input.
 """
 
 import hashlib
@@ -18,9 +18,9 @@ STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.CONCLUDED, ch.CER
 CHANNELS = (*STREAMED, *STATED)
 """The channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20
-"""Most bytes of one member; a submap of a thousand landmarks has two million."""
+"""Most bytes of a member; a submap of a thousand landmarks has two million."""
 LARGEST_SIGNATURE = 8192
-"""Most bytes of a member's signature; an operator's has its certificate in front."""
+"""Most bytes of a member's signature; an operator's includes its certificate."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Member:
 
 
 def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
-    """Decode and check a member. Raises WireError or ValueError."""
+    """Decode and check a member; raises WireError or ValueError."""
     for size, most in ((len(payload), LARGEST_MEMBER), (len(signature), LARGEST_SIGNATURE)):
         if size > most:
             raise ValueError(f"too large: {size} bytes, {most} at most")
@@ -60,7 +60,7 @@ def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
 
 
 def about(message: m.Message) -> str:
-    """The robot that a member is about, to whose share of the set it belongs."""
+    """Robot to whose share of the set a member belongs."""
     if isinstance(message, m.GivenUp):
         return ch.robot_of(message.node) or ""
     return str(getattr(message, "robot", ""))

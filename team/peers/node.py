@@ -1,9 +1,8 @@
-"""A peer's part in spreading the set: members in, members out; no I/O, no clock.
+"""Replicate the team's set between peers: members in, members out; no I/O, no clock.
 
-It publishes a summary of its set (`SetSummary`) when that has changed or a node appears, requests
-members that others have and it lacks, and answers requests. Any node may give a member, so members
-travel over third robots. They are passed to the fold in an order that it accepts: of each stream
-the initial pose, then the submaps without a gap.
+The node publishes a summary (`SetSummary`) when its set has changed or a node appears, requests
+members that it lacks, and answers requests. Members travel over third robots. The fold receives
+each stream's initial pose, then its submaps without a gap.
 """
 
 from collections import Counter, defaultdict
@@ -23,23 +22,22 @@ from team.wire.bus import Outgoing, Sample
 from team.wire.codec import WireError, decoded, encoded
 
 SUMMARY_S = 1.0
-"""Least time [s] between two summaries."""
+"""Shortest interval [s] between two summaries."""
 LAST_S = 0.2
 """… once all have concluded: peers leave soon, and compare their maps before."""
 REPEAT_S = 10.0
-"""… and the longest: a node that has appeared unnoticed receives a summary."""
+"""Longest interval [s], for a node whose appearance was not noticed."""
 PATIENCE_S = 3.0
-"""A request without an answer goes to another node after this time [s]."""
+"""Time [s] after which an unanswered request goes to another node."""
 FRESH_S = 25.0
-"""A summary older than this [s] does not show that its node is in reach."""
+"""Age [s] beyond which a summary does not prove reach."""
 MOST_OPEN = 16_384
-"""A node that owes so many members is not asked for more until they arrive or the requests
-expire."""
+"""Most open requests per node."""
 
 
 @dataclass
 class NodeTraffic:
-    """Traffic from one node: members that were new, and bytes, new or not."""
+    """Traffic from one node: new members, and all bytes."""
 
     members: int = 0
     bytes: int = 0
@@ -48,10 +46,9 @@ class NodeTraffic:
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    known: the nodes that may have a set: the team's robots and a centre. proofs: checks members
-    that come over third nodes; None: there are no keys, and every node is trusted. unsaved: new
-    members since it was last cleared. carried: traffic by node. refused: how many members were not
-    kept; last_refused: why.
+    known: nodes that may have a set: the robots and a centre. proofs: checks members that come over
+    third nodes; None: no keys, every node is trusted. unsaved: new members since last cleared.
+    refused: rejected members; last_refused: the reason.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -85,7 +82,7 @@ class PeerNode:
     # Members.
 
     def take(self, member: Member, carrier: str) -> bool:
-        """Take a member that came from a node; returns whether it is new."""
+        """Take a member from a node; returns whether it is new."""
         try:
             outcome = self.replica.add(member)
         except RefusedError as error:
@@ -106,8 +103,8 @@ class PeerNode:
         return True
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
-        """As `take`, for a sample on a member's key, which the router lets only its author use; a
-        certificate has to be the authority's, too.
+        """As `take`, for a sample on a member's key, which only its author may use; a certificate
+        must also be the authority's.
         """
         try:
             member = member_of(sample.key, sample.payload)
@@ -122,7 +119,7 @@ class PeerNode:
         return self.take(member, carrier)
 
     def take_carried(self, carried: m.Members) -> list[Member]:
-        """Take the members that another node carries; returns the new ones."""
+        """Take members that another node carries; returns the new ones."""
         new_messages: list[Member] = []
         if carried.node not in self.known:
             self._refuse(f"members from {carried.node[:80]}, not in this team")
@@ -148,8 +145,8 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """The messages that a fold can take now and has not yet been given, in order: operators'
-        orders first, since it may end with the last member of a stream; `Done` messages last.
+        """Yield queued messages for the fold: operators' orders first, since it may end with a
+        stream's last member; `Done` messages last.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)
@@ -159,7 +156,7 @@ class PeerNode:
         yield from statements[orders:]
 
     def restart_fold(self) -> None:
-        """Queue every stored member for a fold that begins anew."""
+        """Queue every stored member for a fresh fold."""
         self.rebuild = False
         self._fed.clear()
         self._new_messages = [
@@ -171,9 +168,7 @@ class PeerNode:
     # Exchange.
 
     def take_summary(self, summary: m.SetSummary) -> list[Outgoing]:
-        """Take another node's summary: request members that are missing here, and publish a summary
-        where that node lacks members.
-        """
+        """Request a summary's missing members; publish one where that node lacks members."""
         if summary.node == self.node:
             return []
         if summary.node not in self.known:
@@ -192,7 +187,7 @@ class PeerNode:
         self._answer_s = self._now_s if self._answer_s is None else self._answer_s
 
     def tick(self, now_s: float) -> list[Outgoing]:
-        """The messages that are due: a summary, and requests that were not answered."""
+        """Publish a due summary and repeat unanswered requests."""
         self._now_s = now_s
         self._forget_questions()
         out: list[Outgoing] = []
@@ -213,7 +208,7 @@ class PeerNode:
         return out
 
     def _note_arrival(self, message: m.Message) -> None:
-        """Forget the request of a member that has arrived."""
+        """Close the request of a received member."""
         match message:
             case m.InitialPose():
                 self._close(((message.robot, message.incarnation), -1))
@@ -230,7 +225,7 @@ class PeerNode:
             self._open[asked[1]] -= 1
 
     def _forget_questions(self) -> None:
-        """Let requests expire; nodes that did not send members that they have are asked last."""
+        """Let requests expire; nodes that failed to send members are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
         self._open.subtract(node for _, node in over.values())
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
@@ -265,7 +260,7 @@ class PeerNode:
         return [Outgoing(ch.MEMBERS, summary.node, asked)]
 
     def answer(self, request: bytes) -> list[bytes]:
-        """The answer to a `MembersRequest`; raises WireError."""
+        """Answer a `MembersRequest`; raises WireError."""
         query = decoded(request, m.MembersRequest)
         asker = query.node
         if asker not in self.known:

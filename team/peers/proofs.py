@@ -1,16 +1,15 @@
-"""Checks by signatures that a member carried by a third node is its author's.
+"""Verify by signatures that a member carried by a third node is its author's.
 
-Every robot states its certificates, themselves members, and signs each of its members on a key of
-its own (`robot/r1/signature`), for whoever carries them. An operator leaves at once: it signs its
-orders (`operator/signature/r1`) with its certificate in front, so that robots out of its reach can
-check them.
+Every robot publishes its certificates, themselves members, and the signature of each of its members
+on its own key (`robot/r1/signature`). An operator leaves at once: it signs its orders
+(`operator/signature/r1`) with its certificate in front, for robots out of its reach.
 
-A member is proven by any certificate of its author that the team's authority has issued, that is
-not revoked, and that had not ended at the member's stamp. That stamp is by the author's own
-clock: a stolen key can sign with an earlier date, and only its revocation ends that. A certificate
-of a later generation proves that the earlier ones are revoked, since the authority issues it only
-then; a roster beside the own key names revocations without a successor. Certificates of revoked
-generations stay in the set, which is the same for all peers; they prove nothing.
+A member is proven by any certificate of its author that the authority issued, that is not revoked,
+and that had not expired at the member's stamp. That stamp is by the author's clock: a stolen key
+can sign with an earlier date until it is revoked. A certificate of a later generation proves that
+the earlier ones are revoked, since the authority issues it only then; a roster beside the own key
+names revocations without a successor. Certificates of revoked generations stay in the set, which is
+the same for all peers, and prove nothing.
 """
 
 from collections.abc import Iterator
@@ -22,37 +21,37 @@ from team.peers.replica import Replica
 from team.wire import messages as m
 
 MOST_SIGNATURES = 250_000
-"""Most signatures kept of one node; a robot has one for each of its members."""
+"""Most signatures stored per node; a robot has one per member."""
 LARGEST_OF_ROBOT = 80
 """Most bytes of a robot's signature: ECDSA over P-256 has 72 at most."""
 MOST_OF_OPERATOR = 10_000
-"""Most signatures kept of operators; each has a certificate in front."""
+"""Most stored signatures of operators; each has a certificate in front."""
 OPERATOR = "operator"
 ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
-"""The messages of operators that are members."""
+"""Members that operators sign."""
 
 
 @runtime_checkable
 class Signs(Protocol):
-    """Signs as one node, and checks others' signatures (`team.keys.signing.Signer`)."""
+    """Sign as one node, and verify other nodes' signatures (`team.keys.signing.Signer`)."""
 
     certificate: bytes
 
     def sign(self, named: bytes) -> bytes:
-        """The signature of these bytes."""
+        """Sign these bytes."""
 
     def issued(self, node: str, certificate: bytes) -> Issued | str:
-        """The issued certificate of the node; why it is none, in words."""
+        """The node's certificate as issued, or why it is not."""
 
     def revoked(self, node: str) -> int:
-        """The last generation that is known to be revoked; 0: none."""
+        """Last generation known to be revoked; 0: none."""
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
         """Whether a certificate's key has signed these bytes."""
 
 
 class Proofs:
-    """The signatures that one peer has, which decide on the members that it accepts."""
+    """The signatures of one peer, which decide on the members that it accepts."""
 
     def __init__(self, robot: str, signer: Signs) -> None:
         self._robot = robot
@@ -65,7 +64,7 @@ class Proofs:
         return m.Certificate(stamp_ns=0, robot=self._robot, certificate=self._signer.certificate)
 
     def signed(self, member: Member) -> m.Signature:
-        """The message with the robot's signature of its own member, to be published after it."""
+        """Sign an own member; the message is published after it."""
         signature = self.of(member)
         return m.Signature(
             stamp_ns=member.message.stamp_ns,
@@ -75,9 +74,7 @@ class Proofs:
         )
 
     def take_signature(self, signature: m.Signature, publisher: str) -> None:
-        """Keep a signature that a robot or an operator publishes on its own key, of its own
-        members only.
-        """
+        """Store a signature that a robot or an operator publishes of its own members."""
         operators = publisher == OPERATOR
         if not operators and (
             publisher != signature.robot or len(signature.signature) > LARGEST_OF_ROBOT
@@ -88,8 +85,8 @@ class Proofs:
             signatures[signature.member] = signature.signature
 
     def of(self, member: Member) -> bytes:
-        """A member's signature; empty where there is none yet, and for a certificate, which the
-        authority has signed.
+        """A member's signature; empty where missing, and for a certificate, signed by the
+        authority.
         """
         if isinstance(member.message, m.Certificate):
             return b""
@@ -103,7 +100,7 @@ class Proofs:
         return member.signature or found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:
-        """Why a carried member is not accepted, in words; None where it is."""
+        """Why a carried member is rejected; None if accepted."""
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
             found = self._signer.issued(f"robot-{robot}", message.certificate)
@@ -121,7 +118,7 @@ class Proofs:
         node = f"robot-{robot}"
         issued = list(self._issued_to(node, replica.certificates_of(robot)))
         if not issued:
-            return f"no certificate of {robot} is here yet"
+            return f"no certificate of {robot} was received yet"
         least = max(self._signer.revoked(node) + 1, *(each.generation for each, _ in issued))
         signed_with = [
             each
@@ -160,7 +157,7 @@ class Proofs:
 
 
 def signed_by(member: Member) -> str:
-    """The node whose signature proves a member: its robot, or `operator`."""
+    """Node whose signature proves a member: its robot, or `operator`."""
     return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
 
 

@@ -1,9 +1,8 @@
-"""One peer's copy of the team's set: grow-only, independent of the order in which members arrive.
+"""One peer's copy of the team's set: grow-only, independent of the order of arrival.
 
-Members of one name that differ (a robot that contradicts itself) are decided by their bytes: the
-smaller hash stays, so that all peers agree. The set is bounded: it takes known robots and possible
-incarnations and sequences only, and limits the bytes of each robot, so that none fills another's
-disk.
+Of two members of one name (a robot contradicts itself) the smaller hash stays, so all peers agree.
+The set accepts only known robots and possible incarnations and sequences, and limits the bytes per
+robot: none can fill another's disk.
 """
 
 import hashlib
@@ -17,9 +16,9 @@ from team.store import Stream
 from team.wire import messages as m
 
 MOST_SEQUENCES = 200_000
-"""Most submaps of one incarnation."""
+"""Most submaps per incarnation."""
 MOST_STREAMS = 64
-"""Most incarnations of one robot."""
+"""Most incarnations per robot."""
 MOST_STATEMENTS = 2 * MOST_STREAMS + 8
 """Most orders and `Done` messages about one robot."""
 MOST_VERDICTS = 4096
@@ -27,7 +26,7 @@ MOST_VERDICTS = 4096
 SHARE = 256 * 2**20
 """Most bytes about one robot: 8 h of a submap of 4 kB every half second."""
 MOST_INTERVALS = 64
-"""Most intervals of one stream in a summary; those behind follow once gaps have closed."""
+"""Most intervals of a stream in a summary; later ones follow once gaps have closed."""
 MOST_LOOKS = 1024
 """Most inter-robot measurements from one submap."""
 _WORD = 2**256
@@ -39,16 +38,16 @@ TeammateAt = tuple[int, str]
 
 
 class RefusedError(ValueError):
-    """A member is not kept; the text names the bound that it breaks."""
+    """A rejected member; the text names the violated bound."""
 
 
 @dataclass
 class StreamShare:
-    """The members of one incarnation that are here.
+    """Stored members of one incarnation.
 
-    complete: sequences whose submap is here with all inter-robot measurements from it; count: how
-    many of them from 0 on without a gap; beyond: the others. sum: sum of the complete ones' hashes,
-    modulo 2²⁵⁶.
+    complete: sequences whose submap is stored with all its inter-robot measurements; count: how
+    many from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes, modulo
+    2²⁵⁶.
     """
 
     start: Member | None = None
@@ -61,9 +60,9 @@ class StreamShare:
     newest_ns: int = 0
 
     def parcel(self, sequence: int) -> list[Member]:
-        """A complete submap after the inter-robot measurements from it, in canonical order.
+        """A complete submap after its inter-robot measurements, in canonical order.
 
-        If there are more of these than the number in the submap, the first ones.
+        Surplus measurements are left out.
         """
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
@@ -86,7 +85,7 @@ class StreamShare:
                 self.count += 1
 
     def forget(self, sequence: int) -> None:
-        """Remove a member of a submap from the counts, since it will be replaced."""
+        """Remove a replaced member of a submap from the counts."""
         if sequence in self.complete:
             self.complete.discard(sequence)
             self.sum = (self.sum - _sum(self.parcel(sequence))) % _WORD
@@ -97,9 +96,7 @@ class StreamShare:
 
 
 class Have(NamedTuple):
-    """The stored share of a robot: number of submaps, and the end of the newest [ns of team
-    time].
-    """
+    """Stored share of a robot: number of submaps, and the end of the newest [ns of team time]."""
 
     submaps: int
     newest_ns: int
@@ -108,7 +105,7 @@ class Have(NamedTuple):
 class Replica:
     """The set of a team with the given robots, as one peer has it.
 
-    replacements: how often a robot contradicted a member that had been passed to the fold.
+    replacements: contradictions of members already passed to the fold.
     """
 
     def __init__(self, robots: Iterable[str], share: int = SHARE) -> None:
@@ -123,9 +120,7 @@ class Replica:
         self._announced: _Announced | None = None
 
     def add(self, member: Member) -> Outcome:
-        """Take a member. Raises RefusedError where it can not be of this team or exceeds a
-        bound.
-        """
+        """Add a member; raises RefusedError for another team's or beyond a bound."""
         message = member.message
         robot = about(message)
         if robot not in self._bytes:
@@ -153,7 +148,7 @@ class Replica:
         share = self.streams.get(stream)
         if share is None:
             if sum(robot == stream[0] for robot, _ in self.streams) >= MOST_STREAMS:
-                raise RefusedError(f"{stream[0]} has {MOST_STREAMS} incarnations here already")
+                raise RefusedError(f"{stream[0]} has {MOST_STREAMS} incarnations already")
             share = self.streams[stream] = StreamShare()
         match message:
             case m.InitialPose():
@@ -168,7 +163,9 @@ class Replica:
                 look = message.stamp_ns, message.teammate
                 factors = share.factors.setdefault(sequence, {})
                 if look not in factors and len(factors) >= MOST_LOOKS:
-                    raise RefusedError(f"submap {sequence} of {stream[0]} has {MOST_LOOKS} looks")
+                    raise RefusedError(
+                        f"submap {sequence} of {stream[0]} has {MOST_LOOKS} measurements"
+                    )
                 return self._put(share, sequence, factors, look, member)
             case _:
                 raise RefusedError("no member of a stream")
@@ -201,30 +198,30 @@ class Replica:
         alike = sum((kind == "verdict") == verdict for kind, _ in among)
         if there is None and alike >= most:
             what = "verdicts" if verdict else "statements"
-            raise RefusedError(f"{most} {what} about {robot} are here already")
+            raise RefusedError(f"{most} {what} about {robot} are stored already")
         among[name] = member
         return "new" if there is None else "replaced"
 
     # Contents.
 
     def share_of(self, stream: Stream) -> StreamShare:
-        """The members of a stream that are here; empty where there are none."""
+        """Stored members of a stream."""
         return self.streams.get(stream) or StreamShare()
 
     def have(self, robot: str) -> Have:
-        """How much of a robot is here."""
+        """Stored share of a robot."""
         shares = [share for (name, _), share in self.streams.items() if name == robot]
         newest = max((share.newest_ns for share in shares), default=0)
         return Have(sum(len(share.complete) for share in shares), newest)
 
     @property
     def submaps(self) -> int:
-        """Number of complete submaps that are here."""
+        """Number of complete submaps."""
         return sum(len(share.complete) for share in self.streams.values())
 
     @property
     def concluded(self) -> dict[str, m.Concluded]:
-        """The peers whose final map is out, by robot, as each has announced it."""
+        """Conclusions of the peers whose final map is published, by robot."""
         found = {}
         for robot, statements in self.statements.items():
             member = statements.get(("concluded", 0))
@@ -233,13 +230,13 @@ class Replica:
         return found
 
     def certificates_of(self, robot: str) -> Iterator[bytes]:
-        """The certificates that a robot has stated: more than one where it was renewed."""
+        """Certificates of a robot: several where it was renewed."""
         for member in self.statements.get(robot, {}).values():
             if isinstance(member.message, m.Certificate):
                 yield member.message.certificate
 
     def members(self) -> Iterator[Member]:
-        """Every member, in an order in which a fold can take them one by one."""
+        """Every member, in an order that a fold accepts."""
         for stream in sorted(self.streams):
             share = self.streams[stream]
             if share.start is not None:
@@ -255,7 +252,7 @@ class Replica:
     # Summaries.
 
     def holding(self, stream: Stream) -> m.Holding | None:
-        """What is here of a stream, for a summary; None where nothing can be requested."""
+        """A stream's holding for a summary; None where nothing can be requested."""
         share = self.share_of(stream)
         if share.start is None and not share.complete:
             return None
@@ -289,7 +286,7 @@ class Replica:
         return self._announcement.digest
 
     def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
-        """A summary of the set, small enough to be published again and again."""
+        """Make a summary of the set, small enough to be repeated."""
         announced = self._announcement
         return m.SetSummary(
             stamp_ns=stamp_ns,
@@ -328,7 +325,7 @@ class Replica:
 
 
 class _Announced(NamedTuple):
-    """The contents of a summary, cached until a member arrives."""
+    """Contents of a summary, cached until a member arrives."""
 
     digest: bytes
     holdings: dict[Stream, m.Holding]
@@ -336,7 +333,7 @@ class _Announced(NamedTuple):
 
 
 def _stated(message: m.Message) -> tuple[str, int]:
-    """The name of a statement among those about its robot."""
+    """Name of a statement among those about its robot."""
     match message:
         case m.Done():
             return "done", message.incarnation
@@ -365,9 +362,8 @@ def _rank(member: Member) -> tuple[int, bytes]:
 
 
 def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
-    """First, last, first, last, … of the closed intervals; `count`: those from 0 on without a gap.
-
-    At most MOST_INTERVALS, the first ones.
+    """First, last, first, last, … of the first MOST_INTERVALS intervals; `count`: gap-free from 0
+    on.
     """
     ends: list[int] = [0, count - 1] if count else []
     for each in sorted(s for s in sequences if s >= count):

@@ -1,12 +1,11 @@
-"""A peer's or a centre's set on disk: an append-only file, from which it continues after a restart.
+"""A peer's or a centre's set on disk: an append-only file, loaded after a restart.
 
 Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
-little-endian; the body is a MessagePack array [key, payload, signature]. A record that a crash has
-truncated is cut off when the file is opened again. Behind a damaged record reading continues at the
-next one whose CRC fits; the file is then written anew without the damage, which is named. Lost
-members come from other peers, or are computed again. A record is in the hands of the operating
-system when `append` returns: a process that is killed loses nothing, a computer without power the
-last seconds.
+little-endian; the body is a MessagePack array [key, payload, signature]. A truncated last record is
+cut off when the file is opened. After a damaged record reading continues at the next one whose CRC
+fits; the file is then rewritten without the damage, which is reported. Lost members come from other
+peers or are computed again. A record is in the operating system's hands when `append` returns: a
+killed process loses nothing, a power failure the last seconds.
 """
 
 import logging
@@ -27,12 +26,12 @@ from team.wire import messages as m
 
 MAGIC = b"tmsset1\n"
 RETRY_S = 5.0
-"""Time [s] between two attempts to write to a file that could not be written."""
+"""Interval [s] between attempts to write after an error."""
 SHOWN = 3
-"""Number of gaps of a stream that are listed."""
+"""Number of gaps listed per stream."""
 _HEAD = struct.Struct("<II")
 _BODY = b"\x93"
-"""The first byte of each body: an array of three."""
+"""First byte of each body: an array of three."""
 _LEAST = 4
 """Fewest bytes of a body: the array and three empty values."""
 _LOG = logging.getLogger("teamslam")
@@ -40,11 +39,11 @@ _LARGEST = LARGEST_MEMBER + 2**16
 
 
 class SetFileError(RuntimeError):
-    """The file can not be used; the text gives the reason and the remedy."""
+    """An unusable file; the text gives the reason and the remedy."""
 
 
 class Record(NamedTuple):
-    """An intact record: its place in the file, and its member; None for one of another version."""
+    """An intact record: its place in the file, and its member; None for another version's."""
 
     begin: int
     end: int
@@ -52,13 +51,13 @@ class Record(NamedTuple):
 
 
 def record_of(member: Member) -> bytes:
-    """The record of a member."""
+    """Encode a member as a record."""
     body: bytes = msgpack.packb([member.key, member.payload, member.signature], use_bin_type=True)
     return _HEAD.pack(len(body), zlib.crc32(body)) + body
 
 
 def records_in(content: bytes) -> Iterator[Record]:
-    """The intact records of a file, also those behind damaged ones."""
+    """Yield the intact records of a file, also those after damaged ones."""
     at = len(MAGIC)
     while (begin := _next_record(content, at)) is not None:
         length, _ = _HEAD.unpack_from(content, begin)
@@ -67,10 +66,10 @@ def records_in(content: bytes) -> Iterator[Record]:
 
 
 def _next_record(content: bytes, at: int) -> int | None:
-    """The place of the first intact record from `at` on.
+    """Find the first intact record from `at` on.
 
-    A damaged record whose length is sound is skipped as a whole: what looks like a record within it
-    is its author's. Otherwise each place with the first byte of a body is tried.
+    A damaged record of sound length is skipped as a whole: apparent records within it are its
+    author's. Otherwise each body's first byte is tried.
     """
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
         following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]
@@ -86,7 +85,7 @@ def _next_record(content: bytes, at: int) -> int | None:
 
 
 def _is_intact(content: bytes, at: int) -> bool:
-    """Whether the bytes at this place are a whole record with its CRC."""
+    """Whether a whole record with its CRC begins here."""
     begin = at + _HEAD.size
     if content[begin : begin + 1] != _BODY:
         return False
@@ -104,7 +103,7 @@ def _member_in(body: bytes) -> Member | None:
 
 
 def missing_in(members: Iterable[Member]) -> list[str]:
-    """The submaps that a set lacks before its last one of each stream, in words."""
+    """Report the submaps that a set lacks before the last one of each stream."""
     found: dict[tuple[str, int], set[int]] = {}
     for member in members:
         message = member.message
@@ -122,10 +121,10 @@ def missing_in(members: Iterable[Member]) -> list[str]:
 
 
 class SetFile:
-    """The file of one peer. Raises SetFileError.
+    """The file of one peer; raises SetFileError.
 
-    members: those in it when it was opened. torn: bytes of an incomplete record at its end, cut
-    off. lost: what else was damaged, in words; empty if nothing was.
+    members: those in it when opened. torn: bytes of an incomplete last record, cut off. lost: other
+    damage, in words.
     """
 
     def __init__(self, path: Path) -> None:
@@ -134,7 +133,7 @@ class SetFile:
             content = path.read_bytes() if path.exists() else b""
             found = list(records_in(content))
             if _is_foreign(content) and not found:
-                raise SetFileError(f"{path} is no set of a peer: give --set another file")
+                raise SetFileError(f"{path} is not a peer's set: give --set another file")
             self.members = [each.member for each in found if each.member is not None]
             self._open(content, found)
         except OSError as error:
@@ -161,7 +160,7 @@ class SetFile:
             self._write(MAGIC, 0)
 
     def append(self, members: Iterable[Member]) -> None:
-        """Append members, all or none. Raises SetFileError."""
+        """Append members, all or none; raises SetFileError."""
         records = b"".join(record_of(member) for member in members)
         if records:
             try:
@@ -171,11 +170,11 @@ class SetFile:
             self._size += len(records)
 
     def _write(self, data: bytes, at: int) -> None:
-        """Write all bytes, in as many pieces as the system takes; after an error, none."""
+        """Write all bytes, in as many pieces as the system takes; none after an error."""
         done = 0
         try:
             while done < len(data):
-                # A disk that becomes full takes a part without an error, and refuses the next one.
+                # A disk that becomes full takes a part without an error and refuses the next one.
                 done += os.pwrite(self._file.fileno(), data[done:], at + done)
         except OSError:
             self._file.truncate(at)
@@ -187,9 +186,7 @@ class SetFile:
 
 
 def _is_cut_off(content: bytes, at: int) -> bool:
-    """Whether a file ends within the record at this place, as a process leaves it that is killed
-    while it writes.
-    """
+    """Whether the file ends within this record, as after a killed write."""
     if at + _HEAD.size > len(content):
         return any(content[at:]) or at >= len(content)
     length, _ = _HEAD.unpack_from(content, at)
@@ -197,14 +194,14 @@ def _is_cut_off(content: bytes, at: int) -> bool:
 
 
 def _is_foreign(content: bytes) -> bool:
-    """Whether a file begins as none of ours; zeros are left where the power has failed."""
+    """Whether a file's beginning is not ours; zeros remain after a power failure."""
     begin = content[: len(MAGIC)]
     ours = all(here in (0, there) for here, there in zip(begin, MAGIC, strict=False))
     return any(content) and not (ours and any(begin))
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Write a file anew, in one step."""
+    """Replace a file atomically."""
     fresh = path.with_name(path.name + ".new")
     with fresh.open("wb") as file:
         file.write(content)
@@ -216,19 +213,18 @@ def _replace(path: Path, content: bytes) -> None:
 def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> str:
     places, damaged = max(len(holes), 1), sum(holes)
     lacks = missing_in(members)
-    missing = f"; of what is known it lacks {', '.join(lacks)}" if lacks else ""
+    missing = f"; it lacks at least {', '.join(lacks)}" if lacks else ""
     return (
         f"{path} was damaged in {places} place{'s' * (places != 1)}: {damaged} bytes are lost, "
-        f"{len(members)} members are intact{missing}; the rest of the set is asked for again"
+        f"{len(members)} members are intact{missing}; the rest of the set is requested again"
     )
 
 
 class Keeper:
-    """Keeps a set in its file; without a path nowhere.
+    """Stores a set in its file; without a path in memory only.
 
-    members: those in it when it was opened. A file that can not be written is named; its members
-    are kept in memory and written once that is possible. Raises SetFileError where the file can not
-    be used.
+    members: those in it when opened. Members that cannot be written are reported, kept in memory
+    and written later. Raises SetFileError for an unusable file.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -244,13 +240,13 @@ class Keeper:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The members missing in the file, for the status of its process."""
+        """Members missing in the file, for the status of its process."""
         lost = "" if self._store is None else self._store.lost
-        failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not kept"
+        failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not stored"
         return tuple(text for text in (failure, lost) if text)
 
     def append(self, members: Sequence[Member]) -> None:
-        """Append members; after an error, with those that could not be written before."""
+        """Append members; after an error, with those not written before."""
         if self._store is None:
             return
         self._waiting += members
@@ -263,19 +259,19 @@ class Keeper:
             self._store.append(self._waiting)
         except SetFileError as error:
             if not self._failure:
-                _LOG.error("the set is not kept: %s; trying again every %g s", error, RETRY_S)
+                _LOG.error("the set is not stored: %s; trying again every %g s", error, RETRY_S)
             self._failure = str(error)
             self._retry_s = time.monotonic() + RETRY_S
             return
         if self._failure:
-            _LOG.warning("the set is kept again, with %d members", len(self._waiting))
+            _LOG.warning("the set is stored again, with %d members", len(self._waiting))
         self._waiting, self._failure, self._retry_s = [], "", 0.0
 
     def close(self) -> None:
-        """Write the members that are not written yet, and close the file."""
+        """Write the pending members, and close the file."""
         if self._store is not None:
             self._write()
             if self._waiting:
-                _LOG.error("%d members of the set are not kept", len(self._waiting))
+                _LOG.error("%d members of the set are not stored", len(self._waiting))
             self._store.close()
             self._store = None

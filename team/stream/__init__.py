@@ -1,1 +1,1 @@
-"""Puts a robot's measurements in order and checks them, before they go to an estimator."""
+"""Order and check a robot's measurements before estimation."""

@@ -1,17 +1,17 @@
-"""Puts the measurements of one robot in the order of its measurement counter."""
+"""Put the measurements of one robot in the order of their counter."""
 
 from team.door import another_time
 from team.wire.messages import End, InitialPose, Measurement, StreamEnd
 
 NEAR_LIVES = 16
-"""Incarnations beyond the current one that are accepted: they begin one by one, and seldom."""
+"""Largest accepted step of the incarnation, which grows one by one, and seldom."""
 
 
 class Inbox:
-    """Holds measurements until their turn: Zenoh promises no order across keys.
+    """Hold measurements until their turn: Zenoh guarantees no order across keys.
 
-    A measurement is taken once; duplicates and measurements of earlier incarnations are dropped.
-    A later incarnation begins when its measurement 0 arrives.
+    Duplicates and measurements of earlier incarnations are dropped. A later incarnation begins when
+    its measurement 0 arrives.
     """
 
     def __init__(self) -> None:
@@ -24,16 +24,12 @@ class Inbox:
         self._of_source: set[int] = set()
 
     def confirm(self, measurement: Measurement) -> None:
-        """Note that a measurement comes in the source's own answer: its turn comes, however far off
-        its stamp is.
-        """
+        """Confirm a measurement by the source's answer, whatever its stamp."""
         if measurement.incarnation == self.incarnation:
             self._of_source.add(measurement.number)
 
     def resume(self, incarnation: int, next_measurement: int) -> None:
-        """Note that an earlier process has consumed everything before `next_measurement` of
-        `incarnation`.
-        """
+        """Skip measurements of `incarnation` consumed by an earlier process."""
         self.incarnation = incarnation
         self.next_measurement = next_measurement
         waiting = self._later.pop(incarnation, {}) | self._waiting
@@ -45,7 +41,7 @@ class Inbox:
         self._forget(incarnation)
 
     def put(self, measurement: Measurement) -> None:
-        """Take a measurement, in any order."""
+        """Add a measurement, in any order."""
         if measurement.incarnation > self.incarnation:
             self._later.setdefault(measurement.incarnation, {})[measurement.number] = measurement
         elif (
@@ -55,10 +51,9 @@ class Inbox:
             self._waiting[measurement.number] = measurement
 
     def refusal(self, measurement: Measurement) -> str | None:
-        """Why a measurement can not be of this stream, in words; None if it can.
+        """Why a measurement cannot belong to this stream; None if it can.
 
-        Incarnations follow one another, each begins with its initial pose and has no other, and
-        stamps do not precede that one's.
+        Incarnations follow one another and begin with their only initial pose, the earliest stamp.
         """
         if isinstance(measurement, InitialPose) != (measurement.number == 0):
             what = type(measurement).__name__
@@ -74,7 +69,7 @@ class Inbox:
         return None
 
     def contradicts(self, end: End, robot: str) -> str | None:
-        """Why an announced end can not be the end of the robot's stream, in words."""
+        """Why an announced end cannot be the end of the robot's stream."""
         ends = {
             stream.incarnation: stream.measurements
             for stream in end.streams
@@ -91,7 +86,7 @@ class Inbox:
         return None
 
     def take_next(self) -> Measurement | None:
-        """The next measurement, if its turn has come; it is removed."""
+        """Remove and return the next measurement, if its turn has come."""
         while True:
             measurement = self._waiting.pop(self.next_measurement, None)
             if measurement is not None:
@@ -109,9 +104,7 @@ class Inbox:
             self._forget(following)
 
     def _forget(self, incarnation: int) -> None:
-        """Drop measurements of this incarnation and of earlier ones that can not have their turn
-        any more.
-        """
+        """Drop measurements whose turn cannot come after this incarnation."""
         self._received = 0
         self._of_source.clear()
         self._later = {
@@ -120,9 +113,7 @@ class Inbox:
 
     @property
     def received(self) -> int:
-        """The count of measurements of this incarnation that are here without a gap, consumed or
-        not.
-        """
+        """Gap-free count of this incarnation's measurements, consumed or not."""
         self._received = max(self._received, self.next_measurement)
         while self._received in self._waiting:
             self._received += 1
@@ -132,7 +123,7 @@ class Inbox:
     def gap(self) -> tuple[int, int, int] | None:
         """Incarnation, first and last measurement of the gap before the earliest waiting one.
 
-        Where only a later incarnation has arrived, the gap is at its beginning.
+        With only a later incarnation, the gap is at its beginning.
         """
         if self._waiting:
             first = min(self._waiting)
@@ -148,17 +139,17 @@ class Inbox:
         return (following, 0, first - 1) if first else None
 
     def complete(self, end: StreamEnd) -> bool:
-        """Whether every measurement up to the stream's last one has been consumed."""
+        """Whether every measurement of the stream has been consumed."""
         return end.measurements == 0 or (
             self.incarnation == end.incarnation and self.next_measurement >= end.measurements
         )
 
     def missing(self, end: StreamEnd | None) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement to ask the source for: a gap, or everything up
-        to the end.
+        """Incarnation, first and last measurement to request from the source: a gap, or everything
+        up to the end.
 
-        A gap behind the end, or in an incarnation that is neither the present one nor the last, is
-        nothing that the source has.
+        The source has nothing after the end, or of incarnations other than the present and the
+        last.
         """
         gap = self.gap
         if end is None:
@@ -172,7 +163,6 @@ class Inbox:
         return (end.incarnation, first, end.measurements - 1) if first < end.measurements else None
 
     def _here(self, incarnation: int) -> int:
-        """How many measurements of an incarnation are here without a gap, consumed or not."""
         if incarnation == self.incarnation:
             return self.received
         later, first = self._later.get(incarnation, {}), 0

@@ -1,4 +1,4 @@
-"""Checks whether a stream's measurements are physically sensible, one after the other."""
+"""Check whether a stream's measurements are physically plausible."""
 
 import math
 
@@ -11,14 +11,14 @@ from team.estimation.plausible import is_motion_spread as _spread
 from team.rejection import Rejection
 
 LONGEST_NS = 2**62
-"""No two stamps are as far apart."""
+"""Bound on the distance of two stamps."""
 
 
 class StreamJudge:
-    """Checks one incarnation of a sensor stream; it remembers the time of the last odometry.
+    """Checks one incarnation of a sensor stream against the time of its last odometry.
 
-    A stamp that lies `jump_s` ahead of the odometry is refused, and so is the odometry itself,
-    until the next interval confirms that the clock has really jumped.
+    A stamp `jump_s` ahead of the odometry is refused, even of odometry, until the next interval
+    confirms that the clock has jumped.
     """
 
     def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
@@ -61,6 +61,6 @@ class StreamJudge:
         return Rejection.TIME if is_ahead else None
 
     def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Which ranges are within the bounds."""
+        """Mask of the ranges within the bounds."""
         within: Bool[np.ndarray, " n"] = ranges <= self._bounds.extent_m
         return within

@@ -71,5 +71,5 @@ def test_after_its_end_nothing_is_kept(tmp_path: Path) -> None:
 def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "central.set"
     path.write_text("something else")
-    with pytest.raises(SetFileError, match="is no set of a peer: give --set another file"):
+    with pytest.raises(SetFileError, match="is not a peer's set: give --set another file"):
         StoredSet(path)

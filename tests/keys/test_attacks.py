@@ -299,7 +299,7 @@ def test_each_side_names_a_certificate_that_it_refuses(
     own = credentials_of(keys.own, "router"), load_roster(keys.own)
     with router("tls/127.0.0.1:0", own) as endpoint:
         told, took = refusal(endpoint, keys.strange)
-        assert "the router's certificate is not good" in told
+        assert "the router's certificate is invalid" in told
         assert took < 30.0
         told, took = refusal(endpoint, keys.strange, authority=keys.own / "ca.pem")
         assert "the router refuses" in told
@@ -354,7 +354,7 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
             with bus:
                 told, took = shut_out(bus)
             break
-    assert "the router's certificate is not good: certificate has expired" in told
+    assert "the router's certificate is invalid: certificate has expired" in told
     assert took < life_s + 20.0
 
 

@@ -188,8 +188,8 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
         keeper.append([each])
     (warning,) = keeper.warnings
     assert "No space left on device" in warning
-    assert "members are not kept" in warning
-    assert caplog.text.count("the set is not kept") == 1
+    assert "members are not stored" in warning
+    assert caplog.text.count("the set is not stored") == 1
     whole = kept_in(path, path.read_bytes())
     assert 0 < whole < 50
     room = 10**9
@@ -205,6 +205,6 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
 def test_another_file_is_not_overwritten(tmp_path: Path) -> None:
     other = tmp_path / "notes.txt"
     other.write_text("something of the user's")
-    with pytest.raises(SetFileError, match="is no set of a peer: give --set another file"):
+    with pytest.raises(SetFileError, match="is not a peer's set: give --set another file"):
         SetFile(other)
     assert other.read_text() == "something of the user's"

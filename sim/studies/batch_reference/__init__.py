@@ -1,1 +1,1 @@
-"""The batch MAP over all raw measurements: the accuracy that no team can exceed."""
+"""Batch MAP over all raw measurements: the bound on a team's accuracy."""

@@ -1,17 +1,17 @@
-"""The batch MAP's measurements under the profile's own noise: errors that persist are states.
+"""Measurement factors of the batch MAP under the profile's noise: persistent errors are states.
 
 A measurement (range r, bearing b) of a landmark at distance d from robot k at time t is
 
     b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
     r = (1 + bias_r) d(x, l) + offset + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,  ε ~ N(0, 1), white,
 
-with the shares w that the sensor calls white. e is a first-order Gauss-Markov process of unit
-variance for each robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the
-sensor's correlation times; so it is in the simulator, and the robots' windows take it as constant.
-The biases are three numbers per robot with the centre's priors. An inter-robot measurement is a
-factor between two poses of the same time, as the robots reduce them. A covariance that comes with a
-measurement is white, and all of its noise. GTSAM has no factor for such a measurement: it is a
-Python function of (pose, landmark, e, biases) with its own derivatives.
+with the sensor's white shares w. e is a first-order Gauss-Markov process of unit variance for each
+robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the sensor's correlation
+times, as in the simulator; the robots' windows take it as constant. The biases are three numbers
+per robot with the centre's priors. An inter-robot measurement is a factor between two poses of the
+same time, as the robots reduce them. A covariance that comes with a measurement is white and all of
+its noise. GTSAM has no such factor: it is a Python function of (pose, landmark, e, biases) with
+analytic derivatives.
 """
 
 import math
@@ -29,23 +29,20 @@ from team.estimation.geometry import Point, wrapped
 from team.estimation.models import NEAREST_M, predicted
 
 BIASES = ("bearing", "range_offset", "range_scale")
-"""The errors of a robot's sensor that the centre would estimate, in their order here."""
+"""Sensor biases of the centre's model, in state order."""
 FORGOTTEN = 1e-3
-"""Below this correlation the errors count as independent, and the process begins anew."""
+"""Correlation below which the error process begins anew."""
 _ERRORS = 2**56
 _BIASES = 2**57
 _BASES = 2**58
 PINNED_SIGMA = 1e-6
-"""Standard deviation [m, rad] that fixes a base's pose to that of its mounted sensor, the least
-that GTSAM handles.
-"""
+"""Standard deviation [m, rad] between base and mounted sensor: the least that GTSAM handles."""
 
 
 class Look(NamedTuple):
-    """A landmark seen from a pose of a chain, and the error state of this measurement.
+    """A landmark's measurement from a pose of a chain, with its error state.
 
-    before: the error state of the measurement of the same landmark that is gap_s older. number:
-    index of the measurement in its scan.
+    before: error state of the landmark's measurement gap_s earlier. number: index in the scan.
     """
 
     key: int
@@ -60,12 +57,12 @@ class Look(NamedTuple):
 
 
 def bias_key(chain: int) -> int:
-    """The key of the biases (`BIASES`: bearing [rad], range offset [m], range scale) of a chain."""
+    """Key of a chain's biases (`BIASES`: bearing [rad], range offset [m], range scale)."""
     return _BIASES + chain
 
 
 def detections_of(chains: Sequence[Chain]) -> list[Look]:
-    """All measurements of landmarks in the order of chain, pose and landmark."""
+    """All measurements in order."""
     looks: list[Look] = []
     for c, chain in enumerate(chains):
         last: dict[int, tuple[int, int]] = {}
@@ -101,10 +98,10 @@ def profile_graph(
     robust_c: float | None,
     sigmas: BiasSigmas,
 ) -> Any:
-    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+    """All factors. The range noise is that at the joined solution's range.
 
-    The Cauchy loss of scale c is on √(χ²/2) of each measurement and inter-robot measurement; the
-    centre's is on √(χ²/dim) of each submap.
+    The Cauchy loss of scale c is on √(χ²/2) of each measurement; the centre's is on √(χ²/dim) of
+    each submap.
     """
     graph = path_graph(gtsam, chains, poses)
     loss = None if robust_c is None else math.sqrt(2.0) * robust_c
@@ -121,7 +118,7 @@ def profile_graph(
         scan = chains[look.chain].scans[look.pose - 1]
         R = scan.noise(look.number, sensor, distance)[::-1, ::-1]
         white = np.array([sensor.bearing_white, sensor.range_white])
-        if scan.own.size:  # what a detector claims of a measurement is that one's own
+        if scan.own.size:  # a detector's covariance is that of one measurement
             white = np.ones(2)
         variances = np.diag(R)
         model = (
@@ -140,14 +137,12 @@ def profile_graph(
 
 
 def has_biases(chain: Chain) -> bool:
-    """Whether the centre would estimate a bias of this robot's sensor."""
+    """Whether this robot's sensor has biases."""
     return bool(set(BIASES) & set(chain.config.front_end.biases))
 
 
 def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
-    """The values with all error states and biases at zero, and the bases at their sensors'
-    poses.
-    """
+    """Add zero error states and biases, and the bases."""
     for c, i in _bases(chains):
         pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
         values.insert(_base_key(chains[c], c, i), pose)
@@ -162,7 +157,7 @@ def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
 def _measurement(
     look: Look, keys: Sequence[int], scales: Float[np.ndarray, "2"]
 ) -> Callable[[Any, Any, Any], np.ndarray]:
-    """The residual (bearing [rad], range [m]) of a measurement, and its derivatives by `keys`."""
+    """Residual (bearing [rad], range [m]) of a measurement, and its derivatives by `keys`."""
     across, along = scales.tolist()
 
     def residual(_: Any, values: Any, derivatives: Any) -> np.ndarray:
@@ -210,15 +205,13 @@ def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
 
 
 def _base_key(chain: Chain, number: int, pose: int) -> int:
-    """The key of the base's pose: the sensor's own unless the sensor is mounted away from
-    the base.
-    """
+    """Key of the base's pose: the sensor's own unless mounted."""
     own = pose_key(number, pose)
     return _BASES + own if chain.config.sensor.is_mounted else own
 
 
 def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
-    """(chain, pose) of the base's poses that are states: those with inter-robot measurements."""
+    """(chain, pose) of bases with inter-robot measurements."""
     times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
     return [
         (c, i)
@@ -230,9 +223,6 @@ def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
 
 
 def _sighting_factors(gtsam: Any, chains: Sequence[Chain], loss: float | None) -> list[Any]:
-    """The factors between the base poses of two robots at one time, where the teammate has a pose
-    then.
-    """
     keys = {
         (chain.config.id, int(stamp)): _base_key(chain, c, i)
         for c, chain in enumerate(chains)

@@ -1,10 +1,9 @@
-"""Writes the batch problem of a log as a g2o file, for other optimisers to start from.
+"""Write the batch problem of a log as a g2o file, for other optimisers.
 
-VERTEX_SE2 are the poses of the robots' sensors at their keyframes, VERTEX_XY the landmarks, both
-from the joined map and the odometry between; FIX holds the first pose of each robot whose initial
-pose is exactly known. EDGE_SE2 is the odometry, EDGE_SE2_XY a measurement as a point in the
-sensor's frame, with the first-order covariance of range and bearing at the joined map's range. Up
-to that linearisation it is the problem of `factor_graph`.
+VERTEX_SE2 are sensor poses at keyframes, VERTEX_XY landmarks, both from the joined map and the
+odometry between; FIX holds exactly known initial poses. EDGE_SE2 is the odometry, EDGE_SE2_XY a
+measurement as a point in the sensor's frame, with the first-order covariance of range and bearing
+at the joined map's range. Up to that linearisation it is the problem of `factor_graph`.
 https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
 """
 
@@ -26,9 +25,9 @@ Poses = Float[np.ndarray, "K 3"]
 
 
 def g2o_lines(samples: Iterable[Sample]) -> Iterator[str]:
-    """The lines of the file.
+    """Lines of the file.
 
-    Raises BatchReferenceError for a log without a scenario or without a joined map.
+    Raises BatchReferenceError without a scenario or a joined map.
     """
     recorded = list(samples)
     run = evaluate(recorded)

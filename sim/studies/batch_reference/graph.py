@@ -1,7 +1,6 @@
-"""The factor graph of the batch MAP in GTSAM: keys, factors and values.
+"""Factor graph of the batch MAP in GTSAM: keys, factors and values.
 
-GTSAM is a parameter, since it is an optional extra. Its poses are perturbed on the right, like
-ours.
+GTSAM is a parameter: an optional extra. Poses are perturbed on the right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,14 +20,15 @@ from team.registry import NotInstalledError
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32
 FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
-"""Added to each keyframe's motion (forward [m], left [m], turn [rad]): the covariance of a robot
-that can not slip is singular, and that of no motion at all is zero."""
+"""Added to each motion (forward [m], left [m], turn [rad]): its covariance is singular without slip
+and zero without motion.
+"""
 EXACT_SIGMA = 1e-5
-"""Of an initial pose that is exactly known [m, rad]."""
+"""Standard deviation of an exactly known initial pose [m, rad]."""
 
 
 def load_gtsam() -> Any:
-    """GTSAM; raises NotInstalledError with the command that installs it."""
+    """Import GTSAM; raises NotInstalledError."""
     try:
         import gtsam
     except ImportError:
@@ -39,23 +39,21 @@ def load_gtsam() -> Any:
 
 
 def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
-    """The Newton step of a linear graph, and its length in standard deviations."""
+    """A linear graph's Newton step, and its length in standard deviations."""
     step = linear.optimize()
     gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
     return step, float(np.sqrt(max(2.0 * gain, 0.0)))
 
 
 def pose_key(chain: int, pose: int) -> int:
-    """The key of a pose of a chain; a landmark's is its id, which is below 2³²."""
+    """Key of a pose; a landmark's is its id < 2³²."""
     return (chain + 1) * _CHAIN + pose
 
 
 def landmark_starts(
     chains: Sequence[Chain], poses: Sequence[Poses], joined: MapResult
 ) -> dict[int, Point]:
-    """The initial position of every landmark in a chain: the joined map's, else that of its first
-    measurement.
-    """
+    """Initial positions: the joined map's, else by the first measurement."""
     known = dict(zip(joined.ids.tolist(), joined.means, strict=True))
     found: dict[int, Point] = {}
     for chain, path in zip(chains, poses, strict=True):
@@ -73,9 +71,9 @@ def factor_graph(
     landmarks: Mapping[int, Point],
     robust_c: float | None,
 ) -> Any:
-    """All factors. The range noise is the sensor's at the range that the joined solution predicts.
+    """All factors. The range noise is that at the joined solution's range.
 
-    Where no initial pose is known, the first chain's is fixed to the joined solution's.
+    Without a known initial pose the first chain's is fixed to the joined solution's.
     """
     graph = path_graph(gtsam, chains, poses)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
@@ -98,7 +96,7 @@ def factor_graph(
 
 
 def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> Any:
-    """The factors of the initial poses and of the odometry."""
+    """Factors of the initial poses and of the odometry."""
     graph = gtsam.NonlinearFactorGraph()
     floor = np.diag(FLOOR_SIGMAS) ** 2
     anyone = any(chain.start is not None for chain in chains)
@@ -115,16 +113,14 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
 
 
 def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
-    """The noise model with a Cauchy loss of this scale; None: without a loss."""
+    """Noise model with a Cauchy loss of this scale, if any."""
     if c is None:
         return model
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
 
 
 def start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
-    """The prior of the initial pose; its covariance in (x, y, θ) is rotated into the tangent space
-    of the pose.
-    """
+    """Prior of the initial pose, its (x, y, θ) covariance rotated into the tangent space."""
     if covariance is None:
         model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
     else:

@@ -1,10 +1,10 @@
-"""Batch MAP over all raw measurements of a team, solved again by GTSAM as measurements arrive.
+"""Incremental batch MAP over all raw measurements of a team, solved by GTSAM.
 
 Minimises Σ rᵀP⁻¹r of the initial poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the measurements over
 one pose per robot and keyframe and all landmarks (Dellaert & Kaess 2006, Square root SAM). ρ is the
 identity, or Cauchy's c² log(1 + χ²/c²). A measurement's noise is the sensor's at the range that the
-estimate predicts, and is not differentiated: the graph is built again at each new estimate. Poses
-are perturbed on the right.
+estimate predicts, and is not differentiated: the graph is rebuilt at each new estimate. Poses are
+perturbed on the right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,24 +29,24 @@ from team.estimation.geometry import Pose, compose, tangent
 from team.estimation.models import located, predicted
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
-"""A robust solution begins with Cauchy's scale 8 c, which narrows to c: a measurement that is far
-off since a pose was dead-reckoned is not taken for an outlier."""
+"""A robust solution begins with Cauchy's scale 8 c, which narrows to c: errors of dead reckoning
+are no outliers.
+"""
 _POSES = 2**32
-"""First key of a pose; the key of a landmark is its id, which is below 2³²."""
+"""First key of a pose; a landmark's is its id < 2³²."""
 
 
 class UnsolvableError(ValueError):
-    """The measurements have no solution: some unknown is not determined, or a number overflows."""
+    """An unknown is undetermined, or a number overflows."""
 
 
 @dataclass(frozen=True, eq=False)
 class GrowingBatch:
-    """An estimate of all poses and landmarks, in the map frame.
+    """Estimate of all poses and landmarks, in the map frame.
 
-    starts: initial pose of each robot with its covariance in (x, y, θ); None: exactly known.
-    steps: in their order; step k ends at pose len(starts) + k. poses: (x [m], y [m], θ [rad]),
-    the initial poses first. landmarks: [m], by id. robust_c: Cauchy's scale on √χ² of a measurement
-    (2 numbers); None for least squares.
+    starts: initial poses with covariance in (x, y, θ); None: exact. steps: step k ends at pose
+    len(starts) + k. poses: (x [m], y [m], θ [rad]), initial poses first. landmarks: [m], by id.
+    robust_c: Cauchy's scale on √χ² of a measurement (2 numbers); None: least squares.
     """
 
     starts: Mapping[str, tuple[Pose, Matrix | None]]
@@ -57,13 +57,11 @@ class GrowingBatch:
 
     @property
     def ids(self) -> UInt32[np.ndarray, " L"]:
-        """The landmarks' ids, ascending."""
+        """Ids of the landmarks, ascending."""
         return np.array(sorted(self.landmarks), np.uint32)
 
     def places(self, robot: str) -> list[int]:
-        """The rows of a robot's poses, its initial pose first; raises ValueError for a robot
-        without one.
-        """
+        """Rows of a robot's poses, initial pose first; ValueError without one."""
         robots = list(self.starts)
         if robot not in self.starts:
             raise ValueError(f"{robot} has no start")
@@ -72,26 +70,26 @@ class GrowingBatch:
 
     @property
     def cost(self) -> float:
-        """Σ of χ² of all factors, under the loss; about `dof` where the models are right."""
+        """Σ of χ² of all factors, under the loss; about `dof` for correct models."""
         return 2.0 * float(self._graph.error(self.values))
 
     @property
     def dof(self) -> int:
-        """Numbers in all factors less the number of unknowns: 2 n − 2 L, since there are as many
-        initial poses and motions as poses.
+        """2 n − 2 L for n measurements and L landmarks: initial poses and motions are as many as
+        poses.
         """
         return 2 * sum(len(step.ids) for step in self.steps) - 2 * len(self.landmarks)
 
     @cached_property
     def newton_decrement(self) -> float:
-        """√(gᵀH⁻¹g): the length of the next Newton step in standard deviations."""
+        """√(gᵀH⁻¹g): length of the next Newton step in standard deviations."""
         try:
             return newton_step(load_gtsam(), self._graph.linearize(self.values))[1]
         except RuntimeError as error:
             raise UnsolvableError(str(error).strip()) from error
 
     def converged(self, least_decrement: float) -> bool:
-        """Whether the next step goes no farther than that."""
+        """Whether the next step is short enough."""
         return self.newton_decrement <= least_decrement
 
     @cached_property
@@ -110,7 +108,7 @@ class GrowingBatch:
         return self.graph(self.robust_c)
 
     def graph(self, robust_c: float | None) -> Any:
-        """The factors, with the noise of measurements at the present estimate."""
+        """Factors, with measurement noise at the present estimate."""
         gtsam = load_gtsam()
         graph = gtsam.NonlinearFactorGraph()
         floor = np.diag(FLOOR_SIGMAS) ** 2
@@ -137,7 +135,7 @@ class GrowingBatch:
 
     @cached_property
     def marginals(self) -> Any:
-        """GTSAM's marginals; raises `UnsolvableError` where an unknown is not determined."""
+        """GTSAM's marginals; raises `UnsolvableError`."""
         try:
             return load_gtsam().Marginals(self._graph, self.values)
         except RuntimeError as error:
@@ -147,17 +145,17 @@ class GrowingBatch:
 def initial_state(
     starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None
 ) -> GrowingBatch:
-    """The robots' initial poses alone; raises NotInstalledError without GTSAM."""
+    """Robots' initial poses alone; raises NotInstalledError."""
     load_gtsam()
     mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
     return GrowingBatch(dict(starts), robust_c, (), mean, {})
 
 
 def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
-    """The batch with more steps, in the given order.
+    """Append steps to the batch.
 
-    A new pose is dead-reckoned from the robot's newest one, a new landmark is where its first
-    measurement puts it. Raises ValueError for a robot that has no initial pose.
+    A new pose is dead-reckoned, a new landmark placed by its first measurement. Raises ValueError
+    for a robot without an initial pose.
     """
     newest = {robot: batch.poses[batch.places(robot)[-1]] for robot in batch.starts}
     poses, landmarks = [*batch.poses], dict(batch.landmarks)
@@ -178,9 +176,7 @@ def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
 
 
 def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> GrowingBatch:
-    """The estimate after at most so many iterations of Levenberg-Marquardt, ended where it has
-    converged (`converged` tells). Raises `UnsolvableError`.
-    """
+    """Iterate Levenberg-Marquardt until `converged` or the limit; raises `UnsolvableError`."""
     for scale in _scales(batch.robust_c):
         left = iterations
         while left > 0 and not (scale == batch.robust_c and batch.converged(least_decrement)):
@@ -197,7 +193,6 @@ def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> Grow
 
 
 def _scales(robust_c: float | None) -> list[float | None]:
-    """Cauchy's scales of a robust solution, narrowing to `robust_c`."""
     if robust_c is None:
         return [None]
     scales = [ROBUST_START * robust_c]
@@ -209,7 +204,6 @@ def _scales(robust_c: float | None) -> list[float | None]:
 def _descended(
     batch: GrowingBatch, scale: float | None, iterations: int
 ) -> tuple[GrowingBatch, int]:
-    """The optimum of the present graph, and the number of iterations that it took."""
     gtsam = load_gtsam()
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
@@ -231,7 +225,7 @@ def _descended(
 
 
 def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
-    """Mean and joint marginal covariance of all landmarks."""
+    """Mean and joint covariance of all landmarks."""
     ids = batch.ids
     means = np.array([batch.landmarks[id_] for id_ in ids.tolist()]).reshape(-1, 2)
     n = len(ids)
@@ -247,9 +241,8 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
-    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ).
-
-    Raises ValueError for a robot that is not in the batch.
+    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ); ValueError for an
+    unknown robot.
     """
     place = batch.places(robot)[-1]
     return PoseGaussian(batch.poses[place], _covariance(batch, place))
@@ -258,7 +251,7 @@ def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
 def trajectory(
     batch: GrowingBatch, robot: str
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """The robot's poses from its start on, each with its marginal covariance in (x, y, θ)."""
+    """Poses of the robot with marginal covariances in (x, y, θ)."""
     own = batch.places(robot)
     return batch.poses[own], np.array([_covariance(batch, place) for place in own])
 

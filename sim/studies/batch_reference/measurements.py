@@ -1,4 +1,4 @@
-"""Converts a log's raw measurements to chains of poses, the input of the batch optimiser."""
+"""Convert a log's raw measurements to chains of poses, the input of the batch optimiser."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -29,21 +29,20 @@ _TAKEN = frozenset(
     channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS, ch.SIGHTINGS)
 )
 _ENDLESS_S = 1e9
-"""Length [s] of the batch's only window."""
 
 
 JITTER_NS = 1_000_000
-"""Odometry intervals that are further apart have one missing between them."""
+"""Gap [ns] beyond which an odometry interval is missing."""
 
 
 class BatchReferenceError(RuntimeError):
-    """The batch reference can not be computed; the text says what is missing and what to do."""
+    """The batch reference cannot be computed; the text gives reason and remedy."""
 
 
 class Scan(NamedTuple):
-    """The measurements from one pose: accepted and calibrated ranges [m] and bearings [rad].
+    """Accepted, calibrated ranges [m] and bearings [rad] from one pose.
 
-    own: the covariances that they carry (`team.estimation.scans`).
+    own: their covariances (`team.estimation.scans`).
     """
 
     ids: UInt32[np.ndarray, " n"]
@@ -52,9 +51,8 @@ class Scan(NamedTuple):
     own: Own = unclaimed(0)
 
     def noise(self, k: int, sensor: Sensor, distance: float) -> Matrix:
-        """The covariance of (range, bearing) of measurement k at this predicted range.
-
-        Of a point it is the first-order covariance of its range and bearing at the measured point.
+        """Covariance of (range, bearing) k at this predicted range; of a point, at the measured
+        one.
         """
         if not self.own.size:
             return np.diag(noise(sensor, distance))
@@ -68,9 +66,9 @@ class Chain:
     pose.
 
     The base is at pose ∘ mount⁻¹ (`of_base`, `of_sensor`). increments[i] leads from pose i to pose
-    i + 1, scans[i] is measured from pose i + 1. start: the initial pose (None: unknown), with its
-    covariance (None: exact). sightings: inter-robot measurements from the base's poses at the
-    team's grid times, if requested.
+    i + 1, scans[i] is from pose i + 1. start: initial pose (None: unknown), with its covariance
+    (None: exact). sightings: inter-robot measurements from the base's poses at grid times, if
+    requested.
     """
 
     config: RobotConfig
@@ -84,21 +82,21 @@ class Chain:
 
     @property
     def mount(self) -> Pose:
-        """The sensor's pose on the base."""
+        """Pose of the sensor on the base."""
         return np.array(self.config.sensor.mount)
 
     def of_sensor(self, base: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """The sensor's poses for these poses of the base."""
+        """The sensor's poses."""
         return np.array([compose(pose, self.mount) for pose in base]).reshape(-1, 3)
 
     def of_base(self, poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """The base's poses for these poses of the sensor."""
+        """The base's poses."""
         away = inverse(self.mount)
         return np.array([compose(pose, away) for pose in poses]).reshape(-1, 3)
 
     @property
     def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
-        """The poses by odometry alone, in the frame of the first."""
+        """Poses by odometry alone, in the first one's frame."""
         poses = [np.zeros(3)]
         for increment in self.increments:
             poses.append(compose(poses[-1], increment.mean))
@@ -108,11 +106,10 @@ class Chain:
 def chains_of(
     samples: Iterable[Sample], scenario: TeamConfig, *, sightings: bool = False
 ) -> list[Chain]:
-    """The chains of all robots by (robot, incarnation), with each measurement once in the order of
-    its counter.
+    """Chains of all robots by (robot, incarnation), each measurement once and in order.
 
-    With inter-robot measurements there is a pose at each time of the team's grid
-    (`front_end.node_s`), too. Raises WireError for an invalid measurement.
+    sightings: with a pose at each grid time (`front_end.node_s`). Raises WireError for an invalid
+    measurement.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
@@ -136,7 +133,7 @@ def chains_of(
 def _chain(
     config: RobotConfig, incarnation: int, measurements: Sequence[m.Measurement], sightings: bool
 ) -> Chain | None:
-    """None for a stream without odometry: it has no motion that links its poses."""
+    """None for a stream without odometry."""
     odometry = [
         translate.interval_of(measurement, config)
         for measurement in measurements
@@ -191,9 +188,6 @@ def _chain(
 def _of_sensor(
     pose: Pose | None, covariance: Matrix | None, mount: Pose
 ) -> tuple[Pose | None, Matrix | None]:
-    """The initial pose, with its covariance, of a sensor that is mounted on a base with this
-    initial pose.
-    """
     if pose is None or not mount.any():
         return pose, covariance
     found = moved_by(
@@ -203,18 +197,17 @@ def _of_sensor(
 
 
 def _grid(config: RobotConfig) -> PoseGrid | None:
-    """The grid of a robot whose submaps have pose nodes."""
     if not config.front_end.node_s:
         return None
     return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))
 
 
 def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
-    """Three ways to fill a chain's poses between known poses (at least one) by its odometry.
+    """Interpolate a chain's poses between known poses (at least one) by its odometry, in three
+    ways.
 
-    Forward from the known pose before each; backward from the known pose after it; and the mean of
-    both, weighted by the time to each. Odometry between a pose and a known pose is taken to the
-    chain's last pose that is not after the known one.
+    Forward from the known pose before; backward from the one after; and the mean of both, weighted
+    by the time to each. Odometry up to a known pose counts to the last pose not after it.
     """
     odometry = chain.dead_reckoned
     at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1

@@ -1,17 +1,14 @@
-"""Computes the batch reference: the MAP over all raw measurements of a log, by GTSAM (extra
+"""Compute the batch reference: the MAP over all raw measurements of a log, by GTSAM (extra
 `batch-reference`).
 
-There is one pose per keyframe of each robot: its sensor's, wherever that is mounted. Factors: the
-initial poses; between consecutive poses the odometry, truth = mean ∘ Exp(ξ) with the tangent
-covariance of `increment_of`, which is GTSAM's `BetweenFactorPose2` with its logarithm; each
-accepted range and bearing, independent, with the sensor's noise or its own (under a Cauchy loss
-where the centre's `robust_c` asks for a robust join). Levenberg-Marquardt starts from the joined
-solution with the paths filled in three ways, so its result is never worse than the joined one (with
-the noise `profile` it starts from the best of the three). With the noise `white` every
-measurement's error is independent and inter-robot measurements are not used; with `profile` the
-sensor's errors persist according to the scenario, biases are estimated and inter-robot measurements
-are factors (`errors`). Not modelled: an error of the odometry's scale at speeds that the profile
-does not cover.
+Each robot has one pose of its sensor per keyframe. Factors: the initial poses; the odometry, truth
+= mean ∘ Exp(ξ) with the tangent covariance of `increment_of` (GTSAM's `BetweenFactorPose2` with its
+logarithm); each accepted range and bearing, independent, with the sensor's noise or its own, under
+a Cauchy loss if the centre has `robust_c`. Levenberg-Marquardt starts from the joined solution with
+the paths filled in three ways, so the result is never worse (noise `profile`: from the best of the
+three). With the noise `white` errors are independent and inter-robot measurements unused; with
+`profile` the sensor's errors persist, biases are estimated and inter-robot measurements are factors
+(`errors`). Not modelled: an odometry scale error at speeds outside the profile.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -47,9 +44,9 @@ from team.registry import NotInstalledError
 from team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
-"""√(gᵀH⁻¹g) allowed at the optimum: the length of the next Newton step in standard deviations.
+"""√(gᵀH⁻¹g) allowed at the optimum: length of the next Newton step in standard deviations.
 
-A robust loss is minimised by iterated reweighting, which converges by a constant factor.
+Iterated reweighting of a robust loss converges linearly.
 """
 ITERATIONS = 1000
 NoiseKind = Literal["white", "profile"]
@@ -60,10 +57,10 @@ NO_BIASES = (None, None, None)
 class BatchReference:
     """The optimum. cost = Σ‖r‖² there, initial_cost at the best initial values.
 
-    gradient_norm: of the cost at the optimum, in the units of the state; newton_decrement:
-    √(gᵀH⁻¹g). paths: all poses; final_pose_nees_per_dof and position_rmse_m where there is truth.
-    left_out: robots whose place in the team's frame is not known, and why. biases: (bearing [rad],
-    range offset [m], range scale) of each robot. team: the run's own final map.
+    gradient_norm: of the cost, in state units; newton_decrement: √(gᵀH⁻¹g). paths: all poses;
+    final_pose_nees_per_dof and position_rmse_m where there is truth. left_out: robots without a
+    known place, with the reason. biases: (bearing [rad], range offset [m], range scale) by robot.
+    team: the run's own final map.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -84,7 +81,7 @@ class BatchReference:
     team: MapErrors | None
 
     def to_json(self) -> dict[str, Any]:
-        """The figures under the names that machines read."""
+        """Figures under the names of the JSON output."""
         return {
             "noise": self.noise,
             "landmarks": len(self.ids),
@@ -123,10 +120,9 @@ def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
 
 
 def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchReference:
-    """The batch MAP of a log of a run under the rule `join` or `batch`, over the whole run.
+    """Compute the batch MAP of a log of a whole run under the rule `join` or `batch`.
 
-    Raises BatchReferenceError without GTSAM, without a scenario, without a joined map, or when the
-    optimiser does not converge.
+    Raises BatchReferenceError without GTSAM, scenario, joined map or convergence.
     """
     gtsam = _gtsam()
     recorded = list(samples)
@@ -185,9 +181,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
 def _solved(
     gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, dict[str, float]]:
-    """The best optimum over all initial values, and its figures; raises BatchReferenceError if none
-    has converged.
-    """
+    """Best optimum over all initial values, and its figures; raises BatchReferenceError."""
     optima = [descend(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
     initial_cost = min(2.0 * graph.error(initial) for initial in initials)
@@ -221,9 +215,7 @@ def _gtsam() -> Any:
 def placed(
     chains: Sequence[Chain], run: Evaluation
 ) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
-    """The chains whose place in the team's frame is known, with the joined poses (and the initial
-    pose) that determine it.
-    """
+    """Chains with a known place in the team's frame, and the joined poses that determine it."""
     known, anchors, left_out = [], [], []
     for chain in chains:
         robot = chain.config.id
@@ -250,9 +242,9 @@ def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
 
 
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
-    """The values after Gauss-Newton; a step that does not lower the cost is halved.
+    """Gauss-Newton with halving of steps that do not lower the cost.
 
-    For factors in Python: GTSAM's Levenberg-Marquardt takes five times as long for one iteration.
+    With Python factors, GTSAM's Levenberg-Marquardt takes five times as long.
     """
     values, cost = initial, graph.error(initial)
     for _ in range(ITERATIONS):
@@ -279,7 +271,6 @@ def _reference_figures(
     run: Evaluation,
     **figures: Any,
 ) -> BatchReference:
-    """The optimum's map, paths and covariances, compared with the truth."""
     assert run.map is not None
     marginals = gtsam.Marginals(graph, optimum)
     ids = np.array(landmarks, dtype=np.uint32)

@@ -1,1 +1,1 @@
-"""Estimators of the sources, for comparison; nothing that maps in earnest needs this folder."""
+"""Estimators of the sources, for comparison; the product does not use them."""

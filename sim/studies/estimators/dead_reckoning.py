@@ -1,7 +1,7 @@
-"""Dead reckoning: the odometry alone, composed on SE(2).
+"""Dead reckoning: odometry composed on SE(2).
 
-pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound, and no measurement reduces
-it. Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A, compare SLAM with it.
+pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound. Thrun et al. 2005, chapter
+5; Ma & Ma, section VI-A, compare SLAM with it.
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from team.estimation.models import Increment
 class DeadReckoning:
     """map_from_robot = mean ∘ Exp(ξ), ξ ~ N(0, covariance) in (forward, left, turn).
 
-    In these coordinates the pose stays near a Gaussian where its position is bent to a banana.
+    In these coordinates the pose stays near a Gaussian although its position is banana-shaped.
     """
 
     pose: Increment
 
 
 def initial_state(pose: Pose) -> DeadReckoning:
-    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 
@@ -39,7 +39,7 @@ def filter_step(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> DeadReckoning:
-    """The pose composed with the increment; the measurements are not used."""
+    """Compose the pose with the increment."""
     return DeadReckoning(state.pose.then(increment))
 
 
@@ -51,5 +51,5 @@ def pose_gaussian(state: DeadReckoning) -> PoseGaussian:
 
 
 def landmark_gaussian(state: DeadReckoning) -> LandmarkGaussian:
-    """The empty map: dead reckoning estimates no landmark."""
+    """The empty map."""
     return NO_LANDMARKS

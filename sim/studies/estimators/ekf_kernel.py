@@ -1,8 +1,8 @@
-"""The EKF-SLAM step in one compiled pass: motion, measurements of known landmarks, new landmarks.
+"""EKF-SLAM step in one compiled pass: motion, measurements of known landmarks, new landmarks.
 
-The state is (x, y, theta, x₁, y₁, …); `mean` and `P` are arrays that the caller just made, with
-room for the new landmarks, and are written in place. A sensor is (σ_range², σ_range_per_m²,
-σ_bearing²); the noise of a range is that of the predicted range.
+The state is (x, y, theta, x₁, y₁, …); `mean` and `P` have room for the new landmarks and are
+written in place. A sensor is (σ_range², σ_range_per_m², σ_bearing²); range noise is at the
+predicted range.
 """
 
 import math
@@ -28,12 +28,11 @@ def step(
     measurements: Float[np.ndarray, "k 2"],
     sensor: Triple,
 ) -> bool:
-    """One step; before it only the pose and the first `known` landmarks are in mean and P.
+    """Perform one step; before it only the pose and the first `known` landmarks are in mean and P.
 
-    slots: the landmark of each measurement in the state; first: whether it is a first sight. A
-    further measurement of a landmark that is new in this step updates it after it was placed. False
-    where the covariance of what is predicted is not positive definite; mean and P are then worth
-    nothing.
+    slots: landmark of each measurement in the state; first: first sight of it. Further measurements
+    of a new landmark update it after its placement. False where the innovation covariance is not
+    positive definite; mean and P are then invalid.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]
@@ -56,8 +55,7 @@ def _move(
     motion: Float[np.ndarray, "3"],
     Q: Float[np.ndarray, "3 3"],
 ) -> None:
-    """The pose becomes pose ∘ motion ∘ Exp(ξ), ξ ~ N(0, Q): P_pp ← F P_pp Fᵀ + G Q Gᵀ,
-    P_pl ← F P_pl.
+    """Move: pose ← pose ∘ motion ∘ Exp(ξ), ξ ~ N(0, Q): P_pp ← F P_pp Fᵀ + G Q Gᵀ, P_pl ← F P_pl.
 
     F = ∂(pose ∘ motion)/∂pose = [[I, ∂R/∂θ t], [0, 1]], G = blkdiag(R(θ'), 1).
     """
@@ -89,10 +87,10 @@ def _place(
     measurement: Float[np.ndarray, "2"],
     sensor: Triple,
 ) -> None:
-    """A landmark at first sight becomes the numbers `at` and at + 1 of the state.
+    """Place a new landmark in the entries `at` and at + 1 of the state.
 
-    g = (x, y) + r (cos, sin)(theta + b): with G_p = ∂g/∂pose its rows are P_l· = G_p P_p· and
-    P_ll = G_p P_pp G_pᵀ + G_z R G_zᵀ, so its error is that of the pose too.
+    g = (x, y) + r (cos, sin)(theta + b): with G_p = ∂g/∂pose its rows are P_l· = G_p P_p· and P_ll
+    = G_p P_pp G_pᵀ + G_z R G_zᵀ, so its error includes the pose's.
     """
     own = np.empty(3)
     pose = (mean[0], mean[1], mean[2])
@@ -110,7 +108,7 @@ def _place(
 
 @compiled
 def _applied(seen_at: Triple, at: int, vector: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """H v of one measurement: the rows (range, bearing) of a landmark that lies `at` in the state.
+    """H v of one measurement: the rows (range, bearing) of a landmark with index `at` in the state.
 
     seen_at is (d, ex, ey): distance and unit vector to the landmark. With e⊥ = (−ey, ex) and δ the
     landmark's entries of v less the position's: (e·δ, e⊥·δ/d − v_theta).
@@ -127,7 +125,6 @@ def _all_applied(
     vector: Float[np.ndarray, " n"],
     out: Float[np.ndarray, " m"],
 ) -> None:
-    """H v of all measurements into `out`."""
     for i in range(len(places)):
         seen_at = (sights[i, 0], sights[i, 1], sights[i, 2])
         out[2 * i], out[2 * i + 1] = _applied(seen_at, places[i], vector)
@@ -141,10 +138,10 @@ def _condition(
     measurements: Float[np.ndarray, "t 2"],
     sensor: Triple,
 ) -> bool:
-    """Measurements of the landmarks at `places`, all linearised at the state before them.
+    """Update by measurements of the landmarks at `places`, all linearised at the state before them.
 
-    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`.
-    False where S is not positive definite.
+    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`. False where S is not
+    positive definite.
     """
     m, n = 2 * len(places), len(mean)
     if m == 0:
@@ -206,7 +203,7 @@ def _joseph(
 def _subtract(
     vector: Float[np.ndarray, " n"], factor: float, other: Float[np.ndarray, " k"]
 ) -> None:
-    """The vector less factor times the first entries of `other`: no temporary array is made."""
+    """Compute vector −= factor · other on its first entries, without a temporary array."""
     for i in range(len(vector)):
         vector[i] -= factor * other[i]
 

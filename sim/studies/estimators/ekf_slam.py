@@ -1,8 +1,8 @@
 """EKF-SLAM with known data association: one Gaussian over the pose and all landmarks.
 
-The filter of Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section
-2.6 and experiment 1. Every measurement is linearised once, at the estimate of its time, so over a
-long run the covariance becomes too small (Julier and Uhlmann 2001).
+Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section 2.6 and
+experiment 1. Every measurement is linearised once, at the estimate of its time, so over a long run
+the covariance becomes too small (Julier and Uhlmann 2001).
 """
 
 from dataclasses import dataclass
@@ -23,8 +23,7 @@ from team.estimation.submap import LocalMap
 class EkfSlam:
     """N(mean, covariance) of (pose, landmarks in order of first sight) in the map frame.
 
-    ids:  the landmarks in order of first sight.
-    mean: (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
+    ids: in order of first sight. mean: (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -33,7 +32,7 @@ class EkfSlam:
 
 
 def initial_state(pose: Pose) -> EkfSlam:
-    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
@@ -45,11 +44,10 @@ def filter_step(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> EkfSlam:
-    """Move, take all measurements of known landmarks at once, then place the new ones.
+    """Move, update by all measurements of known landmarks at once, then place the new ones.
 
-    ranges [m] and bearings [rad] are corrected by the calibration. A further measurement of a
-    landmark that is new in this keyframe updates it after it was placed. Raises NotACovarianceError
-    where the state's covariance is none any more, so that the measurements can not be predicted.
+    ranges [m] and bearings [rad] are calibrated. Further measurements of a new landmark update it
+    after its placement. Raises NotACovarianceError.
     """
     ids_after, slots, first = slots_of(state.ids, ids)
     n = 3 + 2 * len(ids_after)
@@ -81,7 +79,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the measurements that `filter_step` would take; of landmarks that are known already."""
+    """NIS of the measurements of mapped landmarks that `filter_step` would use."""
     return joint_innovation(
         landmarks=state.ids,
         mean=state.mean,
@@ -95,18 +93,18 @@ def innovation(
 
 
 def pose_gaussian(state: EkfSlam) -> PoseGaussian:
-    """The marginal of the pose."""
+    """Marginal of the pose."""
     return PoseGaussian(state.mean[:3], state.covariance[:3, :3])
 
 
 def landmark_gaussian(state: EkfSlam) -> LandmarkGaussian:
-    """The joint marginal of all landmarks."""
+    """Joint marginal of all landmarks."""
     local = local_map(state)
     return LandmarkGaussian(local.ids, local.landmarks, local.covariance[3:, 3:])
 
 
 def local_map(state: EkfSlam) -> LocalMap:
-    """The whole Gaussian with its landmarks by ascending id: a submap, if it began at pose zero."""
+    """The whole Gaussian, landmarks by ascending id: a submap, if it began at pose zero."""
     order = np.argsort(state.ids)
     columns = (3 + 2 * order[:, None] + np.arange(2)).ravel()
     at = np.concatenate((np.arange(3), columns))

@@ -1,9 +1,8 @@
-"""FastSLAM 1.0 whose particles each associate for themselves, by maximum likelihood.
+"""FastSLAM 1.0 with maximum-likelihood data association in each particle.
 
-Montemerlo and Thrun 2003: each particle takes each detection for its landmark with the largest
-likelihood, or for a new one where none reaches that of one at the gate's edge. Particles have maps
-of different sizes, so there is no common state; the map and the association are those of the
-heaviest particle.
+Montemerlo and Thrun 2003: each particle assigns a detection to its likeliest landmark, or to a new
+one where none reaches the likelihood at the gate's edge. Maps differ in size, so there is no common
+state; map and association are the heaviest particle's.
 """
 
 from dataclasses import dataclass, replace
@@ -20,9 +19,9 @@ from team.estimation.models import Increment
 
 @dataclass(frozen=True)
 class FastSlamMl:
-    """M particles with C places for landmarks each, of which the first counts[m] are used.
+    """M particles with C landmark slots each, of which the first counts[m] are used.
 
-    seen: how often each was. took: the place of each detection so far, by particle.
+    seen: detections per slot. took: slot of each detection, by particle.
     """
 
     poses: Float[np.ndarray, "M 3"]
@@ -35,7 +34,7 @@ class FastSlamMl:
 
 
 def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
-    """Particles with these poses and logarithms of weights, and no landmark."""
+    """Particles without landmarks; logs: of the weights."""
     particles = len(poses)
     return FastSlamMl(
         poses=poses,
@@ -58,9 +57,7 @@ def filter_step(
     generator: np.random.Generator,
     gate: float = GATE,
 ) -> FastSlamMl:
-    """Every particle moves, associates, updates its map and its weight; then they are drawn anew
-    where too few carry the weight.
-    """
+    """Move, associate and update each particle; resample if few carry the weight."""
     values, vectors = np.linalg.eigh(increment.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = increment.mean + dense.product(generator.standard_normal((len(state.poses), 3)), root.T)
@@ -75,7 +72,7 @@ def filter_step(
 
 
 class _Scan:
-    """One scan being taken: copies of the state's arrays, and what is taken already."""
+    """A scan in progress: the state's arrays, and the landmarks already used."""
 
     def __init__(self, state: FastSlamMl) -> None:
         self._state = state
@@ -86,7 +83,7 @@ class _Scan:
         self._took: list[Int64[np.ndarray, " M"]] = []
 
     def take(self, r: float, b: float, sensor: Sensor, gate: float) -> None:
-        """One detection: in each particle the likeliest landmark that is free, or a new one."""
+        """Assign a detection in each particle to its likeliest free landmark, or a new one."""
         x, y, heading = self._state.poses.T
         particles = np.arange(len(x))
         dx, dy = self._means[..., 0] - x[:, None], self._means[..., 1] - y[:, None]
@@ -159,7 +156,7 @@ class _Scan:
         self._counts[at] += 1
 
     def state(self) -> FastSlamMl:
-        """The particles after the scan."""
+        """Particles after the scan."""
         took = self._state.took
         if self._took:
             took = np.column_stack((took, *self._took))
@@ -175,7 +172,6 @@ class _Scan:
 
 
 def _with_room(state: FastSlamMl, more: int) -> FastSlamMl:
-    """With places for so many more landmarks in every particle."""
     places = state.means.shape[1]
     if int(state.counts.max()) + more <= places:
         return state
@@ -194,7 +190,6 @@ def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
 
 
 def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
-    """Systematic resampling where the effective number is below this share."""
     weights, m = _weights(state), len(state.poses)
     if 1.0 / float(dense.product(weights, weights)) >= below * m:
         return state
@@ -213,13 +208,13 @@ def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) 
 
 
 def taken(state: FastSlamMl) -> Int64[np.ndarray, " N"]:
-    """The number of the landmark that each detection went to in the heaviest particle."""
+    """Landmark of each detection in the heaviest particle."""
     numbers: Int64[np.ndarray, " N"] = UNNAMED + state.took[int(np.argmax(state.logs))]
     return numbers
 
 
 def pose_gaussian(state: FastSlamMl) -> PoseGaussian:
-    """The moments of all particles."""
+    """Moments of all particles."""
     weights = _weights(state)
     heading = float(mean_direction(state.poses[:, 2], weights))
     mean = np.append(dense.product(weights, state.poses[:, :2]), heading)
@@ -229,7 +224,7 @@ def pose_gaussian(state: FastSlamMl) -> PoseGaussian:
 
 
 def landmark_gaussian(state: FastSlamMl) -> LandmarkGaussian:
-    """The map of the heaviest particle; its landmarks are independent given its path."""
+    """Map of the heaviest particle; its landmarks are independent given its path."""
     best = int(np.argmax(state.logs))
     count = int(state.counts[best])
     if not count:

@@ -1,10 +1,9 @@
-"""Hybrid-SLAM as the thesis states it: after each step all particles become their weighted mean.
+"""Hybrid-SLAM as stated in the thesis: after each step all particles become their weighted mean.
 
-W. Xu, sections 4.2 and 4.3. The reset forgets how the pose and the landmarks depend on each other
-and all of the pose's uncertainty but that of the last step, so the covariances come out far too
-small; `window` is the estimator that does not. Two things are set right: the initial covariance of
-a landmark follows from the measurement (the thesis sets 30 m), and the weights start anew with each
-step, as its text says, not as its program does.
+W. Xu, sections 4.2 and 4.3. The reset discards the correlation of pose and landmarks and all pose
+uncertainty but the last step's, so the covariances are far too small; `window` avoids this. Two
+corrections: the initial covariance of a landmark follows from the measurement (thesis: 30 m), and
+the weights start anew with each step, as in the text, not the program.
 """
 
 from dataclasses import dataclass
@@ -23,12 +22,10 @@ from team.estimation.models import Increment
 
 @dataclass(frozen=True)
 class ThesisState:
-    """The mean pose and a map of independent landmarks, in the map frame.
+    """Mean pose and a map of independent landmarks, in the map frame.
 
-    pose:            (x [m], y [m], theta [rad]).
-    pose_covariance: the spread of the last step's particles, [m², m·rad, rad²]; may be singular.
-    ids:             strictly ascending.
-    landmarks:       positions [m]; covariances: one 2 × 2 matrix each [m²].
+    pose: (x [m], y [m], theta [rad]). pose_covariance: spread of the last step's particles; may be
+    singular. ids: strictly ascending. landmarks: [m]; covariances: 2 × 2 each [m²].
     """
 
     pose: Pose
@@ -39,7 +36,7 @@ class ThesisState:
 
 
 def started(pose: Pose) -> ThesisState:
-    """A robot that knows its pose and no landmark."""
+    """An exact pose without landmarks."""
     return ThesisState(
         pose, np.zeros((3, 3)), np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 2, 2))
     )
@@ -57,8 +54,7 @@ def filter_step(
 ) -> ThesisState:
     """Sample poses about the mean, update and weigh (FastSLAM 1.0), and reset to eq. 4.5-4.6.
 
-    The landmarks that are not read keep their values exactly. ranges [m] and bearings [rad] are
-    corrected by the calibration.
+    Unmeasured landmarks stay exactly equal. ranges [m] and bearings [rad] are calibrated.
     """
     after, _ = fastslam.filter_step(
         particles=reset(state, ids, particles),
@@ -83,10 +79,7 @@ def filter_step(
 
 
 def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> Particles:
-    """So many particles, all of them at the mean: what a step knows of these landmarks before it.
-
-    Nothing in it depends on anything else, and of the pose's covariance nothing is left.
-    """
+    """Particles at the mean with these landmarks, without correlations or pose covariance."""
     observed = np.isin(state.ids, ids)
     blocks = state.covariances[observed]
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
@@ -105,10 +98,10 @@ def absorbed(
     landmarks: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 2 2"],
 ) -> ThesisState:
-    """These landmarks replace the state's own of the same id; unknown ones are added.
+    """Replace the state's landmarks of the same id; add unknown ones.
 
-    This is the feedback of the thesis' fused map (section 5.2): what is fused from this state again
-    counts its measurements again.
+    The feedback of the thesis' fused map (section 5.2): fusing the result again counts measurements
+    again.
     """
     others = ~np.isin(state.ids, ids)
     merged = np.concatenate((state.ids[others], ids))

@@ -1,11 +1,10 @@
-"""Hybrid-SLAM as the appendix of W. Xu's thesis has it, where its program differs from its text.
+"""Hybrid-SLAM as in the appendix of W. Xu's thesis, where its program differs from its text.
 
-The particles' poses and landmarks become their weighted mean after each step, as in the text
-(`hybrid_thesis`); but the weights go on from step to step (`particle_w(j) = particle_w(j)*w`, set
-back only if all are zero) and nothing is resampled, so that a few particles soon carry all the
-weight and the others' spread no longer counts. Each particle keeps its own landmark covariances:
-those of eq. 4.6 are computed and not used. A new landmark begins with 15 m and 17.8°, turned by a
-matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
+Poses and landmarks become their weighted mean after each step, as in the text (`hybrid_thesis`);
+but the weights carry over (`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without
+resampling: soon a few particles carry all the weight. Each particle keeps its own landmark
+covariances: those of eq. 4.6 are computed and not used. A new landmark begins with 15 m and 17.8°,
+rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
 """
 
 import math
@@ -30,11 +29,10 @@ FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
 
 @dataclass(frozen=True)
 class CodedState:
-    """The particles before they were set to their mean, and the ones after.
+    """The particles before and after they were set to their mean.
 
-    drawn: the last step's particles, whose pose and map are reported.
-    particles: all poses and landmarks are the mean; weights and covariances are each particle's
-        own.
+    drawn: the last step's particles, whose pose and map are reported. particles: at the mean, with
+    own weights and covariances.
     """
 
     drawn: Particles
@@ -42,7 +40,7 @@ class CodedState:
 
 
 def started(pose: Pose, particles: int) -> CodedState:
-    """A robot that knows its pose and no landmark."""
+    """An exact pose without landmarks."""
     at = fastslam.at_poses(np.tile(pose, (particles, 1)))
     return CodedState(at, at)
 
@@ -56,9 +54,9 @@ def filter_step(
     bearings: Float[np.ndarray, " n"],
     generator: np.random.Generator,
 ) -> CodedState:
-    """Move, weigh on top of the weights so far, update the landmarks, set all to the mean.
+    """Move, multiply the weights, update the landmarks, set all to the mean.
 
-    ranges [m] and bearings [rad] are corrected by the calibration.
+    ranges [m] and bearings [rad] are calibrated.
     """
     known = len(state.particles.ids)
     drawn, _ = fastslam.filter_step(
@@ -88,7 +86,7 @@ def filter_step(
 def _at_first(
     poses: Float[np.ndarray, "M 3"], range_m: float, bearing: float
 ) -> Float[np.ndarray, "M 3"]:
-    """Gz r Gzᵀ of each particle as (xx, xy, yy), with Gz as it is printed."""
+    """Gz r Gzᵀ of each particle as (xx, xy, yy), with Gz as printed."""
     s, c = elementwise.sin_and_cos(poses[:, 2] + bearing)
     along, across = FIRST_RANGE_VAR, elementary.squared(range_m) * FIRST_BEARING_VAR
     return np.column_stack(
@@ -97,14 +95,12 @@ def _at_first(
 
 
 def pose_gaussian(state: CodedState) -> PoseGaussian:
-    """Moments of the last step's particles: all the uncertainty of a pose that is stored."""
+    """Moments of the last step's particles: the only stored uncertainty of a pose."""
     return pose_moments(state.drawn)
 
 
 def landmark_gaussian(state: CodedState) -> LandmarkGaussian:
-    """Means, and the 2 × 2 blocks of eq. 4.6; landmarks are reported as independent of each
-    other.
-    """
+    """Means, and the 2 × 2 blocks of eq. 4.6."""
     found = landmark_moments(state.drawn)
     blocks = np.kron(np.eye(len(found.ids)), np.ones((2, 2)))
     return LandmarkGaussian(found.ids, found.means, found.covariance * blocks)
@@ -116,7 +112,7 @@ def absorbed(
     landmarks: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 2 2"],
 ) -> CodedState:
-    """Every particle takes over these landmarks and covariances (`recieve_information`)."""
+    """Replace these landmarks and covariances in every particle (`recieve_information`)."""
     old, count = state.particles, len(state.particles.poses)
     others = ~np.isin(old.ids, ids)
     triangles = np.stack((covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]), axis=1)

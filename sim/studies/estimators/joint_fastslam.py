@@ -1,8 +1,8 @@
 """Multi-robot FastSLAM: a particle is a path of every robot and one map.
 
 p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, for any
-number of robots at known start poses. The particles have to cover the product of all robots'
-paths, so over-confidence comes sooner than with one robot's (`plain_fastslam`).
+number of robots at known start poses. The particles must cover the product of all paths, so
+over-confidence comes sooner than with one robot (`plain_fastslam`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,10 +24,9 @@ from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 class JointFastSlam:
     """M particles (x¹, …, xᴿ, m, w).
 
-    poses:          (x [m], y [m], theta [rad]) of each robot in each particle, in the map frame.
-    log_weights, ids, means, covariances: as in `fastslam.Particles`, one map per particle.
-    resample_below: a step begins with a resampling if the effective sample size is below this part
-        of the particles; 1: at every step, as in algorithm 1.
+    poses: (x [m], y [m], theta [rad]) by robot and particle, in the map frame. log_weights, ids,
+    means, covariances: as in `fastslam.Particles`. resample_below: relative effective sample size
+    below which a step begins with a resampling; 1: always, as in algorithm 1.
     """
 
     robots: tuple[str, ...]
@@ -43,7 +42,7 @@ class JointFastSlam:
 def initial_state(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
-    """The poses exactly known; an uncertain one is a first turn by Increment(0, covariance)."""
+    """Exact poses; for an uncertain one a first turn by Increment(0, covariance)."""
     none = fastslam.at_poses(np.zeros((particles, 3)))
     return JointFastSlam(
         robots=tuple(poses),
@@ -60,12 +59,12 @@ def initial_state(
 def filter_step(
     state: JointFastSlam, turns: Sequence[RobotStep], generator: np.random.Generator
 ) -> JointFastSlam:
-    """One step of the team: resample if the particles are thin, then the robots' turns in order.
+    """Resample if the particles are thin, then process the robots' turns in order.
 
-    Each turn multiplies the weights by its own p(zʳ | …); with the 2.0 proposal a robot's pose is
-    drawn given its measurements and the map that the turns before it left. A step may be the turn
-    of one robot, so robots need not be synchronous. Draws one uniform number if it resamples and
-    M × 3 normal ones per turn. Raises ValueError for a robot that the state does not know.
+    Each turn multiplies the weights by its own p(zʳ | …); with the 2.0 proposal a pose is drawn
+    given its measurements and the map after the earlier turns. A step may be one robot's turn, so
+    robots need not be synchronous. Draws one uniform number if it resamples and M × 3 normal ones
+    per turn. Raises ValueError for an unknown robot.
     """
     thin = state.resample_below * len(state.log_weights)
     if fastslam.effective_sample_size(state.log_weights) < thin:
@@ -104,17 +103,16 @@ def filter_step(
 
 
 def pose_gaussian(state: JointFastSlam, robot: str) -> PoseGaussian:
-    """Mean and covariance of one robot's poses. Raises ValueError for a robot not in the state."""
+    """Mean and covariance of one robot's poses; raises ValueError for an unknown robot."""
     return pose_moments(_seen_by(state, state.robots.index(robot)))
 
 
 def landmark_gaussian(state: JointFastSlam) -> LandmarkGaussian:
-    """The mixture of the particles' maps as one Gaussian."""
+    """Mixture of the particles' maps as one Gaussian."""
     return landmark_moments(_seen_by(state, 0))
 
 
 def _seen_by(state: JointFastSlam, index: int) -> Particles:
-    """The particles with the poses of one robot: what single-robot FastSLAM works on."""
     return Particles(
         state.poses[index], state.log_weights, state.ids, state.means, state.covariances
     )

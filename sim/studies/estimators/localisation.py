@@ -1,8 +1,8 @@
-"""Monte Carlo localisation: a cloud of weighted poses on a map that is known exactly.
+"""Monte Carlo localisation: a cloud of weighted poses on an exactly known map.
 
 p(pose | z, u, map) by prediction, weighing and resampling: Xu's thesis, section 3.5.1 (eq. 3.23 to
-3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2. The cloud may have many modes, so a start
-need not be known.
+3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2. The cloud may have many modes, so the
+start may be unknown.
 """
 
 import math
@@ -27,12 +27,11 @@ from team.estimation.models import Increment, variances
 
 @dataclass(frozen=True)
 class Localisation:
-    """Weighted poses and the map they move on.
+    """Weighted poses and their map.
 
-    cloud:          particles without landmarks of their own, in the map frame.
-    ids, landmarks: the map, ids strictly ascending, positions [m].
-    resample_below: a step begins with a resampling if the effective sample size is below this part
-        of the particles; Xu takes 0.5.
+    cloud: particles without landmarks, in the map frame. ids, landmarks: the map, ids strictly
+    ascending, [m]. resample_below: relative effective sample size below which a step resamples; Xu:
+    0.5.
     """
 
     cloud: Particles
@@ -47,7 +46,7 @@ def initial_state(
     ids: UInt32[np.ndarray, " L"],
     landmarks: Float[np.ndarray, "L 2"],
 ) -> Localisation:
-    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
@@ -59,9 +58,9 @@ def initial_state_anywhere(
     landmarks: Float[np.ndarray, "L 2"],
     generator: np.random.Generator,
 ) -> Localisation:
-    """Uniform over a rectangle [m] and all headings: nothing is known (Xu, figure 3.5a).
+    """Uniform over a rectangle [m] and all headings (Xu, figure 3.5a).
 
-    The particles must be dense enough that some of them fit the first measurements.
+    The particles must be dense enough for some to fit the first measurements.
     """
     low, high = np.append(lowest, -np.pi), np.append(highest, np.pi)
     poses = high - (high - low) * generator.random((particles, 3))
@@ -79,8 +78,8 @@ def filter_step(
 ) -> Localisation:
     """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
 
-    ranges [m] and bearings [rad] are corrected by the calibration; a measurement of a landmark that
-    is not on the map is left out. Draws one uniform number if it resamples and M × 3 normal ones.
+    ranges [m] and bearings [rad] are calibrated; unmapped landmarks are left out. Draws one uniform
+    number if it resamples and M × 3 normal ones.
     """
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)
@@ -108,10 +107,9 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """The innovation of the measurements that `filter_step` would take, where the map is exact.
+    """Innovation of the measurements that `filter_step` would use, on an exact map.
 
-    A cloud of several modes predicts a broad mixture, whose innovation is as uninformative as its
-    Gaussian.
+    Uninformative for a cloud of several modes.
     """
     read = np.isin(state.ids, ids)
     count, known = len(state.cloud.poses), int(read.sum())
@@ -125,7 +123,7 @@ def innovation(
 
 
 def pose_gaussian(state: Localisation) -> PoseGaussian:
-    """Mean and covariance of the cloud; for a cloud with several modes they are uninformative."""
+    """Mean and covariance of the cloud; uninformative for several modes."""
     return pose_moments(state.cloud)
 
 
@@ -144,10 +142,7 @@ def _weighed(
     measurements: Float[np.ndarray, "n 2"],
     sensor: Triple,
 ) -> Float[np.ndarray, " M"]:
-    """The weights after the measurements: log w + Σ log N(z; h(pose, landmark), R).
-
-    R is that of the predicted range.
-    """
+    """Weights log w + Σ log N(z; h(pose, landmark), R), with R at the predicted range."""
     weighed = log_weights.copy()
     bearing_sigma = math.sqrt(sensor[2])
     for i in range(len(poses)):

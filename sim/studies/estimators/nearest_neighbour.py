@@ -1,8 +1,8 @@
-"""EKF-SLAM over the whole drive that takes each detection for the nearest landmark.
+"""EKF-SLAM over the whole run with nearest-neighbour data association.
 
 Smith, Self and Cheeseman 1990 with individual compatibility and nearest neighbour (Neira and Tardós
-2001, section II): the best pair of a scan first, each detection and each landmark once, what lies
-beyond the gate is a new landmark. A wrong pair is never taken back.
+2001, section II): the best pair of a scan first, each detection and landmark once; beyond the gate
+a landmark is new. A wrong pair is never undone.
 """
 
 from dataclasses import dataclass, replace
@@ -23,14 +23,14 @@ from team.estimation.models import Increment
 
 @dataclass(frozen=True)
 class NearestNeighbour:
-    """The filter, and the number of the landmark that each detection so far went to, in order."""
+    """The filter, and the landmark of each detection so far."""
 
     slam: EkfSlam
     took: tuple[Int64[np.ndarray, " _"], ...] = ()
 
 
 def initial_state(pose: Pose) -> NearestNeighbour:
-    """The pose exactly known."""
+    """Exact pose."""
     return NearestNeighbour(ekf_slam.initial_state(pose))
 
 
@@ -43,7 +43,7 @@ def filter_step(
     bearings: Float[np.ndarray, " n"],
     gate: float = GATE,
 ) -> NearestNeighbour:
-    """Move, associate the detections (ids from UNNAMED on), and take all measurements at once."""
+    """Move, associate detections (ids from UNNAMED on), and update at once."""
     unnamed = np.flatnonzero(ids >= UNNAMED)
     if not len(unnamed):
         slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)
@@ -61,8 +61,8 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Of the measurements that `filter_step` would take, of the landmarks that it would take them
-    for: ids from UNNAMED on name the rows of a scan, not landmarks.
+    """Innovation of the measurements that `filter_step` would use, after association: ids from
+    UNNAMED on are rows of a scan.
     """
     if (ids >= UNNAMED).any():
         _, ids = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, GATE)
@@ -78,7 +78,6 @@ def _moved_and_named(
     bearings: Float[np.ndarray, " n"],
     gate: float,
 ) -> tuple[EkfSlam, UInt32[np.ndarray, " n"]]:
-    """The filter after the motion, and the measurements' landmarks."""
     slam = ekf_slam.filter_step(slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
     unnamed = np.flatnonzero(ids >= UNNAMED)
     given = ids.copy()
@@ -93,7 +92,7 @@ def _associated(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> UInt32[np.ndarray, " n"]:
-    """The number of each detection's landmark; new ones go on from the last."""
+    """Landmark number of each detection; new ones continue from the last."""
     known = np.flatnonzero(slam.ids >= UNNAMED)
     predicted, spread = predictions(slam, known)
     R = np.zeros((len(ranges), 2, 2))

@@ -1,9 +1,8 @@
-"""FastSLAM over the whole run: one set of particles from the start to the end.
+"""FastSLAM over the whole run: one set of particles from start to end.
 
-Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Every resampling throws away
-paths, and no later step brings them back: after a long run all particles share their early path,
-so the landmarks' covariance is far too small. `window` is the use of the same particles that is
-not over-confident.
+Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Resampling discards paths for
+good: after a long run all particles share their early path, so the landmarks' covariance is far too
+small, unlike that of `window`.
 """
 
 from dataclasses import dataclass, replace
@@ -24,10 +23,10 @@ from team.estimation.scans import Own
 
 @dataclass(frozen=True)
 class PlainFastSlam:
-    """Weighted particles in the map frame, and how they are drawn and resampled.
+    """Weighted particles in the map frame, with their proposal and resampling.
 
-    resample_below: a step begins with a resampling if the effective sample size is below this part
-        of the particles (Xu, eq. 3.24-3.25: 0.5); 1: at every step, as Ma & Ma and Montemerlo do.
+    resample_below: relative effective sample size below which a step resamples (Xu, eq. 3.24-3.25:
+    0.5); 1: always, as Ma & Ma and Montemerlo do.
     """
 
     particles: Particles
@@ -38,7 +37,7 @@ class PlainFastSlam:
 def initial_state(
     pose: Pose, particles: int, proposal: Proposal, resample_below: float
 ) -> PlainFastSlam:
-    """The pose exactly known; an uncertain start is a first step by Increment(0, covariance)."""
+    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
     poses = np.tile(pose, (particles, 1))
     return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 
@@ -53,9 +52,7 @@ def filter_step(
     generator: np.random.Generator,
     own: Own | None = None,
 ) -> PlainFastSlam:
-    """Resample if the particles are thin, move, take the measurements
-    (`propagated_and_updated`).
-    """
+    """Resample if the particles are thin, move, and update (`propagated_and_updated`)."""
     particles, _ = fastslam.propagated_and_updated(
         particles=state.particles,
         increment=increment,
@@ -89,7 +86,7 @@ def pose_moments(particles: Particles) -> PoseGaussian:
 
 
 def landmark_moments(particles: Particles) -> LandmarkGaussian:
-    """Moments of the landmarks; the spread between particles is what ties them to each other."""
+    """Moments of the landmarks, correlated by the spread between particles."""
     order = np.argsort(particles.ids)
     mean, P = moments(
         particles.poses,

@@ -1,4 +1,4 @@
-"""One robot's contribution to an estimate over all robots' raw measurements."""
+"""One robot's input to an estimate over all raw measurements."""
 
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ from team.estimation.scans import Own, unclaimed
 class RobotStep(NamedTuple):
     """A robot's motion since its last turn, then its measurements at the end of it.
 
-    ranges [m] and bearings [rad] are corrected by the calibration of its sensor; own: the
-    covariances that the measurements bring themselves (`team.estimation.scans`), without rows none.
+    ranges [m] and bearings [rad] are calibrated; own: their covariances (`team.estimation.scans`),
+    or no rows.
     """
 
     robot: str

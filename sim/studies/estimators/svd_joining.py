@@ -1,10 +1,9 @@
 """Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
 
-Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1), but of each only the mean is
-kept: P is the identity, so a radian of heading counts as a metre (sections 3.2 and 4.3). Two robots
-that see each other exchange their maps, turn one into the frame of the other by a singular value
-decomposition and join the landmarks alone (section 4.3 and appendix II). The minimiser is the one
-of `joining`: only the covariances differ.
+Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1) with their means only: P is
+the identity, so a radian of heading counts as a metre (sections 3.2 and 4.3). Robots that measure
+each other exchange maps, rotate one into the other's frame by a singular value decomposition and
+join the landmarks alone (section 4.3 and appendix II). The minimiser is that of `joining`.
 """
 
 from collections.abc import Mapping
@@ -28,11 +27,10 @@ from team.estimation.submap import LocalMap
 Weighting = Literal["identity", "spherical", "full"]
 SETTINGS = JoinSettings()
 NEEDED = 2
-"""Points that tie two frames."""
 
 
 class TooFewPointsError(ValueError):
-    """Two maps share too few points to find how one lies in the other."""
+    """Two maps share too few points for a relative pose."""
 
     def __init__(self, points: int) -> None:
         plural = "" if points == 1 else "s"
@@ -41,11 +39,11 @@ class TooFewPointsError(ValueError):
 
 
 def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
-    """The submap with the covariance that it is joined with.
+    """The submap with the covariance for the join.
 
-    "identity": I, whatever it was. "spherical": a position and every landmark get half the trace
-    of their block times I, a heading keeps its variance, all correlations are dropped (each block
-    commutes with rotations, which is what Huang's count of minima needs). "full": as it is.
+    "identity": I. "spherical": a position and every landmark get half the trace of their block
+    times I, a heading keeps its variance, correlations are dropped (each block commutes with
+    rotations, as Huang's count of minima requires). "full": unchanged.
     """
     if weighting == "full":
         return local
@@ -61,14 +59,14 @@ def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
 
 @dataclass(frozen=True, eq=False)
 class SubmapJoining:
-    """The submaps of one or more robots with known starts, and their least-squares map."""
+    """Submaps of robots with known starts, and their least-squares map."""
 
     fold: Fold
     weighting: Weighting
 
 
 def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> SubmapJoining:
-    """No submap yet; every robot's start pose is exactly known."""
+    """No submaps; start poses are exact."""
     fold = EMPTY_FOLD
     for robot, pose in poses.items():
         fold = joining.started(fold, InitialPoseFactor(robot, 0, pose))
@@ -76,7 +74,7 @@ def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") 
 
 
 def filter_step(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining:
-    """Take a robot's next submap, which begins where its last one ended, and iterate."""
+    """Add a robot's next submap and iterate."""
     count = len(state.fold.contributions)
     sequence = state.fold.next_sequence((robot, 0))
     taken = Contribution(robot, 0, sequence, count, weighted(local, state.weighting))
@@ -89,10 +87,10 @@ def solved(state: SubmapJoining) -> SubmapJoining:
 
 
 def variance_factor(state: SubmapJoining) -> float:
-    """The variance factor σ̂² by which the covariance of the solution is scaled.
+    """Variance factor σ̂² that scales the covariance of the solution.
 
-    With the identity the residuals must show how large the errors are: σ̂² = Σ‖r‖²/(residuals −
-    unknowns), the variance of unit weight (1 while nothing is redundant). Else 1.
+    With the identity the residuals determine the size of the errors: σ̂² = Σ‖r‖²/(residuals −
+    unknowns), the variance of unit weight (1 without redundancy). Else 1.
     """
     island = state.fold.main
     redundancy = int(island.graph.dimensions.sum()) - island.graph.unknowns
@@ -102,14 +100,14 @@ def variance_factor(state: SubmapJoining) -> float:
 
 
 def pose_gaussian(state: SubmapJoining, robot: str) -> PoseGaussian:
-    """The end of a robot's last submap. Raises KeyError for a robot without submaps."""
+    """End of a robot's last submap; raises KeyError without submaps."""
     graph = state.fold.main.graph
     mean, covariance = joint_marginal(state.fold.main, [graph.streams[robot, 0][-1]])
     return PoseGaussian(mean, variance_factor(state) * covariance)
 
 
 def landmark_gaussian(state: SubmapJoining) -> LandmarkGaussian:
-    """All landmarks: σ̂² (JᵀP⁻¹J)⁻¹. Raises KeyError before the first submap."""
+    """All landmarks: σ̂² (JᵀP⁻¹J)⁻¹; raises KeyError before the first submap."""
     landmarks = state.fold.main.graph.landmarks
     ids = sorted(landmarks)
     mean, covariance = joint_marginal(state.fold.main, [landmarks[id_] for id_ in ids])
@@ -128,7 +126,7 @@ NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)))
 
 
 class ExchangedMap(NamedTuple):
-    """What two maps make together, and how the second lies in the first."""
+    """The union of two maps, and the second's pose in the first."""
 
     landmarks: LandmarkGaussian
     a_from_b: PoseGaussian
@@ -142,10 +140,10 @@ def mutual_sighting(
     range_to_a: float,
     bearing_to_a: float,
 ) -> PointPairs:
-    """The two robots as points, when each sees the other: where each is in both maps.
+    """The positions of two robots that measure each other, as points in both maps.
 
-    A robot is where its own map has it and, in the other map, where the other one sees it; these
-    take the place of shared poses (Downs, chapter 3). pose_a is in frame a, pose_b in frame b.
+    Each is at its own map's pose and, in the other map, at its measured position; these replace
+    shared poses (Downs, chapter 3).
     """
     return PointPairs(
         np.stack((pose_a[:2], located(pose_a, range_to_b, bearing_to_b))),
@@ -156,18 +154,17 @@ def mutual_sighting(
 def exchanged(
     a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS
 ) -> ExchangedMap:
-    """Two maps as one in the frame of a, from their common landmarks and the robots' positions.
+    """Join two maps in the frame of a, by their common landmarks and the robots' positions.
 
     argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): given (R, t), each common
     xᵢ is the middle of its two points, and the remaining ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised in
-    closed form by singular values (`procrustes`). So rotating first and joining then gives the
+    closed form by singular values (`procrustes`). So first rotating and then joining gives the
     whole minimum.
 
     With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have
     σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and
-    G/2 for the common ones; σ̂² = cost/(2n − 3). The maps' own covariances are discarded, as Downs
-    does, so the result does not contain how far each map has drifted as a whole.
-    Raises TooFewPointsError for n < 2.
+    G/2 for the common ones; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances, and with them
+    their drift, are discarded. Raises TooFewPointsError for n < 2.
     """
     ids = np.union1d(a.ids, b.ids)
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
@@ -210,20 +207,18 @@ def _moved(
 
 
 ITERATIONS = 10
-"""Gauss-Newton steps of two maps' joint solution, at the most."""
+"""Most Gauss-Newton steps of two maps' joint solution."""
 STANDS_STILL = 1e-9
-"""A step that moves no coordinate by more than this [m, rad] is the last."""
+"""Largest change of a coordinate [m, rad] in the last step."""
 
 
 def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
-    """Two independent maps as one in the frame of a, each with its own covariance.
+    """Join two independent maps in the frame of a, each with its own covariance.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
-    rotation and translation of `exchanged`; the covariance is (JᵀWJ)⁻¹. This is Downs' exchange
-    with the maps' own covariances: it contains how far each map has drifted as a whole, as far as
-    the maps know that.
-    Raises TooFewPointsError for fewer than two common landmarks, NotACovarianceError for a map
-    whose covariance is none.
+    motion of `exchanged`; the covariance is (JᵀWJ)⁻¹. This is Downs' exchange with the maps' own
+    covariances, which include their drift. Raises TooFewPointsError for fewer than two common
+    landmarks, NotACovarianceError.
     """
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     if len(in_a) < NEEDED:
@@ -256,7 +251,6 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
 
 
 def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Places of the coordinates of the points with these indices."""
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 

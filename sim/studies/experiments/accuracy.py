@@ -1,4 +1,4 @@
-"""How accurate and how consistent the team is in every kind of world: all parts, one command."""
+"""Accuracy and consistency of the team in every kind of world."""
 
 from sim.studies.experiments import (
     accuracy_few,
@@ -26,13 +26,13 @@ _CHANCE = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """The runs of all parts; what two of them need is one run."""
+    """Runs of all parts, each once."""
     found = {task.name: task for part in PARTS for task in part.tasks(options)}
     return list(found.values())
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """All parts' figures, tables and goals."""
+    """Figures, tables and goals of all parts."""
     parts = [part.outcome(options, results) for part in PARTS]
     few = len(options.seeds) < ENOUGH_SEEDS
     title = "accuracy and consistency of the fused map"

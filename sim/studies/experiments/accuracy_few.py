@@ -1,11 +1,11 @@
 """Worlds with few landmarks and unknown initial poses, where wrong minima occur.
 
-A map is wrong where it lies in another minimum of the cost than the truth (`true_minimum`); its
-submaps exclude the truth where the cost at the fixed truth exceeds the 99.9 % quantile. A map lies
-beyond its ellipsoid where its shape (without the rigid part), or the first pose of a robot that
-joined, is outside the 99.9 % region of its own covariance: with a curved valley of the cost that
-happens more often though the minimum is right. A wrong map without a warning is silent. An alarm is
-a warning of a right map that is about more than a large or nonlinear covariance.
+A map is wrong in another minimum of the cost than the truth (`true_minimum`); its submaps exclude
+the truth where the cost there exceeds the 99.9 % quantile. A map is beyond its ellipsoid where its
+shape (without the rigid part), or the first pose of a robot that joined, is outside the 99.9 %
+region of its own covariance; in a curved valley of the cost this is more frequent, even in the
+right minimum. A wrong map without a warning is silent. An alarm is a warning of a right map about
+more than a large or nonlinear covariance.
 """
 
 import msgspec
@@ -28,9 +28,9 @@ from team.estimation.consistency import chi2_interval
 WORLDS = ("thesis", "thesis-b")
 COUNTS = (3, 4, 5)
 SEEN_EVERY_S = 5.0
-"""Spacing [s] of the pose nodes where teammates are measured."""
+"""Spacing [s] of the pose nodes for inter-robot measurements."""
 WIDE = ("is placed weakly", "farther off than its covariance")
-"""Parts of warnings that are about a map's covariances, not about its minimum."""
+"""Parts of warnings about a map's covariances, not its minimum."""
 SHOWN: Shown = (
     ("rmse_aligned", "aligned [m]", "{:.3f}"),
     ("aligned_median", "median [m]", "{:.3f}"),
@@ -47,12 +47,12 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each world and number of landmarks, with and without inter-robot measurements."""
+    """Worlds by number of landmarks, with and without inter-robot measurements."""
     return [task for case in _cases(options).values() for task in case]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """How often a map is wrong, and how often without a warning."""
+    """Frequency of wrong maps, warned and silent."""
     figures: dict[str, Figures] = {}
     for name, case in _cases(options).items():
         figures[name] = few_figures(results.of_all(case))
@@ -81,7 +81,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def few_figures(runs: list[Figures]) -> Figures:
-    """The figures over the seeds of one case, with the numbers of wrong and of silent maps."""
+    """Figures over the seeds of one case, with counts of wrong and silent maps."""
     figures = over_seeds(runs)
     if not runs:
         return figures
@@ -109,12 +109,11 @@ def few_figures(runs: list[Figures]) -> Figures:
 
 
 def _alarmed(run: Figures) -> bool:
-    """Whether a warning is about more than what the covariances do not show."""
     return any(not any(words in text for words in WIDE) for text in run["reasons"])
 
 
 def is_beyond(run: Figures) -> bool:
-    """Whether the map's shape, or where a robot joined, lies beyond 99.9 % of its covariance."""
+    """Whether the shape or a joined robot's first pose is beyond its 99.9 % ellipsoid."""
     dof = 2 * round(run["landmarks"] or 0.0) - 3
     shape = run["shape_nees"]
     if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:
@@ -141,9 +140,6 @@ def _cases(options: Options) -> dict[str, list[Task]]:
 
 
 def _few(scenario: Scenario, count: int, seen: bool) -> Scenario:
-    """The scenario with this many random landmarks and only the first robot's initial pose known;
-    `seen`: with inter-robot measurements.
-    """
     assert isinstance(scenario.world, SimulatedWorld)
     world = msgspec.structs.replace(scenario.world, landmarks=(), landmark_count=count)
     node_s = SEEN_EVERY_S if seen else 0.0

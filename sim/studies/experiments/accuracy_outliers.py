@@ -1,7 +1,7 @@
-"""Compares maps with three outliers in ten measurements with maps without them.
+"""Compare maps with 30 % outliers with maps without them.
 
-The clean run of the same seed leaves out the very measurements that become outliers, so it has as
-many inliers. An outlier has a uniform range and bearing, or the identity of another landmark.
+The clean run of the same seed leaves out the measurements that become outliers, so it has as many
+inliers. An outlier has a uniform range and bearing, or the identity of another landmark.
 """
 
 import msgspec
@@ -15,11 +15,11 @@ from sim.world.config import OutlierKind, SimulatedWorld
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
 LANDMARK_SUBMAPS = 2
-"""Least number of submaps of a landmark, in the clean runs, too: a landmark of one submap may be an
+"""Least number of submaps of a landmark, also in clean runs: a landmark of one submap may be an
 outlier.
 """
 ROBUST_C = 2.0
-"""Scale of the centre's robust loss, in the clean runs, too: it down-weights outliers that agree by
+"""Scale of the centre's robust loss, also in clean runs: it down-weights outliers that agree by
 chance.
 """
 KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
@@ -43,7 +43,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """The figures of every kind of outlier beside the clean runs."""
+    """Figures by kind of outlier beside the clean runs."""
     figures: dict[str, dict[str, Figures]] = {}
     goals = []
     for world in WORLDS:
@@ -86,9 +86,9 @@ def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
 
 
 def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
-    """The scenario with outliers among its measurements, which its windows and its centre expect.
+    """The scenario with outliers, and windows and centre that expect them.
 
-    The clean run has the same centre, and windows that take every measurement.
+    The clean run has the same centre, and windows without rejection.
     """
     replace = msgspec.structs.replace
     assert isinstance(scenario.world, SimulatedWorld)

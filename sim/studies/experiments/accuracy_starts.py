@@ -1,8 +1,7 @@
-"""Unknown initial poses: all robots but the first have to find their place in the team's map.
+"""Unknown initial poses: all robots but the first must be placed in the team's map.
 
-A merge is wrong where the first pose of a robot that joined lies outside the 99.9 % ellipsoid of
-its own covariance. After a right merge only the position of the map as a whole is undetermined, so
-maps are compared after alignment.
+A merge is wrong where the first pose of a robot that joined lies outside its own 99.9 % ellipsoid.
+After a right merge only the map's position is undetermined, so maps are compared after alignment.
 """
 
 import msgspec
@@ -26,19 +25,17 @@ SHOWN: Shown = (
 
 
 def is_wrong(chi2: float) -> bool:
-    """Whether the χ² of a first pose is beyond what 99.9 % of right poses have (3 degrees of
-    freedom).
-    """
+    """Whether χ² of a first pose exceeds the 99.9 % quantile (3 degrees of freedom)."""
     return chi2 > chi2_limit(3, 0.001)
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each world and seed with known starts, and without."""
+    """Each world and seed, with known and unknown starts."""
     return [task for world in WORLDS for pair in _pairs(world, options) for task in pair]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """The maps with and without known initial poses."""
+    """Maps with and without known initial poses."""
     figures: dict[str, dict[str, Figures]] = {}
     rows, goals = [], []
     for world in WORLDS:
@@ -80,14 +77,13 @@ def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
 
 
 def unknown_starts(scenario: Scenario) -> Scenario:
-    """The scenario in which the team knows only the first robot's initial pose."""
+    """The scenario with the first robot's initial pose only."""
     names = tuple(robot.id for robot in scenario.robots[1:])
     world = msgspec.structs.replace(scenario.world, unknown_starts=names)
     return msgspec.structs.replace(scenario, world=world)
 
 
 def _merges(runs: list[Figures]) -> Figures:
-    """The share of robots that joined, and how many of them at a wrong place."""
     chi2 = [
         figures["first_pose_chi2"]
         for run in runs

@@ -1,9 +1,8 @@
-"""Real data: every given UTIAS set, five robots, one fixed profile for all of them.
+"""Real data: every given UTIAS set, five robots, one fixed profile.
 
-The raw map lies according to the initial poses; `shape` is the part of the error that no rigid
-motion explains, and its NEES is per landmark: 2 where the covariance is right. The batch optimiser
-over all raw measurements under the same noise is computed beside each set; the difference is the
-cost of the submaps.
+The raw map lies according to the initial poses; `shape` is the error that no rigid motion explains,
+its NEES is per landmark: 2 for a correct covariance. The difference from the batch optimum under
+the same noise is the cost of the submaps.
 """
 
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ NORMAL_SCALE = (0.8, 1.25)
 `normal_scale`.
 """
 MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
-"""Largest aligned error [m] by the data set's number; other sets have no goal of their own."""
+"""Largest aligned error [m] by the data set's number."""
 MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}
 SHOWN: Shown = (
     ("aligned", "aligned [m]", "{:.4f}"),
@@ -52,14 +51,14 @@ ROBOT: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each set with known starts and without; there is no randomness but the estimator's."""
+    """Each set with and without known starts."""
     return [
         task for dataset in options.datasets for task in (team_on(dataset), _unknown_task(dataset))
     ]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """The figures of each set, and of each robot in it."""
+    """Figures of sets and robots."""
     if not options.datasets:
         return Outcome(
             "real data", {"utias": {}}, missing=(without_datasets("figures on real data"),)
@@ -113,7 +112,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def set_figures(run: Figures) -> Figures:
-    """The figures of one set under the names of real data."""
+    """Figures of one set."""
     renamed = {
         "aligned": "rmse_aligned",
         "raw": "rmse",
@@ -129,7 +128,7 @@ def set_figures(run: Figures) -> Figures:
 
 
 def team_on(dataset: Dataset) -> Task:
-    """The team on a set, with the batch under the profile's noise."""
+    """The team on a set, with the batch."""
     return team_task(load("utias"), dataset=dataset, batch=True, noise="profile")
 
 

@@ -1,7 +1,6 @@
-"""Simulated worlds under every pair of estimator and rule, and the batch MAP of the same
-measurements.
+"""Simulated worlds under every pair of estimator and rule, with the batch MAP.
 
-NEES is per degree of freedom: 1 where the covariance is right.
+NEES is per degree of freedom: 1 for a correct covariance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,9 +29,9 @@ from team.pairs import PAIRS
 
 
 class World(NamedTuple):
-    """A kind of world: its scenario, its most seeds, and what the default pair must reach.
+    """A world: its scenario, its most seeds, and the goals of the default pair.
 
-    rules: every valid pair runs in it, not only the default one. batch: with the batch MAP.
+    rules: every valid pair runs, not only the default. batch: with the batch MAP.
     """
 
     scenario: str
@@ -43,7 +42,7 @@ class World(NamedTuple):
 
 
 OTHERS_SEEDS = 10
-"""Most seeds of pairs for comparison: their figures differ from the default pair's by factors."""
+"""Most seeds of pairs for comparison."""
 _THESIS = {
     "nees": (0.93, 1.07),
     "in_band": (0.90, 1.0),
@@ -76,12 +75,12 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """The runs of all worlds, rules and seeds."""
+    """All worlds, rules and seeds."""
     return [task for cells in _cells(options).values() for runs in cells.values() for task in runs]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """The figures of every world and rule, with the goals of the default rule."""
+    """Figures of every world and rule, and the default rule's goals."""
     worlds: dict[str, dict[str, Figures]] = {}
     goals: list[Goal] = []
     tables: list[Table] = []
@@ -96,9 +95,9 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
-    """The figures over the seeds of each rule of one world, and of the batch.
+    """Figures over the seeds of each rule of one world, and of the batch.
 
-    ratio: of the RMS landmark errors to the batch's on the same seeds.
+    ratio: of the RMS landmark errors to the batch's.
     """
     figures = {rule: over_seeds(of_rule) for rule, of_rule in runs.items() if of_rule}
     batches = {run["seed"]: run["batch"] for run in runs.get(named(*OURS), []) if "batch" in run}
@@ -121,7 +120,6 @@ def _worlds(options: Options) -> list[World]:
 
 
 def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
-    """The tasks of each world and rule."""
     return {
         world.scenario: {
             named(estimator, fusion): [
@@ -140,7 +138,6 @@ def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
 
 
 def _most(world: World, estimator: str, fusion: str) -> int:
-    """The most seeds of this pair."""
     return world.most_seeds if (estimator, fusion) == OURS else OTHERS_SEEDS
 
 

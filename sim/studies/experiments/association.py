@@ -1,8 +1,8 @@
-"""Landmarks without names: how well association works, over spacing, clutter and missed detections.
+"""Accuracy of data association over landmark spacing, clutter and missed detections.
 
-One simulated place, four systems: ours without names, the same measurements with names, an EKF over
-the whole drive with nearest neighbour, and FastSLAM whose particles each associate by maximum
-likelihood. The sensors differ only in their noise; one parameter is varied at a time.
+One simulated place, four systems: ours without and with identities, an EKF over the whole run with
+nearest neighbour, and FastSLAM with maximum-likelihood association per particle. The sensors differ
+only in their noise; one parameter is varied at a time.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # Matplotlib takes half a second to import
 
 SIZE_M, LANDMARKS, VIEW_M, STEPS = 60.0, 40, 12.0, 150
 SPACING_M = 0.5 * SIZE_M / LANDMARKS**0.5
-"""The mean distance of a landmark from its nearest neighbour, where they are uniform."""
+"""Mean distance of a landmark from its nearest neighbour, for uniform landmarks."""
 RATIOS = (4.0, 6.0, 10.0, 20.0, 40.0)
 CLUTTER = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 MISSED = (0.0, 0.1, 0.2, 0.3, 0.5)
@@ -34,7 +34,7 @@ RATIO, FEW = 20.0, 2
 
 
 class System(NamedTuple):
-    """An estimator and a rule, and whether landmarks have names."""
+    """An estimator and a rule; named: landmarks have identities."""
 
     name: str
     estimator: Estimator
@@ -68,9 +68,7 @@ FIGURES = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """One run of each axis, value, system and seed; a run that two axes have in common is
-    run once.
-    """
+    """Each axis, value, system and seed; common runs once."""
     runs = [
         task
         for axis in AXES
@@ -118,9 +116,7 @@ def association_run(
     missed: float,
     seed: int,
 ) -> dict[str, Any]:
-    """The figures of one run; the baselines have one robot, since each robot of theirs has a map of
-    its own.
-    """
+    """Figures of one run; baselines have one robot, since they do not merge maps."""
     alone = fusion == "alone"
     scenario = load("waypoints")
     error_m = SPACING_M / ratio
@@ -217,7 +213,7 @@ def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) 
 
 
 def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
-    """Six panels; a system has one colour in all of them, also where another one has no curve."""
+    """Six panels, with one colour per system."""
     shown = [each for each in FIGURES if each[0] not in ("wrong_percent", "gospa")]
     made = figure(12.0, 6.0)
     colours = {system.name: f"C{k}" for k, system in enumerate(SYSTEMS)}

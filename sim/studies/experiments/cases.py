@@ -1,7 +1,7 @@
-"""Computes cases in parallel and stores their results on disk, with joblib's workers and memory.
+"""Compute cases in parallel and store their results on disk, with joblib's workers and memory.
 
-A case that fails, or whose process dies, loses only itself. With a scheduler the cases run on
-Dask's workers, on a cluster, too (decision 37).
+A case that fails or dies loses only itself. With a scheduler the cases run on Dask's workers, also
+on a cluster (decision 37).
 """
 
 import threading
@@ -20,21 +20,19 @@ from sim.studies.experiments.task import Task
 from team.extras import install_command
 
 FOLDER = "cases"
-"""Folder of the stored results, in the folder of an experiment."""
 _STORED = "output.pkl"
-"""Name of joblib's file of a stored result."""
 IDLE_S = 5
-"""Time [s] after which a worker without a case ends."""
+"""Timeout [s] of an idle worker."""
 Cached = Callable[..., dict[str, Any]]
 
 
 class SchedulerError(ValueError):
-    """A scheduler that can not be used; the text says why and what to do."""
+    """An unusable scheduler; the text gives reason and remedy."""
 
 
 @dataclass(frozen=True)
 class Done:
-    """A finished case: its result, or else the error in a line and the traceback."""
+    """A finished case: its result, or an error with traceback."""
 
     task: Task
     result: dict[str, Any] | None
@@ -43,16 +41,14 @@ class Done:
 
 
 class Cases:
-    """The stored results of a folder; a result is valid for a case of the same parameters and
-    program.
-    """
+    """Stored results of a folder, valid for equal parameters and program."""
 
     def __init__(self, folder: Path) -> None:
         self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
         self._has_any = any((folder / FOLDER).rglob(_STORED))
 
     def found(self, task: Task) -> dict[str, Any] | None:
-        """The result of a case that was stored before; None where it is to be computed."""
+        """Stored result of a case, or None."""
         if not self._has_any:
             return None
         arguments = _arguments(task)
@@ -64,12 +60,11 @@ class Cases:
     def run(self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None) -> Iterator[Done]:
         """Compute the cases, `jobs` at a time; yields each as it is done, in no fixed order.
 
-        Long cases begin first. Leaving the iterator early ends the workers. scheduler: the address
-        of a Dask scheduler whose workers can read the folder; then as many run at a time as it has
-        workers.
+        Long cases begin first. Leaving the iterator ends the workers. scheduler: address of a Dask
+        scheduler whose workers can read the folder; their number replaces `jobs`.
         """
-        # An idle worker may end just as it gets a case; joblib warns and starts another.
-        # Where warnings are errors its thread would end instead, and nobody would start one.
+        # An idle worker may end just as it gets a case; joblib warns and starts another. With
+        # warnings as errors joblib's thread would end instead.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         waiting = {task.name: task for task in sorted(tasks, key=lambda task: -task.cost)}
         with ExitStack() as stack:
@@ -80,7 +75,7 @@ class Cases:
                 for done in finished:
                     del waiting[done.task.name]
                     yield done
-            except TerminatedWorkerError:  # one of those that are left: each by itself then
+            except TerminatedWorkerError:  # each remaining case runs by itself then
                 for task in waiting.values():
                     yield self._alone(task)
             finally:
@@ -90,7 +85,7 @@ class Cases:
     def _parallel(
         self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None
     ) -> Generator[Done, None, None]:
-        # Of one job joblib would make a loop in this process, where a case that dies ends us.
+        # With one job joblib would run a loop in this process, which a dying case would end.
         workers = max(jobs, 2) if scheduler is None else -1
         at_once = jobs if scheduler is None else "all"
         parallel = Parallel(
@@ -110,7 +105,6 @@ class Cases:
 
 
 def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
-    """The workers: processes of this machine with one thread each, or those of a scheduler."""
     if scheduler is None:
         return [parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=IDLE_S)]
     try:
@@ -126,10 +120,10 @@ def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
 
 @contextmanager
 def _cancelling() -> Iterator[None]:
-    """Suppress the pool's message about a case that is cancelled on request.
+    """Suppress the pool's message about a cancelled case.
 
-    Loky kills the workers first; its thread then fails on a case that was being handed over at that
-    moment, and ends with a KeyError (joblib/loky, pull request 663).
+    Loky kills the workers first; its thread then fails with a KeyError on a case being handed over
+    (joblib/loky, pull request 663).
     """
     previous = threading.excepthook
 
@@ -150,7 +144,7 @@ def _cancelling() -> Iterator[None]:
 def _attempt(cached: Cached, task: Task) -> Done:
     try:
         return Done(task, cached(**_arguments(task)))
-    except Exception as error:  # whatever a case raises is that case's result
+    except Exception as error:  # an error is the case's result
         text = " ".join(str(error).split())
         return Done(task, None, f"{type(error).__name__}: {text}", traceback.format_exc())
 
@@ -167,7 +161,5 @@ def _arguments(task: Task) -> dict[str, Any]:
 def _result(
     work: str, parameters: dict[str, Any], program: str, local: dict[str, str]
 ) -> dict[str, Any]:
-    """The result of a case. program: digest of the sources, so that results of other programs are
-    not used.
-    """
+    """Compute a case. program: digest of the sources, part of the key of the stored result."""
     return Task(work, parameters, "", local=local).run()

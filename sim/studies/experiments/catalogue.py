@@ -1,13 +1,13 @@
-"""The experiments by name. Light to import: the command line lists them without loading them."""
+"""The experiments by name; light to import, for the command line."""
 
 from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """An experiment: its name on the command line, its module, a line about it.
+    """An experiment: its command, its module, a summary.
 
-    module: one that has `tasks` and `outcome`, or `module:object` of an object that has them.
-    seeds: how many there are by default, with --quick, and at the most as a part of `all`.
+    module: has `tasks` and `outcome`; or `module:object` of an object with them. seeds: by default,
+    with --quick, and at most in `all`.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""A task that computes a run's errors over team time: online poses, and one landmark of the map.
+"""Compute a run's errors over team time: online poses, and one landmark of the map.
 
-The landmark is the first that the first robot saw. Its error and its sigma are those of the newest
-map at each time: the fused one, or the robot's own where nothing is fused.
+The landmark is the first robot's first. Its error and sigma are those of the newest map at each
+time: the fused one, or else the robot's own.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ STEP_S = 1.0
 """Length [s] of a step of the thesis' world."""
 Map = m.FusedMap | m.MapEstimate
 DIGITS = 5
-"""Significant digits of a stored curve: a picture shows three."""
+"""Significant digits of a stored curve."""
 
 
 def curves_task(
@@ -41,11 +41,10 @@ def curves_task(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Task:
-    """A task that computes the curves of one run.
+    """Make the task of the curves of one run.
 
-    team_scenario: the scenario that the team uses, where it differs from the world's. late: each
-    step's measurements are those of the step before. shots: the steps at which maps and paths are
-    stored for pictures.
+    team_scenario: the team's scenario if it differs from the world's. late: measurements are those
+    of the step before. shots: steps whose maps and paths are stored.
     """
     return Task(
         "sim.studies.experiments.curves:curves_run",
@@ -65,9 +64,7 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """The curves of every robot's pose and of the first landmark, the map's error, and the map at
-    `shots`.
-    """
+    """Curves of the poses and of the first landmark, the map's error, and the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
@@ -100,7 +97,7 @@ def curves_run(
 def true_landmarks(
     samples: Iterable[Sample],
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """The ids and positions [m] of the world's landmarks; empty where they are not known."""
+    """Ids and positions [m] of the world's landmarks, if known."""
     for message in messages(samples, ch.TRUTH_LANDMARKS.key()):
         if isinstance(message, m.TruthLandmarks):
             return translate.landmarks_of(message)
@@ -108,12 +105,12 @@ def true_landmarks(
 
 
 def messages(samples: Iterable[Sample], key: str) -> Iterable[m.Message]:
-    """The messages of one key, in their order."""
+    """Messages of one key, in order."""
     return (opened(sample)[2] for sample in samples if sample.key == key)
 
 
 def a_step_late(streams: WorldStreams) -> WorldStreams:
-    """The streams with each message of landmarks replaced by the one before it."""
+    """Delay each message of landmarks by one."""
     return replace(streams, streams=tuple(_a_step_late(stream) for stream in streams.streams))
 
 
@@ -128,8 +125,8 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
-    """The keys of a robot's online poses: the centre's where the centre estimates them; else the
-    robot's own, then those in the team's map.
+    """Keys of a robot's online poses: the centre's if it estimates them; else the robot's own, then
+    the team map's.
     """
     if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)
@@ -139,7 +136,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
 def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """The poses and covariances on these keys; at equal times those of the last key."""
+    """Poses and covariances on these keys; the last key has precedence."""
     by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in by_stamp:
@@ -155,7 +152,6 @@ def estimated_poses(
 
 
 def _pose_curve(found: PoseErrors) -> Figures:
-    """Distance and heading error with their sigmas; √(σx² + σy²) is that of the distance."""
     errors, sigmas = found.errors, found.sigmas
     return {
         "time_s": short(found.stamps_ns * 1e-9),
@@ -168,7 +164,6 @@ def _pose_curve(found: PoseErrors) -> Figures:
 
 
 def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
-    """The team's maps with landmarks in them, in their order; without any, those of the robot."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
         published = messages(samples, key)
         maps = [
@@ -191,7 +186,6 @@ def _shot(
     lines: Mapping[str, tuple[Path, Path]],
     truth: Mapping[int, Float[np.ndarray, "2"]],
 ) -> Figures:
-    """The newest map, its landmarks' 2 × 2 blocks and its error, and the paths until then."""
     now_ns = round(step * STEP_S * 1e9)
     newest = next((each for each in reversed(maps) if each.stamp_ns <= now_ns), None)
     return {
@@ -215,7 +209,6 @@ def _landmark_curve(
     robot: str,
     truth: Mapping[int, Float[np.ndarray, "2"]],
 ) -> Figures | None:
-    """The error of the first landmark that this robot saw; None if it saw none."""
     landmark = next(
         (
             int(translate.scan_of(message)[0][0])
@@ -246,5 +239,5 @@ def _landmark_curve(
 
 
 def short(values: Float[np.ndarray, " K"]) -> list[float]:
-    """The values rounded to DIGITS digits, for JSON."""
+    """Round the values to DIGITS digits, for JSON."""
     return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]

@@ -1,8 +1,8 @@
 """Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
 
-Each has the printed figures, his protocol (`downs_joined`) and ours: the profile of `utias` as it
-is. All use the sensor and odometry models of the profile. His paired t-tests are computed again, on
-the printed figures and on the computed ones.
+Each has the printed figures, his protocol (`downs_joined`) and ours (`utias`), all with the
+profile's sensor and odometry models. His paired t-tests are recomputed on the printed and on the
+computed figures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,13 +44,13 @@ from sim.studies.experiments.team_runs import Figures, team_task
 from sim.world.config import UtiasWorld
 
 Row = tuple[float | None, ...]
-"""Errors [m] of robots 1 … 5, or the team's alone; None where there is none."""
+"""Errors [m] of robots 1 … 5, or of the team alone."""
 QUICK_S = 300.0
 TEAM = "team"
 
 
 class Method(NamedTuple):
-    """A row of a table: its name, its runs, and the figure of each robot (or of the team)."""
+    """A row of a table: name, runs, and a figure per robot (or of the team)."""
 
     name: str
     tasks: Callable[[Options, Dataset], list[Task]]
@@ -59,9 +59,9 @@ class Method(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """A paired t-test: what it compares, its p as printed, and the two sides of it by set.
+    """A paired t-test: its text, its printed p, and its two sides by set.
 
-    before: the other table's row by the name of this table's method. tasks: the runs of these.
+    before: the other table's row by method. tasks: its runs.
     """
 
     text: str
@@ -87,7 +87,7 @@ class PrintedTable(NamedTuple):
     sample: Callable[[Options, Dataset], Task] | None = None
 
     def tasks(self, options: Options) -> list[Task]:
-        """Every method's runs on every set and the simulator's; what two methods share once."""
+        """Runs of every method, on sets and simulator."""
         found = self.simulated.tasks(options)
         found += [
             task
@@ -98,7 +98,7 @@ class PrintedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """The rows of each set and of the simulator, the picture of them, the t-tests."""
+        """Rows and pictures of sets and simulator, the t-tests."""
         simulated = self.simulated.outcome(self.title, options, results)
         return combined(self.title, (self._of_sets(options, results), simulated))
 
@@ -151,9 +151,7 @@ class PrintedTable(NamedTuple):
         return rows | {m.name: m.row(options, dataset, results) for m in self.methods}
 
     def _tests(self, options: Options, results: Results) -> dict[str, Figures]:
-        """The paired two-sided t-tests: over the robots of sets, or over the sets' means where a
-        table has a team's map.
-        """
+        """Paired two-sided t-tests over the robots of sets, or over the sets' means."""
         if self.compared is None:
             return {}
         one = len(self.columns) == 1
@@ -207,7 +205,6 @@ class PrintedTable(NamedTuple):
 
 
 def _profile(options: Options) -> Scenario:
-    """The profile; with --quick only its first minutes."""
     scenario = load("utias")
     if not options.quick or not isinstance(scenario.world, UtiasWorld):
         return scenario
@@ -227,12 +224,10 @@ def _spherical(options: Options, dataset: Dataset) -> Task:
 
 
 def _team(options: Options, dataset: Dataset) -> Task:
-    """The whole sets as in `accuracy`: the same runs."""
     return team_task(_profile(options), dataset=dataset) if options.quick else team_on(dataset)
 
 
 def _singles(options: Options, dataset: Dataset) -> list[Task]:
-    """Each robot as a team of its own."""
     scenario = _profile(options)
     return [
         team_task(
@@ -245,8 +240,6 @@ def _singles(options: Options, dataset: Dataset) -> list[Task]:
 def _of_robots(
     task: Callable[[Options, Dataset], Task], name: str
 ) -> Callable[[Options, Dataset, Results], Row]:
-    """A figure of each robot from one run of all."""
-
     def row(options: Options, dataset: Dataset, results: Results) -> Row:
         robots = (results.of(task(options, dataset)) or {}).get("robots", {})
         return tuple(robots.get(robot.id, {}).get(name) for robot in load("utias").robots)
@@ -291,7 +284,7 @@ def _cells(row: Row) -> list[str]:
 def _paired(
     before: Sequence[float | None], after: Sequence[float | None], one: bool
 ) -> list[tuple[float, float]]:
-    """The pairs of one set; one: the mean of the robots against the team."""
+    """Pairs of one set; one: the mean of the robots against the team."""
     if one:
         known, team = _known(before), _known(after)
         return [(float(np.mean(known)), team[0])] if known and team else []
@@ -337,7 +330,6 @@ def _pair(
     names: Sequence[str],
     figures: Sequence[str],
 ) -> tuple[Method, ...]:
-    """The cross product of the two protocols and the figures."""
     found: list[Method] = []
     for k, name in enumerate(names):
         for source in figures:
@@ -360,9 +352,9 @@ TABLE_5_1 = PrintedTable(
     ),
     (
         _DIFFERS,
-        "Ours is the same filter with measurements sampled to half a second. The text explains his "
-        "errors by linearisation; most of them is a turn of the whole map, which alignment takes "
-        "away: the start heading and the odometry's first metres decide it.",
+        "Ours is the same filter with measurements sampled to half a second. The text explains "
+        "his errors by linearisation; most of the error is a rotation of the whole map, which "
+        "alignment removes: the start heading and the first metres of odometry determine it.",
     ),
     SIMULATED_5_1,
     sample=_HIS_EKF,
@@ -380,8 +372,8 @@ TABLE_5_2 = PrintedTable(
     (
         _DIFFERS,
         "The printed paths are some eight times better than the printed maps that they were made "
-        "with, in one frame; how a path can be right within 0.04 m in a map that lies wrong by "
-        "0.3 m the source does not say. Rows 3 and 8 of the printed table are the same.",
+        "with, in one frame; the source does not explain how a path can be right within 0.04 m in "
+        "a map that is wrong by 0.3 m. Rows 3 and 8 of the printed table are equal.",
     ),
     SIMULATED_5_2,
 )
@@ -402,9 +394,9 @@ TABLE_5_3 = PrintedTable(
     _pair(_JOINED, _joined_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
-        "A printed error of 0.0000 m is below what the survey of the landmarks is good for, and "
-        "rows 6 and 7 of the printed table are the same: not to be taken as verified. "
-        "The t-test of the 45 printed pairs gives another p than the text has.",
+        "A printed error of 0.0000 m is below the accuracy of the landmarks' survey, and rows 6 "
+        "and 7 of the printed table are equal: these figures are not verified. The t-test of the "
+        "45 printed pairs gives another p than the text.",
     ),
     SIMULATED_5_3,
     Compared(
@@ -422,8 +414,8 @@ TABLE_5_4 = PrintedTable(
     _pair(_JOINED, lambda k, _: _joined_row(k, "position_rmse"), (HIS, OURS), ("position_rmse",)),
     (
         _DIFFERS,
-        "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's own millimetre, so no "
-        "estimate can be measured to be that good: it is most likely not a distance to the truth.",
+        "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's accuracy of a "
+        "millimetre, so it cannot be a measured distance to the truth.",
     ),
     SIMULATED_5_4,
 )
@@ -440,9 +432,9 @@ TABLE_5_5 = PrintedTable(
     _pair((_each(_spherical), _each(_team)), _team_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
-        "He exchanges maps at each mutual sighting. Here the robots' whole maps are tied once, by "
-        "singular values over the landmarks that they share and the robots' own places at every "
-        "mutual sighting. Ours joins all submaps in one frame, with sightings of teammates.",
+        "He exchanges maps at each mutual sighting. Here the robots' whole maps are aligned once, "
+        "by singular values over the common landmarks and the robots' own positions at every "
+        "mutual sighting. Ours joins all submaps in one frame, with inter-robot measurements.",
     ),
     SIMULATED_5_5,
     Compared(

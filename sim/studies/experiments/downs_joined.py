@@ -1,10 +1,9 @@
-"""Runs after J. Downs' thesis as tasks: whole-run maps of each robot, and submaps joined by his
-method.
+"""Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
 
-His protocol: measurements sampled to one second, a submap for every step, of which only the mean is
-used. Each robot's submaps are joined by least squares with the identity as covariance, and the
-robots' maps are aligned by singular values (`svd-join-spherical`). A submap here is a window of one
-step of the hybrid estimator; his is a step of an EKF without landmarks before it.
+His protocol: measurements sampled to one second, a submap per step, of which only the mean is used.
+Each robot's submaps are joined by least squares with the identity as covariance, and the maps are
+aligned by singular values (`svd-join-spherical`). A submap here is a window of one step of the
+hybrid estimator; his is a step of an EKF without earlier landmarks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,12 +46,11 @@ from team.wire.bus import Sample, opened
 STEP_S = 1.0
 NEVER_S = 1e6
 DRAWN_POINTS = 1000
-"""Most points of a drawn path."""
 
 
 def final_maps_only(scenario: Scenario) -> Scenario:
-    """The scenario without running poses and maps and without broadcasts, of which his tables have
-    nothing; the final map and the smoothed paths are the same without them.
+    """The scenario without running poses, maps and broadcasts, which do not influence the final map
+    and the smoothed paths.
     """
     change = msgspec.structs.replace
     robots = tuple(change(robot, pose_s=NEVER_S) for robot in scenario.robots)
@@ -61,8 +59,8 @@ def final_maps_only(scenario: Scenario) -> Scenario:
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """The scenario with measurements and submaps of one second, exact initial poses, no loss, no
-    factor and no error states.
+    """The scenario with measurements and submaps of one second, exact initial poses, no loss,
+    factor or error states.
     """
     change = msgspec.structs.replace
     scenario = final_maps_only(scenario)
@@ -87,14 +85,12 @@ def his_protocol(scenario: Scenario) -> Scenario:
 
 
 def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str = "") -> Task:
-    """Every robot's own map and path, such as those of `ekf-slam` with `alone`."""
+    """Task of every robot's own map and path, such as those of `ekf-slam`."""
     return _task("whole_run", scenario, dataset, note)
 
 
 def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
-    """Every robot's submaps joined by his method, and the robots' maps aligned, under his
-    protocol.
-    """
+    """Task of his method under his protocol."""
     return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
 
 
@@ -112,7 +108,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """By robot, the errors of its last own map and of its online path; the map of one robot."""
+    """Errors of the robots' last own maps and online paths; the map of one."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -126,7 +122,6 @@ def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = 
 
 
 def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
-    """The first robot's last map and its paths, to be drawn."""
     name, robot = next(iter(evaluation.robots.items()))
     maps = [opened(s)[2] for s in samples if s.key == ch.OWN_MAP.key(name)]
     last = next((each for each in reversed(maps) if isinstance(each, m.MapEstimate)), None)
@@ -149,10 +144,9 @@ def _thinned(path: Path) -> list[list[float]]:
 def spherical_run(
     scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
 ) -> Figures:
-    """By robot, the errors of its joined map and smoothed path, and the map; the team's errors.
+    """By robot, errors of its joined map and smoothed path, and the map; the team's errors.
 
-    with_covariances: the figures of the same submaps in one join with the covariances that he
-    discards.
+    with_covariances: the same submaps joined with their covariances.
     """
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
@@ -198,14 +192,12 @@ def _samples(scenario: Mapping[str, Any], path: str | None) -> list[Sample]:
 
 
 def _submaps(samples: Sequence[Sample], robot: str) -> list[m.Submap]:
-    """A robot's submaps in their order."""
     submaps = [opened(s)[2] for s in samples if s.key == ch.SUBMAP.key(robot)]
     by_sequence = {each.sequence: each for each in submaps if isinstance(each, m.Submap)}
     return [by_sequence[sequence] for sequence in sorted(by_sequence)]
 
 
 def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
-    """The robot's known initial pose; the origin of its own frame where it is unknown."""
     for sample in samples:
         if sample.key == ch.START.key(robot):
             message = opened(sample)[2]
@@ -218,7 +210,7 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
 def _joined(
     robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
 ) -> SubmapJoining:
-    """All submaps joined at once: the limit of joining them one by one."""
+    """All submaps joined at once: the limit of joining one by one."""
     initial_state = svd_joining.initial_state({robot: start})
     contributions = [
         Contribution(robot, 0, k, k, weighted(translate.local_map_of(s).without_nodes, "identity"))
@@ -230,7 +222,6 @@ def _joined(
 
 
 def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path:
-    """The end poses of the submaps, at their stamps."""
     graph = state.fold.main.graph
     ends = graph.offset[np.array(graph.streams[robot, 0][1:])]
     poses = state.fold.main.state[ends[:, None] + np.arange(3)]
@@ -238,7 +229,6 @@ def _path(robot: str, state: SubmapJoining, submaps: Sequence[m.Submap]) -> Path
 
 
 def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
-    """The error [m] of a joined path."""
     unit = np.broadcast_to(np.eye(3), (len(path.poses), 3, 3))
     errors = pose_errors(path, unit, evaluation.robots[robot].truth)
     return None if errors is None else errors.position_rmse_m
@@ -247,8 +237,8 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """The pairs of positions, one a step, at which two robots measured each other in the same step,
-    in both maps.
+    """Positions, in both maps, of two robots that measured each other in one step, a pair per
+    step.
     """
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
     found: dict[tuple[Stream, Stream], PointPairs] = {}
@@ -276,7 +266,7 @@ def _mutual(
 def _looks(
     samples: Sequence[Sample], robot: str, sensor: Sensor
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """By teammate and step, the last (range [m], bearing [rad]) of that step, calibrated."""
+    """Last calibrated (range [m], bearing [rad]) by teammate and step."""
     found: dict[str, dict[int, tuple[float, float]]] = {}
     for message in messages(samples, ch.SIGHTINGS.key(robot)):
         if isinstance(message, m.Sightings):
@@ -289,7 +279,7 @@ def _looks(
 
 
 def _at(path: Path, step: int) -> int | None:
-    """The index of the pose at a step; None where the robot has none within half a step."""
+    """Index of the pose at a step; None beyond half a step."""
     stamp_ns = round(step * STEP_S * 1e9)
     nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
     near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S
@@ -299,7 +289,6 @@ def _at(path: Path, step: int) -> int | None:
 def _errors(
     found: LandmarkGaussian, truth: Mapping[int, Float[np.ndarray, "2"]]
 ) -> MapErrors | None:
-    """The errors of the landmarks with truth."""
     known = [k for k, id_ in enumerate(found.ids.tolist()) if id_ in truth]
     if not known:
         return None

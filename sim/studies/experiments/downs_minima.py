@@ -1,10 +1,10 @@
-"""Downs' check that two robots' maps have one joint minimum, by a global optimiser.
+"""Test by a global optimiser Downs' claim that two robots' maps have one joint minimum.
 
-The shared-map problem is argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (t, θ). The
-points and t are linear in it and are eliminated exactly, so every minimum is one of the profile
-C(θ), and none is lost. With the identity C(θ) = c − α cos θ − β sin θ, which has one minimum. With
-the maps' own covariances it need not: the profile is searched on a grid. SciPy's differential
-evolution, the successor of his genetic algorithm, looks over (t, θ) without any start.
+The shared-map problem is argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (t, θ). It
+is linear in the points and t, which are eliminated exactly: the minima are those of the profile
+C(θ). With the identity C(θ) = c − α cos θ − β sin θ, which has one minimum. With the maps' own
+covariances it may have more: the profile is searched on a grid. SciPy's differential evolution, the
+successor of his genetic algorithm, searches (t, θ) without a start.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ from team.estimation.geometry import wrapped
 from team.estimation.map_joining.alignment import procrustes
 
 STEPS = 600
-"""Number of steps of his simulator: most landmarks are seen by then."""
+"""Steps of his simulator, after which most landmarks were detected."""
 DURATION_S = 300.0
 GRID = 720
 SAME = 1e-3
@@ -44,7 +44,7 @@ SAME = 1e-3
 
 
 class Pair(NamedTuple):
-    """The common landmarks of two maps, and the covariance of each map's."""
+    """Common landmarks of two maps, with each map's covariance."""
 
     in_a: Float[np.ndarray, "n 2"]
     in_b: Float[np.ndarray, "n 2"]
@@ -53,12 +53,12 @@ class Pair(NamedTuple):
 
 
 def tasks(options: Options) -> list[Task]:
-    """Two robots in his simulator by seed, and all robots of the sets."""
+    """Two robots in his simulator, and all robots of the sets."""
     return [task for _, task in _runs(options)]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """How many minima each pair of maps has, and whether the optimiser finds the closed form's."""
+    """Minima of each pair of maps, and the optimiser's agreement with the closed form."""
     found: dict[str, Figures] = {}
     for name, task in _runs(options):
         robots = (results.of(task) or {}).get("robots", {})
@@ -113,7 +113,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def common(a: Figures, b: Figures) -> Pair:
-    """The landmarks that both maps have."""
+    """Landmarks of both maps."""
     _, in_a, in_b = np.intersect1d(a["ids"], b["ids"], return_indices=True)
     parts = []
     for each, rows in ((a, in_a), (b, in_b)):
@@ -156,14 +156,14 @@ def profile_with_covariances(pair: Pair, turns: Float[np.ndarray, " K"]) -> Floa
 
 
 def minima(costs: Float[np.ndarray, " K"]) -> int:
-    """How many local minima a closed curve has; equal neighbours count as one point."""
+    """Number of local minima of a closed curve; plateaus count once."""
     moves = np.sign(np.diff(np.append(costs, costs[0])))
     moves = moves[moves != 0]
     return int(((moves < 0) & (np.roll(moves, -1) > 0)).sum())
 
 
 def evolved(pair: Pair, seed: int) -> Float[np.ndarray, "3"]:
-    """(t [m], θ [rad]) of the least cost that differential evolution finds, from no start."""
+    """(t [m], θ [rad]) of the least cost found by differential evolution, without a start."""
     wide = 2.0 * float(np.abs(np.concatenate((pair.in_a, pair.in_b))).max()) + 1.0
 
     def cost(motion: Float[np.ndarray, "3"], /) -> float:

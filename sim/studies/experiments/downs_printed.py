@@ -1,14 +1,13 @@
-"""The figures that J. Downs' thesis prints: root mean square errors in metres.
+"""Printed figures of J. Downs' thesis: root mean square errors in metres.
 
-Inconsistencies of the tables: rows 3 and 8 of table 5.2 are the same, and rows 6 and 7 of table
-5.3; the smoothed paths of table 5.4 are better than the truth system, which is accurate to a
-millimetre; and some averages are not those of their rows.
+Inconsistencies: rows 3 and 8 of table 5.2 are equal, and rows 6 and 7 of table 5.3; the smoothed
+paths of table 5.4 are better than the truth system, accurate to a millimetre; some averages are not
+those of their rows.
 """
 
 from collections.abc import Mapping
 
 Robots = tuple[float, float, float, float, float]
-"""Robots 1 … 5 of a set."""
 
 EKF_MAPS: Mapping[str, Robots] = {
     "1": (0.3304, 0.4240, 0.2255, 0.3733, 0.2437),
@@ -64,6 +63,6 @@ TEAM_MAPS: Mapping[str, float] = {
 }  # fmt: skip
 """Table 5.5: joined maps of five robots."""
 P_EKF_JOINED = 3.04e-4
-"""Chapter 5: of the paired t-test of tables 5.1 and 5.3."""
+"""Chapter 5: paired t-test of tables 5.1 and 5.3."""
 P_JOINED_TEAM = 0.1018
-"""Chapter 5: of the paired t-test of tables 5.3 and 5.5."""
+"""Chapter 5: paired t-test of tables 5.3 and 5.5."""

@@ -1,8 +1,7 @@
-"""Tables 5.1 … 5.5 of J. Downs' thesis on his own simulator: 10 and 100 landmarks, one run a seed.
+"""Tables 5.1 … 5.5 of J. Downs' thesis on his simulator: 10 and 100 landmarks, one run a seed.
 
-He ran it thirty times for each (section 4.2) and prints no figure of it, so there is nothing to
-compare with; the methods and the t-tests are those of the tables. It has one robot; table 5.5 needs
-a team, here two robots that start at its centre together.
+He ran it thirty times for each (section 4.2) and prints no figure. Methods and t-tests are those of
+the tables. It has one robot; for table 5.5, two robots start at its centre together.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,13 +26,13 @@ WORLDS = ("downs-10", "downs-100")
 TEAM = 2
 QUICK_STEPS = 300
 STARTED, ALIGNED = "rmse", "rmse_aligned"
-"""Errors of a map as it lies, and after the rigid motion that fits it to the truth."""
+"""Errors of a raw map, and after the rigid motion that fits it to the truth."""
 
 
 class Simulated(NamedTuple):
-    """A method on the simulator: its name, its run, the place of its figures, its colour.
+    """A method on the simulator: its name, run, robots and colour.
 
-    robot: the figures are those of robot 1 in the run; else of `part`, or of the run itself.
+    robot: figures of robot 1; else of `part`, or of the run.
     """
 
     name: str
@@ -69,10 +68,10 @@ OUR_TEAM = Simulated("team, ours", _ours, TEAM, BLACK)
 
 
 class SimulatedTable(NamedTuple):
-    """The simulator's part of a table. figures: their names and headings.
+    """The simulator's part of a table. figures: names and headings.
 
-    compared: pairs of methods whose maps the paired t-test compares, before and after. sample: a
-    map of the first method is drawn, as in figure 5.1.
+    compared: pairs of methods for the t-test. sample: draw a map of the first method, as in figure
+    5.1.
     """
 
     methods: tuple[Simulated, ...]
@@ -81,7 +80,7 @@ class SimulatedTable(NamedTuple):
     sample: bool = False
 
     def tasks(self, options: Options) -> list[Task]:
-        """Every world, method and seed, with the runs that only the t-tests need."""
+        """Every world, method and seed, and runs for the t-tests."""
         found = [
             _task(world, method, options, seed)
             for world in WORLDS
@@ -91,7 +90,7 @@ class SimulatedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, title: str, options: Options, results: Results) -> Outcome:
-        """The errors over the seeds, their t-tests, and every run as a dot."""
+        """Errors over the seeds, t-tests, and every run as a dot."""
         errors = self._errors(options, results)
         if not errors:
             return Outcome(title, {})
@@ -130,7 +129,6 @@ class SimulatedTable(NamedTuple):
         return list(dict.fromkeys([*self.methods, *compared]))
 
     def _errors(self, options: Options, results: Results) -> dict[str, list[float]]:
-        """By world, method and figure, over the seeds."""
         found = {}
         for world in WORLDS:
             count = world.partition("-")[2]
@@ -173,11 +171,11 @@ class SimulatedTable(NamedTuple):
 
 
 def sample_picture(name: str, title: str, sample: Figures) -> Picture:
-    """As his figure 5.1: a map of the EKF."""
+    """A map of the EKF, as his figure 5.1."""
     return Picture(
         name,
-        f"As figure 5.1, a map of the EKF: {title}, {sample['robot']}. Ellipses hold 95 % of what "
-        "the map believes; crosses are the true landmarks, grey the true path.",
+        f"As figure 5.1, a map of the EKF: {title}, {sample['robot']}. Ellipses: 95 % of "
+        "the map's covariances; crosses are the true landmarks, grey the true path.",
         partial(_draw_sample, title, sample),
     )
 
@@ -215,7 +213,6 @@ def _task(world: str, method: Simulated, options: Options, seed: int) -> Task:
 def _by_seed(
     world: str, method: Simulated, name: str, options: Options, results: Results
 ) -> dict[int, float]:
-    """The figure of each seed's run that has it."""
     found = {}
     for seed in options.seeds:
         run = results.of(_task(world, method, options, seed))
@@ -226,7 +223,7 @@ def _by_seed(
 
 
 def paired_test(pairs: Sequence[tuple[float, float]]) -> Figures:
-    """The paired t-test, two-sided, of figures before and after; p None below two pairs."""
+    """Paired two-sided t-test of figures before and after; p None below two pairs."""
     both = np.array(pairs).reshape(-1, 2)
     return {
         "pairs": len(both),

@@ -1,4 +1,4 @@
-"""Curves over many seeds on common times, and the look of the experiments' pictures."""
+"""Curves over many seeds on common times, and the style of the pictures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,14 +14,13 @@ if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.figure import Figure
 
 BAND = (0.1, 0.9)
-"""The band of a picture holds four fifths of the runs."""
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Errors and sigmas of S runs at K common times; NaN where a run has no value yet.
+    """Errors and sigmas of S runs at K common times; NaN before a run's first value.
 
-    nees: the mean per degree of freedom of each run; None where the runs have none.
+    nees: mean per degree of freedom of each run, if any.
     """
 
     times_s: Float[np.ndarray, " K"]
@@ -37,7 +36,7 @@ class Curves:
         *,
         stepwise: bool,
     ) -> Self:
-        """The runs' curves at these times. stepwise: a value holds until the next one."""
+        """Sample the runs at these times. stepwise: hold values."""
         nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
         return cls(
             times_s,
@@ -47,14 +46,14 @@ class Curves:
         )
 
     def quantile(self, share: float) -> Float[np.ndarray, " K"]:
-        """The quantile over the runs with a value, at each time; NaN where there is none."""
+        """Quantile over the runs with a value, at each time; NaN without any."""
         values = np.full(len(self.times_s), np.nan)
         there = ~np.isnan(self.errors).all(axis=0)
         values[there] = np.nanquantile(self.errors[:, there], share, axis=0)
         return values
 
     def rms(self) -> Float[np.ndarray, " S"]:
-        """The root mean square over time of each run."""
+        """Root mean square over time of each run."""
         means: Float[np.ndarray, " S"] = np.sqrt(np.nanmean(self.errors**2, axis=1))
         return means
 
@@ -62,9 +61,7 @@ class Curves:
 def sampled(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
-    """A curve of a run at these times; stepwise: a value holds until the next one, else linear
-    interpolation.
-    """
+    """Sample a curve at these times; stepwise: hold values instead of linear interpolation."""
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)
@@ -99,16 +96,13 @@ def draw_map(
     colour: str = MAP_COLOUR,
     label: str | None = None,
 ) -> None:
-    """Landmarks as dots with their 95 % ellipses. blocks: a 2 × 2 covariance each [m²].
-
-    label: of the dots, in a legend.
-    """
+    """Draw landmarks as dots with 95 % ellipses. blocks: a 2 × 2 covariance each [m²]."""
     dots = np.array(means, dtype=np.float64).reshape(-1, 2)
     axis.plot(*dots.T, linestyle="", marker=".", color=colour, zorder=5, label=label)
     draw_ellipses(axis, dots, np.array(blocks).reshape(-1, 2, 2), colour, zorder=5)
 
 
 def ruled(axis: "Axes") -> None:
-    """A grid behind the curves."""
+    """Draw a grid behind the curves."""
     axis.grid(color="#e4e4e4", linewidth=0.6)
     axis.set_axisbelow(True)

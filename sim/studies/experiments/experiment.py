@@ -1,4 +1,4 @@
-"""The interface of an experiment: its options and tasks, their results, and its outcome."""
+"""The interface of an experiment: options, tasks, results, outcome."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ UTIAS_SOURCE = (
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set that the user gave; sha256 of its file, or of all files of its folder."""
+    """A given data set; sha256 of its file, or of all files of its folder."""
 
     name: str
     path: Path
@@ -24,13 +24,13 @@ class Dataset:
 
 
 def seed_count(count: int) -> str:
-    """A number of seeds with its noun: `1 seed`, `3 seeds`."""
+    """A number with its noun: `1 seed`, `3 seeds`."""
     return f"{count} seed{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command line: the seeds, small or full, the data sets."""
+    """Options of the command line."""
 
     seeds: tuple[int, ...]
     quick: bool = False
@@ -38,28 +38,28 @@ class Options:
 
     @property
     def seed_count(self) -> str:
-        """The number of seeds with its noun."""
+        """The number with its noun."""
         return seed_count(len(self.seeds))
 
 
 @dataclass(frozen=True)
 class Results:
-    """The results of the runs by the tasks' names; a run that failed has none."""
+    """Results of the runs by task name, except failed ones."""
 
     by_name: Mapping[str, dict[str, Any]]
 
     def of(self, task: Task) -> dict[str, Any] | None:
-        """The result of one task; None if it failed."""
+        """Result of one task; None if it failed."""
         return self.by_name.get(task.name)
 
     def of_all(self, tasks: Sequence[Task]) -> list[dict[str, Any]]:
-        """The existing results, in the order of the tasks."""
+        """Existing results, in task order."""
         return [self.by_name[task.name] for task in tasks if task.name in self.by_name]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column is the row's name. note: an explanation for the reader."""
+    """A table as text; the first column names the row."""
 
     title: str
     columns: tuple[str, ...]
@@ -69,9 +69,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture: its file's name without suffix, its caption, and the function that draws it as a
-    PNG.
-    """
+    """A picture: file name without suffix, caption, drawing function."""
 
     name: str
     caption: str
@@ -80,7 +78,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Goal:
-    """The bound of a figure; value None: it could not be computed."""
+    """Bounds of a figure; value None: it could not be computed."""
 
     figure: str
     value: float | None
@@ -89,7 +87,7 @@ class Goal:
 
     @property
     def passed(self) -> bool | None:
-        """Whether it is reached; None where there is no value."""
+        """Whether the bounds hold, if there is a value."""
         if self.value is None:
             return None
         return isfinite(self.value) and self.least <= self.value <= self.most
@@ -97,10 +95,10 @@ class Goal:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of an experiment.
+    """Result of an experiment.
 
-    figures: for machines, by name. remarks: differences from the source, with the reason. missing:
-    what could not be computed, and what to do about it.
+    figures: for machines. remarks: differences from the source, with the reason. missing: figures
+    that need more data, with the remedy.
     """
 
     title: str
@@ -114,7 +112,7 @@ class Outcome:
 
 @runtime_checkable
 class Experiment(Protocol):
-    """The interface of an experiment's module."""
+    """Interface of an experiment's module."""
 
     def tasks(self, options: Options) -> list[Task]:
         """The runs, each once."""
@@ -124,7 +122,7 @@ class Experiment(Protocol):
 
 
 def combined(title: str, parts: Sequence[Outcome]) -> Outcome:
-    """Several outcomes as one, in their order; their figures differ in name."""
+    """Combine several outcomes with different figures."""
     return Outcome(
         title,
         {name: figure for part in parts for name, figure in part.figures.items()},
@@ -137,7 +135,7 @@ def combined(title: str, parts: Sequence[Outcome]) -> Outcome:
 
 
 def without_datasets(what: str) -> str:
-    """The line for `Outcome.missing` of what needs a UTIAS data set."""
+    """Line for `Outcome.missing` about a missing UTIAS data set."""
     return (
         f"{what}: give the sets with --dataset MRCLAM_Dataset1.zip --dataset …; they are of "
         f"{UTIAS_SOURCE}"

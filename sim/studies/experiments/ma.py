@@ -1,9 +1,8 @@
-"""The common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
+"""Common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
 
-The report prints no parameters and no data set's number. Both are in its program (the repository
-that its appendix names): the initial pose of robot 1 is that of set 2, α₁ … α₆ are 0.1 for
-intervals of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad². It uses the
-logged odometry without calibration.
+Parameters and set are only in its program (the repository of its appendix): the initial pose of
+robot 1 is that of set 2, α₁ … α₆ are 0.1 for intervals of 0.02 s, the variances of range and
+bearing 0.0167 m² and 0.000737 rad². The logged odometry is not calibrated.
 """
 
 from collections.abc import Mapping
@@ -38,13 +37,13 @@ from team.wire.bus import Sample, opened
 
 FRAME_S = 0.2
 FRAMES = 1400
-"""Number of frames of the report, roughly five minutes."""
+"""Frames of the report, roughly five minutes."""
 MOTION = MotionModel(alphas=(0.1,) * 6, alpha_interval_s=0.02)
 SENSOR = Sensor(range_sigma=0.0167**0.5, bearing_sigma=0.000736589**0.5)
 START_SIGMA = 1e-3
 """Standard deviation of the program's initial covariance [m, rad]."""
 PARTICLES = 100
-"""The program's default; the report does not say."""
+"""The program's default; not in the report."""
 DEAD_RECKONING = Method("dead reckoning", "dead-reckoning", "alone", 1, VERMILION, PARTICLES)
 SINGLE = Method("single FastSLAM", "fastslam1", "alone", 1, BLUE, PARTICLES)
 MULTI_3 = Method("multi, 3 robots", "dead-reckoning", "joint-fastslam", 3, ORANGE, PARTICLES)
@@ -56,7 +55,7 @@ _LINE_POINTS = 1400
 
 
 def ma_task(dataset: Dataset, method: Method, seed: int) -> Task:
-    """The run of one method on the first 1400 frames of a set."""
+    """Run of one method on the first 1400 frames of a set."""
     scenario = _scenario(method, seed)
     return Task(
         "sim.studies.experiments.ma:ma_run",
@@ -92,9 +91,7 @@ def _scenario(method: Method, seed: int) -> Scenario:
 
 
 def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
-    """The program's models; every measurement is processed separately, with resampling at each step
-    and a map each second.
-    """
+    """The program's models: separate measurements, resampling at each step, a map each second."""
     replace = msgspec.structs.replace
     front_end = replace(
         robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()
@@ -105,7 +102,7 @@ def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
 def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
     """Errors over frames of every robot's path and of the map, the lines and the last map.
 
-    sha256: of the data set at `path`; it stands for it in the task's name.
+    sha256: of the data set at `path`.
     """
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     samples = list(TimedRun().samples(resolved))
@@ -136,7 +133,6 @@ def _frames(stamps_ns: np.ndarray, start_ns: int) -> list[float]:
 def _robot(
     estimate: Path, covariances: Float[np.ndarray, "K 3 3"], true: Path, start_ns: int
 ) -> Figures:
-    """The curve of a robot's position error over frames, and its lines."""
     thinned = max(1, -(-len(estimate.poses) // _LINE_POINTS))
     end_ns = int(estimate.stamps_ns[-1]) if len(estimate.stamps_ns) else 0
     there = (true.stamps_ns >= start_ns) & (true.stamps_ns <= end_ns)
@@ -160,7 +156,6 @@ def _robot(
 def _map(
     samples: list[Sample], robot: str, truth: Mapping[int, np.ndarray], start_ns: int
 ) -> Figures | None:
-    """The mean distance of the landmarks from the truth over frames, and the last map."""
     fused, own = (
         [
             each
@@ -192,7 +187,6 @@ def _map(
 
 
 def _clouds(samples: list[Sample], robot: str) -> list[list[list[float]]]:
-    """The positions of the particles at eight times."""
     clouds = [
         floats(message.poses, "poses").reshape(-1, 3)[:, :2].round(3).tolist()
         for message in (opened(s)[2] for s in samples if s.key == ch.PARTICLES.key(robot))

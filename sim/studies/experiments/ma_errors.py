@@ -31,9 +31,9 @@ from sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
 
 
 class ErrorFigure(NamedTuple):
-    """Errors over frames. of: "path" of robot 1, or "map", the mean distance of its landmarks.
+    """Errors over frames. of: "path" of robot 1, or "map", its landmarks' mean distance.
 
-    printed: the mean error [m] that the text names, by the method's name.
+    printed: mean error [m] by method.
     """
 
     title: str
@@ -52,7 +52,7 @@ class ErrorFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Medians and bands over the seeds beside the printed figures, for each set."""
+        """Medians and bands beside the printed figures, for each set."""
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         figures, rows, pictures = {}, [], []
@@ -71,9 +71,9 @@ class ErrorFigure(NamedTuple):
             if found:
                 caption = (
                     f"{self.title}: {dataset.name}. Above: medians over {options.seed_count} "
-                    "and the band of four fifths of them. Below: the run of seed "
-                    f"{options.seeds[0]} within its own 3σ bound. Where a robot sees no landmark, "
-                    "the filters say no pose, and the curve stands."
+                    "with the 10 … 90 % band. Below: the run of seed "
+                    f"{options.seeds[0]} within its own 3σ bound. Without landmarks "
+                    "the filters publish no pose, and the curve is flat."
                 )
                 draw = drawing(f"{self.title}: {dataset.name}", panel, found, "frame")
                 pictures.append(Picture(dataset.name, caption, draw))
@@ -98,7 +98,6 @@ class ErrorFigure(NamedTuple):
         )
 
     def _curves(self, dataset: Dataset, options: Options, results: Results) -> dict[str, Curves]:
-        """By method, where there is a run of it."""
         frames = np.arange(1.0, FRAMES + 1.0)
         found = {}
         for method in self.methods:
@@ -110,9 +109,7 @@ class ErrorFigure(NamedTuple):
 
 
 def _runs(dataset: Dataset, method: Method, options: Options) -> list[Task]:
-    """One run of each seed; of our estimator the first only, since it takes longest on the same
-    data.
-    """
+    """One run per seed; of our estimator the first only: it takes longest."""
     seeds = options.seeds[:1] if method == OURS else options.seeds
     return [ma_task(dataset, method, seed) for seed in seeds]
 
@@ -131,18 +128,18 @@ def _mean(curves: Curves) -> Float[np.ndarray, " S"]:
 _PROGRAM = (
     "The report names neither parameters nor the set. Its program does: the start is that of set "
     "2, every α is 0.1 at 0.02 s, σ are 0.13 m and 0.027 rad; the particles are its default, 100 "
-    "(its last configuration says 1). Printed are means over the run, read from the text."
+    "(its last configuration has 1). Printed figures are means over the run, from the text."
 )
 _RAW = (
-    "The odometry is taken as logged, as the program does. In these sets the base drives 5 % "
-    "faster than logged and turns 6 % less, with a fourth of a second of delay: errors that last, "
-    "which the α of independent errors can not express. Ours has learnt them, and its errors are "
-    "smaller for that reason too, not for its fusion alone."
+    "The odometry is as logged, as in the program. In these sets the base drives 5 % faster than "
+    "logged and turns 6 % less, with a delay of a quarter of a second: persistent errors, which "
+    "the α of independent errors cannot represent. Our profile models them, so our errors are "
+    "smaller for that reason, too, not by fusion alone."
 )
 _POSES = (
     "As in the report several robots are better than one (measured on set 2). One filter over the "
-    "poses of all robots with so few particles wears thin, though: each resampling throws away "
-    "paths of all of them for the sake of one, and the stated σ is far too small (NEES)."
+    "poses of all robots with so few particles degenerates, however: each resampling discards "
+    "paths of all robots, and the reported σ is far too small (NEES)."
 )
 FIGURE_4A = ErrorFigure(
     "Ma & Ma, figure 4(a): path, dead reckoning against single FastSLAM",

@@ -29,14 +29,14 @@ CLOUD_COLOUR = SKY
 
 
 class PathFigure(NamedTuple):
-    """Paths of some methods side by side, of the first seed's run on each set."""
+    """Paths of some methods side by side, of the first seed."""
 
     title: str
     methods: tuple[Method, ...]
     remark: str
 
     def tasks(self, options: Options) -> list[Task]:
-        """One run of each method on each set."""
+        """One run per method and set."""
         return [
             ma_task(dataset, method, options.seeds[0])
             for dataset in options.datasets
@@ -44,7 +44,7 @@ class PathFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """A picture for each set, and the robots' mean errors."""
+        """A picture per set, and mean errors."""
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         figures, rows, pictures = {}, [], []
@@ -60,7 +60,7 @@ class PathFigure(NamedTuple):
             if runs:
                 caption = (
                     f"{self.title}: {dataset.name}, seed {options.seeds[0]}. Grey: true paths; "
-                    "crosses: true landmarks; ellipses hold 95 % of what is believed; light blue: "
+                    "crosses: true landmarks; ellipses: 95 % of the covariances; light blue: "
                     "particles at eight times."
                 )
                 draw = _Drawing(f"{self.title}: {dataset.name}", tuple(runs))
@@ -83,7 +83,6 @@ class PathFigure(NamedTuple):
 
 
 def _mean_errors(run: Figures) -> dict[str, float]:
-    """The mean position error [m] of each robot's path, where it has poses."""
     return {
         name: float(np.mean(robot["curve"]["error_m"]))
         for name, robot in run["robots"].items()
@@ -97,7 +96,6 @@ class _Drawing:
     runs: tuple[tuple[Method, Figures], ...]
 
     def __call__(self, path: Path) -> None:
-        """One panel for each method, all of them over the same ground."""
         picture = figure(6.5 * len(self.runs), 7.2)
         row = picture.subplots(1, len(self.runs), squeeze=False)[0]
         for axis, (method, run) in zip(row, self.runs, strict=True):
@@ -143,6 +141,6 @@ FIGURE_3 = PathFigure(
 FIGURE_5 = PathFigure(
     "Ma & Ma, figure 5",
     (MULTI_3, MULTI_5),
-    "The report shows three robots and names a video of five. The poses are the centre's, said at "
+    "The report shows three robots and names a video of five. The poses are the centre's, at "
     "measurements of landmarks; its particles are not sent, so the picture has none.",
 )

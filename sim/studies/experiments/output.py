@@ -1,6 +1,4 @@
-"""Writes an experiment's outcome: tables in the terminal, JSON, pictures, and one page with all of
-it.
-"""
+"""Write an experiment's outcome: tables in the terminal, JSON, pictures, and one page."""
 
 import base64
 import json
@@ -36,7 +34,7 @@ _COLOURS = {True: "green", False: "red", None: "yellow"}
 
 
 def printed(concluded: Concluded) -> list[RenderableType]:
-    """The outcome for a terminal."""
+    """Render the outcome for a terminal."""
     outcome = concluded.outcome
     parts: list[RenderableType] = [Text(outcome.title, style="bold")]
     parts += [_grid(table) for table in outcome.tables]
@@ -51,7 +49,7 @@ def printed(concluded: Concluded) -> list[RenderableType]:
 
 
 def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, Any]:
-    """The figures with their provenance; NaN and infinity become null."""
+    """Figures with their provenance; NaN and infinity become null."""
     options, outcome = concluded.options, concluded.outcome
     content = {
         "experiment": concluded.entry.name,
@@ -86,9 +84,7 @@ def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, An
 def write(
     all_concluded: Sequence[Concluded], folder: Path, page: str, provenance: Mapping[str, str]
 ) -> Path:
-    """Write each experiment's JSON and pictures and one page of all of them; returns the page's
-    path.
-    """
+    """Write JSON, pictures and a common page; returns the page's path."""
     folder.mkdir(parents=True, exist_ok=True)
     sections = []
     for concluded in all_concluded:
@@ -127,7 +123,7 @@ def _grid(table: Table) -> Grid:
     for k, column in enumerate(table.columns):
         if k:
             grid.add_column(Text(column), justify="right", no_wrap=True)
-        else:  # it is wrapped where the terminal is narrow, but not within a word
+        else:  # wraps in a narrow terminal, but not within a word
             grid.add_column(Text(column), min_width=widest)
     for row in table.rows:
         grid.add_row(*(Text(cell) for cell in row))
@@ -203,7 +199,6 @@ def _section(concluded: Concluded, figures: Sequence[str]) -> str:
 
 
 def _kinds(concluded: Concluded) -> str:
-    """The runs and their parameters, in a collapsed section."""
     if not concluded.kinds:
         return ""
     rows = "".join(

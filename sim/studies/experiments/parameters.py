@@ -1,4 +1,4 @@
-"""The parameters of the runs in words: their differences from a built-in scenario."""
+"""Describe the parameters of the runs by their differences from a built-in scenario."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,12 +11,12 @@ from sim.scenarios.scenario import load, with_options
 from sim.studies.experiments.task import Task
 
 IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots.id"})
-"""Parameters that the run's label has, or that differ for every robot."""
+"""Parameters in the run's label, or different for every robot."""
 COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central.fusion"})
 
 
 def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
-    """The label, number and parameters of the runs that differ in their seed only."""
+    """Label, number and parameters of the runs that differ in their seed only."""
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
         label = task.label.rpartition(", seed ")[0] or task.label
@@ -26,7 +26,6 @@ def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
 
 
 def _parameters(task: Task) -> Iterator[str]:
-    """The differences of a task's scenarios from the built-in ones, and its other parameters."""
     yield task.work.rpartition(".")[2]
     for name, value in task.parameters.items():
         if isinstance(value, Mapping) and "robots" in value:
@@ -46,12 +45,11 @@ def _differences(scenario: Mapping[str, Any]) -> Iterator[str]:
 
 @cache
 def _built_in(name: str, robots: int) -> Mapping[str, str]:
-    """The leaves of a built-in scenario with so many robots."""
     return dict(_flat(msgspec.to_builtins(with_options(load(name), robots=robots)), ""))
 
 
 def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Leaves by their dotted paths; those of the robots as one where all are alike."""
+    """Leaves by their dotted paths; those of the robots as one if all are equal."""
     if isinstance(value, Mapping):
         for name, each in value.items():
             yield from _flat(each, f"{path}.{name}" if path else name)

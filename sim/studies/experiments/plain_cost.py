@@ -1,14 +1,13 @@
-"""An independent implementation of the joined map's cost: plain arrays, and a solver of SciPy's.
+"""Independent implementation of the joined map's cost: plain arrays, and a solver of SciPy's.
 
-It is a reference for the team's map joining and shares no code with it. The same formulas
+A reference for the team's map joining, without shared code. The same formulas
 
     Σ ‖L_k⁻¹ (R(θ_s)ᵀ(p − p_s) …, θ_e − θ_s …; minus the submap's mean)‖², L_k L_kᵀ = f P_k
     + Σ ‖L⁻¹ (range, bearing of a teammate; minus the measurement)‖² + Σ ‖prior‖²
 
-are implemented with complex numbers and solved by Levenberg-Marquardt steps (damping as in
-Nielsen 1999) through SuperLU, where the map joining has kernels, a factorisation of its own and
-Gauss-Newton steps. The graph provides the measurements, and the indices in the state of each pose
-and landmark.
+are implemented with complex numbers and solved by Levenberg-Marquardt steps (damping as in Nielsen
+1999) through SuperLU, where the map joining has kernels, its own factorisation and Gauss-Newton
+steps. The graph provides measurements and state indices.
 """
 
 from collections import defaultdict
@@ -29,19 +28,19 @@ Blocks = Float[np.ndarray, "K r m"]
 Indices = Int64[np.ndarray, " _"]
 
 AT_REST = 1e-9
-"""A state is at rest where an undamped step is expected to lower χ² by less than this."""
+"""Expected decrease of χ² by an undamped step below which a state is converged."""
 SMALL = 1e-5
-"""A damped step has to be expected to lower χ² by less than this before that is looked at."""
+"""Expected decrease of χ² by a damped step below which convergence is tested."""
 STEPS = 2000
 """Most steps of a solution: a long curved valley takes many."""
 UNDAMPED = 1e-12
-"""The least damping: coordinates that nothing determines stay where they are."""
+"""Least damping: undetermined coordinates keep their values."""
 DAMPING = 1e-3
 """First damping, relative to the diagonal of the normal equations."""
 
 
 class Solution(NamedTuple):
-    """A state, its cost, and whether the solver converged there."""
+    """A state, its cost, and whether it converged."""
 
     state: Values
     cost: float
@@ -49,9 +48,7 @@ class Solution(NamedTuple):
 
 
 class Whitened(NamedTuple):
-    """The whitened residuals of K terms of one kind and size, their Jacobians, and the indices of
-    their coordinates in the state.
-    """
+    """Whitened residuals of K terms of one kind and size, their Jacobians and state indices."""
 
     residuals: Float[np.ndarray, "K r"]
     jacobians: Float[np.ndarray, "K r m"]
@@ -59,13 +56,13 @@ class Whitened(NamedTuple):
 
 
 class PlainCost:
-    """The cost of a graph's states. fixed: coordinates of the state that are not solved for."""
+    """Cost of a graph's states. fixed: coordinates that are not solved for."""
 
     def __init__(
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
     ) -> None:
         if graph.biases:
-            raise NotImplementedError("the judge knows no biases: front_end.biases must be []")
+            raise NotImplementedError("this cost has no biases: front_end.biases must be []")
         self.free: Indices = np.flatnonzero(~fixed)
         self._terms_of: Kinds = [
             *_submaps(graph, covariance_factor), *_sightings(graph), *_priors(graph)
@@ -80,12 +77,12 @@ class PlainCost:
         return float(r @ r)
 
     def residuals(self, state: Values) -> Values:
-        """The whitened residuals, kind by kind; the sum of their squares is the cost."""
+        """Whitened residuals, kind by kind."""
         found = [each.residuals.ravel() for each in self._terms(state)]
         return np.concatenate([np.zeros(0), *found])
 
     def jacobian(self, state: Values) -> sparse.csr_array:
-        """The Jacobian of the whitened residuals with respect to the free coordinates."""
+        """Jacobian of the residuals by the free coordinates."""
         entries, rows, columns, begin = [np.zeros(0)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for each in self._terms(state):
             row = begin + np.arange(each.residuals.size).reshape(*each.residuals.shape, 1)
@@ -101,9 +98,9 @@ class PlainCost:
         return whole[:, :free].tocsr()
 
     def solved(self, state: Values) -> Solution:
-        """The minimum that the steps reach from a state.
+        """Minimise from a state.
 
-        Each is δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, and is taken where it lowers the cost.
+        Steps δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, are taken if they lower the cost.
         """
         state, cost, damping, growth = state.copy(), self.of(state), DAMPING, 2.0
         N, gradient = self._normal(state)
@@ -126,16 +123,15 @@ class PlainCost:
         return Solution(state, cost, at_rest=False)
 
     def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
-        """JᵀJ and Jᵀ r."""
         return self._sum.normal(self._terms(state))
 
     def _terms(self, state: Values) -> list[Whitened]:
-        """The terms at a state; a column behind the last is that of what is not solved for."""
+        """Terms at a state; fixed coordinates share a column after the last."""
         return [kind.whitened(state) for kind in self._terms_of]
 
 
 class _Sum:
-    """Sums the terms' normal equations, which have the same entries at every state."""
+    """Sums the terms' normal equations, whose sparsity is the same at every state."""
 
     def __init__(self, columns: Sequence[Int64[np.ndarray, "_ _"]], free: int) -> None:
         keys = [(c[:, None, :] * (free + 1) + c[:, :, None]).ravel() for c in columns]
@@ -159,8 +155,8 @@ class _Sum:
 
 
 class _Submaps(NamedTuple):
-    """K submaps with the same numbers of poses and points. at: the indices in the state of the
-    coordinates of each one's start, poses and landmarks; points: the first ones of the latter two.
+    """K submaps of equal size. at: state indices of each one's start, poses and landmarks; points:
+    the first ones of the latter two.
     """
 
     whitening: Float[np.ndarray, "K n n"]
@@ -170,7 +166,7 @@ class _Submaps(NamedTuple):
     poses: int
 
     def whitened(self, state: Values) -> Whitened:
-        """The submaps as the state predicts them, less what they are."""
+        """Predicted less measured submaps."""
         poses, count = self.poses, self.points.shape[1]
         x = np.concatenate([3 * np.arange(poses), 3 * poses + 2 * np.arange(count - poses)])
         y, heading = x + 1, 3 * np.arange(poses) + 2
@@ -191,14 +187,14 @@ class _Submaps(NamedTuple):
 
 
 class _Sightings(NamedTuple):
-    """K inter-robot measurements. at: the coordinates of the observer's pose and the teammate's."""
+    """K inter-robot measurements. at: coordinates of the observer's pose and the teammate's."""
 
     whitening: Float[np.ndarray, "K 2 2"]
     means: Float[np.ndarray, "K 2"]
     at: Int64[np.ndarray, "K 6"]
 
     def whitened(self, state: Values) -> Whitened:
-        """Range and bearing of the teammate as the state predicts them, less those measured."""
+        """Predicted less measured range and bearing."""
         pose = state[self.at]
         x, y = pose[:, 3] - pose[:, 0], pose[:, 4] - pose[:, 1]
         distance = np.hypot(x, y)
@@ -212,14 +208,14 @@ class _Sightings(NamedTuple):
 
 
 class _Priors(NamedTuple):
-    """K Gaussians of coordinates of the state; the third is a heading where there is one."""
+    """K Gaussians of coordinates of the state; the third, if any, is a heading."""
 
     whitening: Float[np.ndarray, "K n n"]
     means: Float[np.ndarray, "K n"]
     at: Int64[np.ndarray, "K n"]
 
     def whitened(self, state: Values) -> Whitened:
-        """The coordinates less their means."""
+        """Coordinates less their means."""
         r = state[self.at] - self.means
         r[:, 2:] = _around(r[:, 2:])
         return _whitened(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))
@@ -229,7 +225,6 @@ Kinds = list[_Submaps | _Sightings | _Priors]
 
 
 def _submaps(graph: Graph, covariance_factor: float) -> Iterator[_Submaps]:
-    """The graph's submaps by their numbers of poses and points."""
     kinds = defaultdict(list)
     for contribution, nodes, *_ in graph.submaps:
         kinds[1 + len(contribution.local.node_stamps), len(nodes) - 1].append((contribution, nodes))
@@ -247,7 +242,6 @@ def _submaps(graph: Graph, covariance_factor: float) -> Iterator[_Submaps]:
 
 
 def _sightings(graph: Graph) -> Iterator[_Sightings]:
-    """The graph's inter-robot measurements, if there are any."""
     if graph.sightings:
         sightings = [each for each, *_ in graph.sightings]
         first = graph.offset[np.array([nodes for _, *nodes in graph.sightings])]
@@ -259,7 +253,6 @@ def _sightings(graph: Graph) -> Iterator[_Sightings]:
 
 
 def _priors(graph: Graph) -> Iterator[_Priors]:
-    """The graph's priors, each by itself: they are few."""
     for node, mean, information in graph.priors:
         whitening = np.linalg.cholesky(information).T
         yield _Priors(
@@ -272,7 +265,7 @@ def _whitened(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whit
 
 
 def _step(N: sparse.csc_array, damping: float, gradient: Values) -> tuple[Values, float]:
-    """δ = (N + μ diag N)⁻¹ g, and by how much −δ lowers a cost that is quadratic."""
+    """δ = (N + μ diag N)⁻¹ g, and the decrease of a quadratic cost by −δ."""
     D = damping * N.diagonal()
     step = np.asarray(splu((N + sparse.diags_array(D)).tocsc()).solve(gradient))
     return step, float(step @ (gradient + D * step))
@@ -285,5 +278,4 @@ def _whitening(covariance: Rows) -> Rows:
 
 
 def _around(angles: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
-    """Angles in (−π, π]."""
     return np.asarray(np.angle(np.exp(1j * angles)))

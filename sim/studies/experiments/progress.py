@@ -1,4 +1,4 @@
-"""Shows the progress of the runs: a bar with the time left, or plain lines outside a terminal."""
+"""Show the progress of the runs: a bar, or plain lines outside a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,15 +11,14 @@ from sim.studies.experiments.cases import Done
 from sim.studies.experiments.task import Task
 
 LINE_S = 10.0
-"""Wall time between two plain lines."""
 
 
 @contextmanager
 def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
-    """A function to call with every finished task; failures are printed at once."""
+    """Yields a function to call with every finished task."""
     console = Console(stderr=True)
-    of = f"{len(tasks)} runs" + (f", {found} more are kept from before" if found else "")
-    # Runs cost very different times: the bar goes by what they are expected to cost.
+    of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
+    # The bar advances by expected cost, which differs widely between runs.
     cost = sum(task.cost for task in tasks)
     bar = Progress(
         BarColumn(bar_width=30),

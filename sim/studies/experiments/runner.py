@@ -1,4 +1,4 @@
-"""Runs an experiment: loads the stored results, computes the others, and concludes."""
+"""Run an experiment: load the stored results, compute the others, and conclude."""
 
 import hashlib
 import os
@@ -17,15 +17,15 @@ from sim.studies.experiments.parameters import kinds_of
 from sim.studies.experiments.task import Task
 
 FAILURES = "failures.txt"
-"""File beside the results with the tracebacks of the last command's failed runs."""
+"""File with the tracebacks of the last command's failed runs."""
 _BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
 class Concluded:
-    """An experiment's outcome, and the runs of it that failed, with their errors.
+    """An experiment's outcome, and its failed runs with their errors.
 
-    kinds: runs that differ in their seed only, how many, and their parameters.
+    kinds: runs that differ in their seed only: label, number, parameters.
     """
 
     entry: Entry
@@ -47,13 +47,13 @@ class Plan:
 
 
 Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[[Done], None]]]
-"""Given the tasks to compute and the number of stored results, returns the function to call with
-every finished task.
+"""Given the tasks and the number of stored results, returns the function to call per finished
+task.
 """
 
 
 def planned(entry: Entry, options: Options) -> Plan:
-    """The experiment's tasks; raises ScenarioError, DatasetError."""
+    """List the experiment's tasks; raises ScenarioError, DatasetError."""
     name, _, attribute = entry.module.partition(":")
     module = import_module(f"sim.studies.experiments.{name}")
     experiment = cast(Experiment, getattr(module, attribute) if attribute else module)
@@ -67,7 +67,7 @@ def computed(
     progress: Progress,
     scheduler: str | None = None,
 ) -> list[Concluded]:
-    """The outcomes of all plans; their tasks run together, one that several need runs once."""
+    """Outcomes of all plans; common tasks run once."""
     folder.mkdir(parents=True, exist_ok=True)
     tasks = {task.name: task for plan in plans for task in plan.tasks}
     cases = Cases(folder)
@@ -101,7 +101,7 @@ def _write_failures(path: Path, failures: Sequence[Done]) -> None:
 
 
 def dataset(path: Path) -> Dataset:
-    """A data set with its checksum; raises DatasetError where there is none."""
+    """A data set with its checksum; raises DatasetError."""
     with open_data_set(str(path), "Barcodes.dat"):
         pass
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
@@ -121,7 +121,7 @@ def _blocks(path: Path) -> Iterator[bytes]:
 
 
 def cores() -> int:
-    """The processor's cores that this process may use."""
+    """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

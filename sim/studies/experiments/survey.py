@@ -1,8 +1,7 @@
-"""All estimators and rules on the same measurements, and the thesis' tables 2.1 and 2.2 in numbers.
+"""All estimators and rules on the same measurements, with the thesis' tables 2.1 and 2.2.
 
-The thesis describes advantages and disadvantages of the methods in words; here are measurements of
-those that are implemented, on its own world and on the one with an accurate sensor. The methods
-that are not implemented are named.
+The thesis describes advantages and disadvantages in words; these are measurements of the
+implemented methods, on its world and on the one with an accurate sensor.
 """
 
 from typing import NamedTuple
@@ -25,9 +24,7 @@ from team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
 MOST_SEEDS = 12
-"""Most seeds: the methods differ by factors, and there are two dozen pairs of a second or
-two each.
-"""
+"""Most seeds: the methods differ by factors."""
 PARTICLES = (50, 200, 1000)
 SHOWN: Shown = (
     ("rmse", "map [m]", "{:.3f}"),
@@ -46,7 +43,7 @@ SHOWN: Shown = (
 
 
 class SurveyedMethod(NamedTuple):
-    """A method of tables 2.1 and 2.2: the thesis' judgement, and the pair that implements it."""
+    """A method of tables 2.1 and 2.2, and the pair that implements it."""
 
     method: str
     uncertainty: str
@@ -76,17 +73,17 @@ SURVEYED = (
          "data association", ("hybrid-thesis", "alone")),
 )  # fmt: skip
 BATCH = "graph based"
-"""The batch MAP is this method's optimum; it runs after the team has ended."""
+"""The batch MAP is this method's optimum."""
 
 
 def tasks(options: Options) -> list[Task]:
-    """Every pair in every world, and FastSLAM with few and many particles."""
+    """Every pair and world; FastSLAM with few and many particles."""
     pairs = [task for world in WORLDS for pair in PAIRS for task in _runs(world, pair, options)]
     return pairs + [task for count in PARTICLES for task in _fastslam(count, options)]
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """One table a world, and the two of the thesis with numbers."""
+    """One table a world, and the thesis' two with numbers."""
     figures = {world: _world(world, options, results) for world in WORLDS}
     seeds = seed_count(len(options.seeds[:MOST_SEEDS]))
     tables = [
@@ -118,7 +115,6 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def _world(world: str, options: Options, results: Results) -> dict[str, Figures]:
-    """The figures of each pair, and of the batch MAP."""
     figures = {}
     for pair in PAIRS:
         runs = results.of_all(_runs(world, pair, options))
@@ -139,7 +135,6 @@ def _timed(figures: Figures) -> Figures:
 
 
 def _runs(world: str, pair: tuple[Estimator, FusionRule], options: Options) -> list[Task]:
-    """The same runs as those of `accuracy`."""
     return [
         team_task(
             with_options(load(world), seed=seed, estimator=pair[0], fusion=pair[1]),
@@ -163,7 +158,6 @@ def _fastslam(particles: int, options: Options) -> list[Task]:
 
 
 def _table_2_1(figures: dict[str, Figures]) -> Table:
-    """Uncertainty and online, as printed and as measured."""
     rows = []
     for surveyed in SURVEYED:
         found = _found(surveyed, figures)
@@ -182,7 +176,6 @@ def _table_2_1(figures: dict[str, Figures]) -> Table:
 
 
 def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Table:
-    """Adjectives beside numbers."""
     columns: Shown = (
         ("rmse", "map [m]", "{:.2f}"),
         ("nees", "NEES/dof", "{:.3g}"),

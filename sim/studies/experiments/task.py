@@ -15,16 +15,15 @@ from team.sources import sources_of
 
 ROOTS = ("team", "central", "sim")
 LIBRARIES = ("numpy", "scipy", "numba", "gtsam")
-"""Libraries that results depend on, beside our sources."""
+"""Libraries that results depend on."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One run. work: `module:function`; the function takes the parameters and returns a JSON
-    object.
+    """One run. work: `module:function`, from the parameters to a JSON object.
 
-    local: further keyword arguments that do not change the result, such as the path of a data set
-    whose checksum is among the parameters. cost: estimated run time [s].
+    local: further arguments without influence on the result, such as the path of a data set whose
+    checksum is a parameter. cost: estimated run time [s].
     """
 
     work: str
@@ -35,17 +34,17 @@ class Task:
 
     @cached_property
     def name(self) -> str:
-        """A digest of the function's name and the parameters."""
+        """Digest of function name and parameters."""
         text = json.dumps([self.work, self.parameters], sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
     def program(self) -> str:
-        """A digest of our sources that the function uses and of the libraries' versions."""
+        """Digest of sources and library versions."""
         return program_of(self.work.partition(":")[0])
 
     def run(self) -> dict[str, Any]:
-        """Compute it in this process; returns the result."""
+        """Compute the task in this process."""
         module, _, function = self.work.partition(":")
         work: Callable[..., dict[str, Any]] = getattr(importlib.import_module(module), function)
         return work(**self.parameters, **self.local)
@@ -53,9 +52,7 @@ class Task:
 
 @lru_cache
 def program_of(module: str) -> str:
-    """Digest of the libraries' versions, of every source of ours that a module imports, directly or
-    not, and of the native core.
-    """
+    """Digest of library versions, of all sources that a module imports, and of the native core."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:

@@ -1,4 +1,4 @@
-"""A task that runs a team in memory and compares it with the truth and the batch optimiser."""
+"""Run a team in memory and compare it with the truth and the batch optimum."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -47,9 +47,9 @@ def team_task(
     note: str = "",
     noise: NoiseKind = "white",
 ) -> Task:
-    """A run of this scenario. batch: with the batch MAP of the same measurements.
+    """Make the task of a team's run. batch: with the batch MAP.
 
-    minimum: with `true_minimum`. note: what the scenario's name does not tell. noise: the batch's.
+    minimum: with `true_minimum`. note: appended to the scenario's name. noise: the batch's.
     """
     pair = named(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
@@ -66,7 +66,7 @@ def team_task(
 
 
 def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False) -> float:
-    """Estimated CPU time [s] of a run: long ones begin first."""
+    """Estimated CPU time [s] of a run."""
     world = scenario.world
     if not isinstance(world, SimulatedWorld):
         return _UTIAS_S + batch * _UTIAS_BATCH_S
@@ -80,7 +80,7 @@ def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False
 
 
 def named(estimator: str, fusion: str) -> str:
-    """The name of a pair as users write it."""
+    """Name of a pair in tables."""
     return f"{estimator} + {fusion}"
 
 
@@ -92,14 +92,13 @@ def team_run(
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """The figures of one run; `batch` and `minimum`, if requested, contain those of the batch MAP
-    and of `true_minimum`.
+    """Figures of one run; `batch`, `minimum`: with those of the batch MAP and of `true_minimum`.
 
-    sha256: of the data set at `path`; it stands for it in the task's name.
+    sha256: of the data set at `path`.
     """
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     run = TimedRun()
-    # Provisional maps and priors are the bulk of a large team's log, and nobody looks at them here.
+    # Provisional maps and priors are the bulk of a large team's log and not used here.
     bulk = {ch.FUSED_MAP.key(), *(ch.PRIOR.key(robot.id) for robot in resolved.robots)}
     samples = [sample for sample in run.samples(resolved) if sample.key not in bulk]
     evaluation = evaluate(samples)
@@ -118,7 +117,7 @@ def team_run(
 
 
 class TimedRun:
-    """A team in memory, and the CPU time [s] that its robots and its centre spend on messages."""
+    """A team in memory, and its robots' and centre's CPU time [s]."""
 
     def __init__(self) -> None:
         self._robots = _Watch()
@@ -127,9 +126,7 @@ class TimedRun:
         self._fusions = 0
 
     def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
-        """Run the team; yields the samples of its log. streams: of the world; None: those of the
-        scenario.
-        """
+        """Run the team; yields the samples of its log. streams: default: the scenario's."""
         measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
         for sample in run_team(scenario, measurements, *self._nodes(scenario.central)):
@@ -138,7 +135,7 @@ class TimedRun:
             yield sample
 
     def figures(self) -> Figures:
-        """The total times, and the times per odometry interval and per fused map."""
+        """Times in total, per odometry interval and per fused map."""
         return {
             "robot_seconds": self._robots.seconds,
             "centre_seconds": self._centre.seconds,
@@ -149,7 +146,6 @@ class TimedRun:
     def _nodes(
         self, config: CentralConfig
     ) -> tuple[Callable[[RobotConfig, Exchange], RobotNode], type[CentralNode]]:
-        """The makers of nodes that measure the time of handling a message."""
         robots, centre = self._robots, self._centre
 
         def timed_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
@@ -173,7 +169,7 @@ class TimedRun:
 
 
 class _Watch:
-    """The CPU time [s] that this process has spent inside it."""
+    """Measure the CPU time [s] that this process spends inside."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -186,9 +182,9 @@ class _Watch:
 
 
 def team_figures(evaluation: Evaluation) -> Figures:
-    """The figures of a run; None where there is no truth. Means are over the robots.
+    """Figures of a run, averaged over the robots; None without truth.
 
-    Without a fused map the figures of a map are those of the robots' own maps.
+    Without a fused map the robots' own maps count.
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map
@@ -228,9 +224,7 @@ def team_figures(evaluation: Evaluation) -> Figures:
 
 
 def _robot_figures(robot: RobotResult) -> Figures:
-    """One robot's errors [m]; first_pose_chi2: of the motion by which its first smoothed pose
-    differs from the truth, 3 degrees of freedom.
-    """
+    """One robot's errors [m]; first_pose_chi2: 3 degrees of freedom."""
     smoothed, online = robot.smoothed, robot.online
     return {
         "position_rmse": None if smoothed is None else smoothed.position_rmse_m,
@@ -243,7 +237,7 @@ def _robot_figures(robot: RobotResult) -> Figures:
 
 
 def reference_figures(reference: BatchReference) -> Figures:
-    """The figures of the batch MAP under the same names."""
+    """Figures of the batch MAP under the same names."""
     errors = reference.errors
     shape = None if errors is None else errors.shape
     return {
@@ -259,9 +253,7 @@ def reference_figures(reference: BatchReference) -> Figures:
 
 
 class Figure(NamedTuple):
-    """A figure over seeds: its name, the run's figure that it is computed from, and the
-    function.
-    """
+    """A figure over seeds: its name, the run's figure, and the function."""
 
     name: str
     source: str
@@ -269,19 +261,19 @@ class Figure(NamedTuple):
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """The mean of the values that are not None."""
+    """Mean of the known values."""
     known = [value for value in values if value is not None]
     return fmean(known) if known else None
 
 
 def middle(values: Iterable[float | None]) -> float | None:
-    """The median of the values that are not None."""
+    """Median of the known values."""
     known = [value for value in values if value is not None]
     return median(known) if known else None
 
 
 def rms(values: Iterable[float | None]) -> float | None:
-    """The root mean square of the values that are not None."""
+    """Root mean square of the known values."""
     square = mean(None if value is None else value * value for value in values)
     return None if square is None else square**0.5
 
@@ -314,7 +306,7 @@ OVER_SEEDS = (
 
 
 def over_seeds(runs: Sequence[Figures]) -> Figures:
-    """The figures over several runs, under the runs' names, with the number of runs."""
+    """Figures over several runs, with their number."""
     return {"seeds": len(runs)} | {
         figure.name: figure.over_seeds(run.get(figure.source) for run in runs)
         for figure in OVER_SEEDS
@@ -323,7 +315,7 @@ def over_seeds(runs: Sequence[Figures]) -> Figures:
 
 
 def cells_of(figures: Figures, shown: Shown) -> list[str]:
-    """A row of a table; a dash where there is no figure."""
+    """A row of a table; a dash for a missing figure."""
     return [
         "–" if figures.get(name) is None else form.format(figures[name]) for name, _, form in shown
     ]

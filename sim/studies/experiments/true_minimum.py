@@ -1,12 +1,11 @@
-"""Decides whether a map is in the minimum that the truth lies in, by the cost and not by the
-covariance.
+"""Decide by the cost, not the covariance, whether map and truth lie in the same minimum.
 
-An ellipsoid is exceeded wherever the valley of the cost is curved, though the minimum is the right
-one. So three tests use the final map's own cost: whether a solution that starts at the truth has
-less cost, whether it ends in another place that is about as likely, and by how much the cost rises
-where the truth is fixed (the likelihood ratio: χ² of the fixed coordinates, whatever their
-parametrisation). The cost and its minima are those of `plain_cost`, which shares no code with the
-map joining: a map whose state has not converged is wrong, too.
+An ellipsoid is exceeded in any curved valley of the cost, even in the right minimum. Three tests
+use the final map's own cost: whether a solution from the truth has less cost, whether it ends in
+another place that is about as likely, and by how much the cost rises with the truth fixed (the
+likelihood ratio: χ² of the fixed coordinates, for any parametrisation). Cost and minima are those
+of `plain_cost`, which shares no code with the map joining: a map whose state has not converged is
+wrong, too.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,23 +27,22 @@ from team.wire import messages as m
 from team.wire.bus import Sample
 
 LOWER = 1.0
-"""A cost that is lower by more than this belongs to another minimum."""
+"""Decrease of the cost that indicates another minimum."""
 LIKELY = 0.999
 """Quantile of χ² beyond which a place, or the truth, is excluded."""
 NEARBY = 3
-"""Number of initial states near the truth, beside the truth itself."""
+"""Number of initial states near the truth, besides the truth."""
 NEARBY_RAD = 0.1
 """Standard deviation [rad] of these states' headings about the true ones."""
 Values = Float[np.ndarray, " _"]
 
 
 class TrueMinimum(NamedTuple):
-    """The map's minimum compared with the one that a solution from the truth reaches.
+    """The map's minimum compared with that of a solution from the truth.
 
-    lower: how much less the cost of the solution from the truth is. other_minimum: that solution
-    ends outside the map's 99.9 % ellipsoid, at a cost that does not exclude it. rise: how much more
-    the cost is with the landmarks and the end of each robot's first submap fixed at the truth; dof:
-    number of coordinates that are fixed so.
+    lower: how much less the latter's cost is. other_minimum: it ends outside the map's 99.9 %
+    ellipsoid, at a cost that does not exclude it. rise: increase of the cost with the landmarks and
+    the end of each robot's first submap fixed at the truth; dof: number of fixed coordinates.
     """
 
     lower: float
@@ -54,7 +52,7 @@ class TrueMinimum(NamedTuple):
 
     @property
     def wrong(self) -> bool:
-        """Whether the map is in another minimum than the truth."""
+        """Whether map and truth lie in different minima."""
         return self.lower > LOWER or self.other_minimum
 
     @property
@@ -64,7 +62,7 @@ class TrueMinimum(NamedTuple):
 
 
 def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | None:
-    """The figures of the final map of a run under `join`; None where no initial pose is known."""
+    """Figures of the final map under `join`; None without a known initial pose."""
     fold = final_fold(samples)
     if run.map is None or not fold.starts:
         return None
@@ -75,7 +73,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 
 
 def final_fold(samples: Iterable[Sample]) -> Fold:
-    """The centre's final fold, computed from the submaps and inter-robot measurements of a log."""
+    """The centre's final fold, recomputed from a log."""
     log = Recorded()
     for sample in samples:
         log.take(sample)
@@ -97,12 +95,12 @@ def judged(
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     paths: Mapping[str, Path],
 ) -> TrueMinimum:
-    """The figures of an island in the frame of the truth, with plain squares and without biases."""
+    """Figures of an island in the truth's frame, with plain squares and without biases."""
     graph, settings = island.graph, island.settings
     if settings.robust_c is not None:
-        raise NotImplementedError("the judge has plain squares: central.robust_c must be left out")
+        raise NotImplementedError("this cost has plain squares: central.robust_c must be left out")
     if settings.joined_ranges:
-        raise NotImplementedError("the judge knows no central.joined_ranges: leave it out")
+        raise NotImplementedError("this cost has no central.joined_ranges: leave it out")
     fixed = np.repeat(graph.fixed, np.diff(graph.offset))
     cost = PlainCost(graph, settings.covariance_factor, fixed)
     ours = cost.of(island.state)
@@ -136,7 +134,6 @@ def judged(
 def _at_truth(
     island: Island, landmarks: Mapping[int, Float[np.ndarray, "2"]], paths: Mapping[str, Path]
 ) -> tuple[Values, set[int]]:
-    """The state with every known node at its true value, and the set of these nodes."""
     graph, state = island.graph, island.state.copy()
     known: set[int] = set()
 

@@ -1,8 +1,7 @@
-"""The common part of the experiments after W. Xu's thesis: its world, its methods, its curves.
+"""Common part of the experiments after W. Xu's thesis: its world, its methods, its curves.
 
-Its world is the built-in scenario `thesis`, with the 50 particles of its section 4.4.2. A figure of
-the thesis is one run; ours is the median of many seeds with the band of four fifths of them, and
-one single run with its 3σ bound.
+The world is the scenario `thesis`, with the 50 particles of section 4.4.2. A figure of the thesis
+is one run; ours is the median of many seeds with the 10 … 90 % band, and one run with its 3σ bound.
 """
 
 import math
@@ -33,9 +32,9 @@ CODED_BEARING_SIGMA = math.sqrt(math.pi / 18.0**2)
 
 
 class Method(NamedTuple):
-    """A curve of a figure: its name, its pair, its number of robots, its colour.
+    """A curve of a figure: name, pair, number of robots, colour.
 
-    particles: 50, as in the thesis; None: our scenario's number.
+    particles: 50, as in the thesis; None: the scenario's.
     """
 
     name: str
@@ -65,10 +64,9 @@ Reading = Literal["stated", "exact", "coded"]
 class Panel(NamedTuple):
     """One world of a figure, its methods, and the thesis' figures in metres.
 
-    noise: of the odometry, (m, rad) in a step; None: the scenario's. reading: the interpretation of
-    the thesis. "stated": its text. "exact": the same with exact odometry, while the filters assume
-    noise. "coded": its appendix' program (`as_coded`). printed: by the method's name, the largest
-    error in the text or the picture.
+    noise: of the odometry, (m, rad) in a step; None: the scenario's. reading: "stated": the thesis'
+    text; "exact": the same with exact odometry, while the filters assume noise; "coded": its
+    appendix' program (`as_coded`). printed: by method, the largest error in text or picture.
     """
 
     name: str
@@ -79,7 +77,7 @@ class Panel(NamedTuple):
 
 
 class ErrorFigure(NamedTuple):
-    """A figure of errors over 500 steps. of: "pose" of robot 1, or "landmark", the first seen."""
+    """Errors over 500 steps. of: "pose" of robot 1, or "landmark", its first."""
 
     title: str
     of: str
@@ -96,7 +94,7 @@ class ErrorFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Medians and bands over the seeds beside the printed figures."""
+        """Medians and bands beside the printed figures."""
         found = {panel.name: self._curves(panel, options, results) for panel in self.panels}
         rows = [
             (f"{panel.name}: {method.name}" if panel.name else method.name, *row(panel, method, c))
@@ -117,7 +115,7 @@ class ErrorFigure(NamedTuple):
             Picture(
                 panel.name.partition(",")[0].replace(" ", "-") or "errors",
                 f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
-                f"{options.seed_count} and the band of four fifths of them. Below: the run "
+                f"{options.seed_count} with the 10 … 90 % band. Below: the run "
                 f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
                 drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
             )
@@ -133,7 +131,6 @@ class ErrorFigure(NamedTuple):
         return Outcome(self.title, figures, (table,), tuple(pictures), remarks=self.remarks)
 
     def _curves(self, panel: Panel, options: Options, results: Results) -> dict[str, Curves]:
-        """By method, where there is a run of it."""
         steps = np.arange(1, 501) * STEP_S
         found = {}
         for method in panel.methods:
@@ -145,7 +142,7 @@ class ErrorFigure(NamedTuple):
 
 
 def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -> Task:
-    """The run of one method in one panel's world; shots: the steps whose maps are drawn."""
+    """Run of a method in a panel's world; shots: steps whose maps are drawn."""
     scenario = with_options(
         load("thesis"),
         seed=seed,
@@ -168,9 +165,7 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
 
 
 def _telling(scenario: Scenario) -> Scenario:
-    """The scenario with a map at every step of a filter over the whole run, which has no
-    windows.
-    """
+    """The scenario with a map at every step of a filter without windows."""
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, window_s=STEP_S))
@@ -180,13 +175,13 @@ def _telling(scenario: Scenario) -> Scenario:
 
 
 def as_coded(scenario: Scenario) -> Scenario:
-    """The inputs of the appendix' program, where they differ from section 4.4.2.
+    """Inputs of the appendix' program where they differ from section 4.4.2.
 
-    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` are what a normal number is multiplied by in
-    `add_control_noise`: variances taken for standard deviations, 2.5 mm and 0.16° instead of 5 cm
-    and 3°. `R(2,2) = pi/18^2` is a variance: 5.6°, not 10°. Landmarks are seen from any distance
-    below 20 m. `get_observations(xtrue(:,i), …)` looks from the pose before the motion; the world
-    looks at its start for that.
+    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` multiply a normal number in `add_control_noise`:
+    variances taken for standard deviations, 2.5 mm and 0.16° instead of 5 cm and 3°. `R(2,2) =
+    pi/18^2` is a variance: 5.6°, not 10°. Landmarks are detected at any distance below 20 m.
+    `get_observations(xtrue(:,i), …)` measures from the pose before the motion; so the world
+    measures at its start.
     """
     replace = msgspec.structs.replace
     assert isinstance(scenario.world, SimulatedWorld)
@@ -199,9 +194,7 @@ def as_coded(scenario: Scenario) -> Scenario:
 
 
 def with_particles(scenario: Scenario, particles: int) -> Scenario:
-    """The scenario with this number of particles for every robot, and for a filter at the
-    centre.
-    """
+    """Set the number of particles of robots and centre."""
     replace = msgspec.structs.replace
     robots = tuple(
         replace(robot, front_end=replace(robot.front_end, particles=particles))
@@ -212,7 +205,7 @@ def with_particles(scenario: Scenario, particles: int) -> Scenario:
 
 
 def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
-    """The scenario with odometry noise of (m, rad) in a step of a second."""
+    """Set the odometry noise (m, rad) of a step of a second."""
     replace = msgspec.structs.replace
     motion = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
     robots = tuple(
@@ -222,7 +215,6 @@ def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
 
 
 def _of(run: Figures, what: str) -> Figures | None:
-    """The curve of robot 1's pose, or of the landmark."""
     curve: Figures | None = (
         run["landmark"] if what == "landmark" else next(iter(run["poses"].values()), None)
     )
@@ -230,7 +222,7 @@ def _of(run: Figures, what: str) -> Figures | None:
 
 
 def row(panel: Panel, method: Method, curves: Curves) -> tuple[str, ...]:
-    """The figures of one method as cells of a table."""
+    """Figures of one method as cells of a table."""
     printed = panel.printed.get(method.name)
     largest = np.nanmax(curves.errors, axis=1)
     low, middle, high = np.quantile(largest, (BAND[0], 0.5, BAND[1]))
@@ -246,7 +238,7 @@ def row(panel: Panel, method: Method, curves: Curves) -> tuple[str, ...]:
 
 
 def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
-    """The figures of one method for machines."""
+    """Figures of one method for machines."""
     largest = np.nanmax(curves.errors, axis=1)
     return {
         "printed_max_m": panel.printed.get(name),
@@ -263,9 +255,7 @@ def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
 def drawing(
     title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
 ) -> Callable[[Path], None]:
-    """A function that draws the medians with their bands, and one run with its bound; unit: of the
-    times.
-    """
+    """Draw medians with bands, and one run with its bound; unit: of the times."""
 
     def draw(path: Path) -> None:
         _draw(path, title, panel, found, unit)
@@ -292,7 +282,7 @@ def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], uni
     above.set_xlabel(unit)
     above.set_ylabel("distance to the truth,\nmedian and 10 … 90 % of the seeds [m]")
     above.set_xlim(0, max(curves.times_s[-1] for curves in found.values()))
-    # One method that is lost in some runs would press all the others to the floor.
+    # A method that diverges in some runs would flatten all others.
     largest = max(float(np.nanmax(curves.quantile(BAND[1]))) for curves in found.values())
     middle = max(float(np.nanmax(curves.quantile(0.5))) for curves in found.values())
     above.set_ylim(0, 1.05 * min(largest, 2.0 * middle))

@@ -25,17 +25,17 @@ TEAMS_CODED = (SINGLE_HYBRID_CODED, MULTI_FASTSLAM, MULTI_CODED, OUR_TEAM)
 _PRINTED_5_3 = dict.fromkeys((MULTI_FASTSLAM.name, MULTI_HYBRID.name, MULTI_CODED.name), 1.0)
 _PRINTED_5_2 = {MULTI_HYBRID.name: 0.5, MULTI_CODED.name: 0.5}
 _READINGS = (
-    "As stated: the noise of section 4.4.2 is in the odometry that the filters get. As coded: the "
+    "As stated: the noise of section 4.4.2 is in the odometry of the filters. As coded: the "
     "program of the thesis' appendix takes each control from the true path, so its odometry has no "
     "error and dead reckoning alone would be exact; and it multiplies normal numbers by variances, "
-    "so that its particles spread by 2.5 mm and 0.16° a step instead of 5 cm and 3°. Its bearings "
-    "have 5.6° instead of 10°, landmarks are seen from any distance below 20 m and from the pose "
-    "before the motion, and weights are never set back. The appendix has Hybrid only; EKF-SLAM, "
+    "so its particles spread by 2.5 mm and 0.16° a step instead of 5 cm and 3°. Its bearings have "
+    "5.6° instead of 10°, landmarks are detected at any distance below 20 m and from the pose "
+    "before the motion, and weights are never reset. The appendix has Hybrid only; EKF-SLAM, "
     "FastSLAM and ours get the same measurements and controls."
 )
 _FORGETS = (
-    "Hybrid as written sets all particles to their mean after each step and so forgets how pose "
-    "and landmarks depend on each other: its bound covers one step's noise, whatever the error is. "
+    "Hybrid as written sets all particles to their mean after each step and so discards the "
+    "correlation of pose and landmarks: its bound covers one step's noise, whatever the error is. "
     "Ours keeps the joint Gaussian of a window, and its error stays within the bound."
 )
 
@@ -50,11 +50,11 @@ FIGURE_4_4 = ErrorFigure(
     (
         _READINGS,
         "The printed errors of 7, 3 and 2 m are those of the program, not of the text: as coded "
-        "the runs stay within them and in their order, as stated every recursive filter is off by "
-        "much more. True controls alone (the second reading) do not explain it; the small noise "
-        "does.",
-        "As coded ours is no better than the others: that all measurements are a step late "
-        "is in no model of noise, and its NEES says so. As stated it is.",
+        "the runs stay within them and in their order; as stated every recursive filter has a "
+        "much larger error. The reason is the small noise, not true controls alone (the second "
+        "reading).",
+        "As coded ours is no better than the others: no model of noise covers measurements that "
+        "are a step late, as its NEES shows. As stated it is better.",
         _FORGETS,
     ),
 )
@@ -72,11 +72,11 @@ FIGURE_4_5 = ErrorFigure(
         )
     ),
     (
-        "The thesis pairs 50 cm with 3° as the high noise and 5 cm with 10° as the low one; meant "
-        "are, by its words of a low and a high level of each, 50 cm with 10° and 5 cm with 3°. "
-        "Both pairings are here. It prints paths and no figures. Its text has FastSLAM fail at "
-        "high noise and Hybrid not: with the noise in the odometry Hybrid as written has the "
-        "smoother path, as it says, but is no better at the noise that is printed as high.",
+        "The thesis pairs 50 cm with 3° as the high noise and 5 cm with 10° as the low one; "
+        "according to its text 50 cm with 10° and 5 cm with 3° are meant. Both pairings are here. "
+        "It prints paths and no figures. In its text FastSLAM fails at high noise and Hybrid does "
+        "not: with the noise in the odometry Hybrid as written has the smoother path, but is no "
+        "better at the printed high noise.",
         _FORGETS,
     ),
 )  # fmt: skip
@@ -93,8 +93,8 @@ FIGURE_4_6 = ErrorFigure(
         ),
     ),
     (
-        "Printed: all three below 5 m once the landmark has been seen some times, EKF-SLAM best "
-        "with 2 m at the 45th step, where the robot leaves it. Ours is said once per window.",
+        "Printed: all three below 5 m after a few measurements of the landmark, EKF-SLAM best "
+        "with 2 m at the 45th step, where the robot leaves it. Ours is published once per window.",
     ),
 )
 FIGURE_5_2 = ErrorFigure(
@@ -106,15 +106,15 @@ FIGURE_5_2 = ErrorFigure(
     ),
     (
         "Printed: multi-Hybrid within 0.5 m, multi-FastSLAM above it, single Hybrid worst. As "
-        "stated multi-Hybrid is the worst of them, in some runs by tens of metres; as coded all "
-        "come to one to three metres, in no clear order. Within 0.5 m it is in neither reading.",
+        "stated multi-Hybrid is worst, in some runs by tens of metres; as coded all reach one to "
+        "three metres, in no clear order. Neither reading gives 0.5 m.",
         _READINGS,
-        "The appendix' function that merges two maps multiplies a 2 × 1 by a 2 × 2 matrix from the "
-        "wrong side and can not run as printed, so both readings merge by equations 5.1 to 5.4, "
-        "with the sign of 5.1 and 5.3 set right.",
-        "The robots of multi-Hybrid absorb the fused map and send it again, so that every "
-        "measurement is counted once more at each step: the error may shrink, the covariance loses "
-        "its meaning, and the poses, whose uncertainty is forgotten, drift.",
+        "The appendix' function that merges two maps multiplies a 2 × 1 by a 2 × 2 matrix from "
+        "the wrong side and cannot run as printed, so both readings merge by equations 5.1 to "
+        "5.4, with the sign of 5.1 and 5.3 corrected.",
+        "The robots of multi-Hybrid absorb the fused map and send it again, so every measurement "
+        "is counted again at each step: the error may shrink, the covariance loses its meaning, "
+        "and the poses, whose uncertainty is discarded, drift.",
     ),
 )
 FIGURE_5_3 = ErrorFigure(
@@ -125,9 +125,9 @@ FIGURE_5_3 = ErrorFigure(
         Panel("as coded", TEAMS_CODED, _PRINTED_5_3, reading="coded"),
     ),
     (
-        "Printed: both multi-robot methods fall below 1 m at the 120th step, when robot 2 sees the "
-        "landmark, single Hybrid only after the 240th. As written and as coded the fused variance "
-        "is next to nothing after some steps, and nothing that is seen later moves the landmark.",
+        "Printed: both multi-robot methods fall below 1 m at the 120th step, when robot 2 detects "
+        "the landmark, single Hybrid only after the 240th. As written and as coded the fused "
+        "variance nearly vanishes after some steps, and no later measurement moves the landmark.",
         _READINGS,
     ),
 )

@@ -1,10 +1,8 @@
 """Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
 
-Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here the same is shown on the
-thesis' own world: the three steps of the filter one by one at the end of a stretch without
-measurements, and a start anywhere. The states are those of
-`sim.studies.estimators.localisation`; the motions and measurements are those that the robot of
-such a run receives, cut into keyframes as in every node.
+Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here they are on the thesis'
+world: the three steps of the filter after a stretch without measurements, and a start anywhere. The
+filter is `sim.studies.estimators.localisation`; keyframes are those of a robot's node.
 """
 
 from collections.abc import Mapping
@@ -46,14 +44,13 @@ if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
 
 STRETCH = ((28.715, 33.276), (51.298, 53.539), (64.3, 67.3))
-"""A part of robot 1's path: from the lower left to the upper right, as in figure 3.2."""
+"""Part of robot 1's path, from the lower left to the upper right, as in figure 3.2."""
 STRETCH_STEPS = 49
 BLIND_CLOUDS = 6
 PARTICLES = 1000
 ANYWHERE_PARTICLES = 20_000
 ANYWHERE_STEPS = (0, 1, 40)
 DRAWN = 2000
-"""Most particles of a picture."""
 STAGES = ("prediction", "update", "resampling")
 _COST_S = 1.0
 
@@ -69,7 +66,7 @@ ERRORS = ErrorFigure(
 
 
 def tasks(options: Options) -> list[Task]:
-    """The three steps, a start anywhere and the errors over 500 steps, for every seed."""
+    """The three steps, a start anywhere, the errors."""
     return [
         *(_stages_task(options, seed) for seed in options.seeds),
         *(_anywhere_task(options, seed) for seed in options.seeds),
@@ -78,7 +75,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Three pictures of the steps, one of the start anywhere, one of the errors."""
+    """Pictures of the steps, the start anywhere, the errors."""
     stages = results.of_all([_stages_task(options, seed) for seed in options.seeds])
     anywhere = results.of_all([_anywhere_task(options, seed) for seed in options.seeds])
     errors = ERRORS.outcome(options, results)
@@ -167,7 +164,6 @@ def _alone(seed: int, particles: int) -> Scenario:
 
 
 def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
-    """A run of one seed; clouds are stored for the picture of the first seed only."""
     return Task(
         f"sim.studies.experiments.xu_localisation:{work}",
         {"world": msgspec.to_builtins(scenario), "clouds": seed == options.seeds[0]},
@@ -178,8 +174,6 @@ def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
 
 @dataclass(frozen=True)
 class _Run:
-    """The keyframes that a robot receives in a run, its known map, and its true poses."""
-
     scenario: Scenario
     keyframes: list[RobotKeyframe]
     start: np.ndarray
@@ -218,9 +212,7 @@ def _run_of(world: Mapping[str, Any]) -> _Run:
 
 
 def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """Predict over the whole stretch, weigh by one measurement, resample; a summary of each
-    cloud.
-    """
+    """Predict over the stretch, weigh by one measurement, resample; a summary of each cloud."""
     run = _run_of(world)
     sensor = run.scenario.robots[0].sensor
     random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
@@ -237,7 +229,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         )
     last = run.keyframes[-1]
     true = run.truth[last.stamp_ns]
-    # One landmark, the one farthest to the left: as in figure 3.3.
+    # The landmark farthest to the left: as in figure 3.3.
     k = int(np.argmax(last.keyframe.bearings))
     measurement = (
         last.keyframe.ids[k : k + 1],
@@ -274,7 +266,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 
 def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """The filter from a uniform cloud over the place, by the farthest measurement of each step."""
+    """Localise from a uniform cloud, by each step's farthest measurement."""
     run = _run_of(world)
     config = run.scenario.robots[0]
     assert isinstance(run.scenario.world, SimulatedWorld)
@@ -288,7 +280,7 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     poses = [run.start.tolist()]
     for k, each in enumerate(run.keyframes, 1):
         keyframe = each.keyframe
-        far = np.argsort(keyframe.ranges)[-1:]  # with all of them the first step would do
+        far = np.argsort(keyframe.ranges)[-1:]  # all of them would localise at once
         measurements = keyframe.ids[far], keyframe.ranges[far], keyframe.bearings[far]
         state = localisation.filter_step(
             state, keyframe.increment, config.sensor, *measurements, random
@@ -296,7 +288,7 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         if k in ANYWHERE_STEPS:
             true = run.truth[each.stamp_ns]
             found[str(k)] = _summary(state, true)
-            # What carries no weight is gone after the next resampling.
+            # The next resampling removes particles without weight.
             drawn.append(_cloud(fastslam.resampled(state.cloud, random)[0], DRAWN))
             poses.append(true.tolist())
     if clouds:
@@ -305,7 +297,6 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 
 def _summary(state: Localisation, true: np.ndarray) -> Figures:
-    """The error of the cloud's mean, and the cloud's own covariance."""
     mean, covariance = localisation.pose_gaussian(state)
     off = mean[:2] - true[:2]
     return {
@@ -392,7 +383,7 @@ def _draw_stage(run: Figures, name: str, path: Path) -> None:
 
 
 def _scatter(axis: "Axes", cloud: Figures, label: str | None) -> None:
-    """Darker where the weight is higher, and the darkest on top."""
+    """Darker for higher weights, the darkest on top."""
     points, weights = np.array(cloud["points"]), np.array(cloud["weights"])
     order = np.argsort(weights)
     shades = np.column_stack(

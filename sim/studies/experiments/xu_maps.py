@@ -40,7 +40,7 @@ STEPS = 500
 class MapFigure(NamedTuple):
     """Maps of some methods at some steps: one run drawn, and the error over the seeds.
 
-    shown: the methods, each with its reading of the thesis.
+    shown: methods with their reading.
     """
 
     title: str
@@ -49,7 +49,7 @@ class MapFigure(NamedTuple):
     remarks: tuple[str, ...]
 
     def tasks(self, options: Options) -> list[Task]:
-        """A run of each method that is drawn, and those of the error figures."""
+        """Runs of the drawn methods and of the error figures."""
         return [
             each
             for method, reading in self.shown
@@ -60,7 +60,7 @@ class MapFigure(NamedTuple):
         ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """A picture and a row for each method."""
+        """A picture and a row per method."""
         rows, pictures, figures = [], [], {}
         for method, reading in self.shown:
             run = results.of(self._drawn(method, reading, options))
@@ -93,15 +93,14 @@ class MapFigure(NamedTuple):
         return _run(method, reading, options.seeds[0], self.steps)
 
     def _pictures(self, label: str, run: Figures, seed: int) -> list[Picture]:
-        """A picture for each step, lettered as in the source where there are several."""
         name = label.replace(" ", "-").replace(",", "").lower()
         pictures = []
         for k, shot in enumerate(run["shots"]):
             letter = chr(ord("a") + k) if len(self.steps) > 1 else ""
             title = f"{self.title}{f' ({letter})' if letter else ''}: {label}"
             caption = (
-                f"{title}, seed {seed}, step {shot['step']}. Ellipses hold 95 % of what the map "
-                "believes; crosses are the true landmarks, grey the true paths."
+                f"{title}, seed {seed}, step {shot['step']}. Ellipses: 95 % of the map's "
+                "covariances; crosses are the true landmarks, grey the true paths."
             )
             file = f"{name}-{letter}-step-{shot['step']}" if letter else name
             drawing = partial(_draw_shot, title, shot, run["landmarks"])
@@ -114,7 +113,6 @@ def _run(method: Method, reading: Reading, seed: int, shots: tuple[int, ...] = (
 
 
 def _named(method: Method, reading: Reading) -> str:
-    """The method's name with its reading, unless the name has it."""
     return method.name if "," in method.name else f"{method.name}, {_READ[reading]}"
 
 
@@ -163,12 +161,12 @@ def _draw_paths(axis: "Axes", shot: Figures) -> None:
 
 
 class PathFigure(NamedTuple):
-    """Figure 4.5: paths of one run, without landmarks as in the source, beside the errors."""
+    """Figure 4.5: paths of one run, without landmarks, beside the errors."""
 
     errors: ErrorFigure
 
     def tasks(self, options: Options) -> list[Task]:
-        """The error figure's runs, and one of each panel and method to be drawn."""
+        """Runs of the error figure, and one per panel and method."""
         drawn = [
             self._run(panel, method, options)
             for panel in self.errors.panels
@@ -177,7 +175,7 @@ class PathFigure(NamedTuple):
         return self.errors.tasks(options) + drawn
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """A picture of the paths for each panel, then the errors."""
+        """A picture per panel, then the errors."""
         pictures = []
         for panel in self.errors.panels:
             runs = [
@@ -215,12 +213,12 @@ _READ: Mapping[Reading, str] = {
     "stated": "as stated", "exact": "true controls", "coded": "as coded",
 }  # fmt: skip
 _PRINTED = (
-    "The thesis prints the maps without figures. They are those of its program, whose controls are "
-    "exact and whose particles hardly spread (xu-4.4); as stated, with the noise of section 4.4.2 "
-    "in the odometry, the same filters end far from the truth."
+    "The thesis prints the maps without figures. They are those of its program, with exact "
+    "controls and a tiny spread of the particles (xu-4.4); as stated, with the noise of section "
+    "4.4.2 in the odometry, the same filters end far from the truth."
 )
 _ROBOT_1 = (
-    "The text of figures 4.1 and 4.2 has the robot start at the lower left, (10, 40); that is "
+    "In the text of figures 4.1 and 4.2 the robot starts at the lower left, (10, 40); that is "
     "robot 2's start in the appendix. Here, as in figure 4.3 and in the appendix, robot 1 starts "
     "at the right, (80, 40)."
 )

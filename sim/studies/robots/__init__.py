@@ -1,1 +1,1 @@
-"""Estimators of the sources as a robot runs them, for comparison; the product runs without them."""
+"""Robots with the sources' estimators, for comparison; the product runs without them."""

@@ -1,4 +1,4 @@
-"""The interface between a robot of a comparison and its estimator over a whole stream."""
+"""Interface between a comparison robot and its estimator over a whole stream."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -30,11 +30,11 @@ NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
 
 
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """The results of an odometry interval: the stamps of a new running pose and map.
+    """Results of an odometry interval: stamps of a new running pose and map.
 
-    cloud: returns the particles, where there are any, until the next interval is taken. judged: the
-    innovation since it was last reported, and its time. became: the outcomes of all detections
-    without identities, at the end of the stream.
+    cloud: returns the particles, if any, until the next interval. judged: the innovation since its
+    last report, and its time. became: outcomes of all detections without identities, at the end of
+    the stream.
     """
 
     pose_ns: int | None = None
@@ -52,9 +52,8 @@ class RobotEstimator(Protocol):
     """An estimator on one incarnation of a robot's stream: measurements in, running poses and maps
     out.
 
-    sequence: the number of its running poses and maps. used: the disposition of a measurement that
-    it takes. joint: whether its map has a joint covariance. innovation: of all measurements that it
-    predicted.
+    sequence: number of its running poses and maps. used: disposition of its measurements. joint:
+    the map has a joint covariance. innovation: of all predicted measurements.
     """
 
     @property
@@ -67,33 +66,31 @@ class RobotEstimator(Protocol):
     def innovation(self) -> Innovation: ...  # noqa: D102
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; returns the reason if it is rejected."""
+        """Process a scan of landmarks; returns the reason of a rejection."""
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
-        """Take one odometry interval, or only its duration (not measured); returns its results."""
+        """Process one odometry interval, or only its duration (not measured)."""
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; returns the last results, and the number of scans that no odometry
-        covered.
-        """
+        """End the stream; returns the last results, and the number of scans without odometry."""
 
     def own_pose(self) -> PoseGaussian:
-        """The running pose from own measurements alone."""
+        """Running pose from own measurements alone."""
 
     def own_map(self) -> LandmarkGaussian:
-        """The running map from own measurements (and what was absorbed)."""
+        """Running map from own measurements (and what was absorbed)."""
 
 
 @runtime_checkable
 class Associates(Protocol):
-    """An estimator that takes scans of landmarks without identities: numbers from 2³¹ on."""
+    """An estimator that accepts scans of landmarks without identities: numbers from 2³¹ on."""
 
     associates: bool
 
 
 @runtime_checkable
 class AbsorbsMaps(Protocol):
-    """An estimator that takes the team's map back in (rules with feedback)."""
+    """An estimator that absorbs the team's map (rules with feedback)."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the own landmarks by the fused ones."""
@@ -108,7 +105,7 @@ def estimator_of(
     initial: InitialPose = AT_ORIGIN,
     known: KnownMap = NOTHING_KNOWN,
 ) -> RobotEstimator:
-    """Make the estimator that the configuration names, at the beginning of an incarnation."""
+    """Make the configured estimator at the beginning of an incarnation."""
     made: Factory = loaded(
         ESTIMATORS[config.estimator].made_by, f"the estimator {config.estimator}"
     )

@@ -1,7 +1,7 @@
-"""The exchange of whole maps between a robot and a centre that fuses them.
+"""Exchange whole maps between a robot and a centre that fuses them.
 
-A map goes out every `exchange_s`, with its joint covariance. Under a rule with feedback the robot
-then waits for the answer (lockstep), which its own map absorbs.
+A map with its joint covariance is sent every `exchange_s`. Under a rule with feedback the robot
+waits for the answer (lockstep) and absorbs it.
 """
 
 from collections import deque
@@ -13,16 +13,14 @@ from team.robot.statements import MessageWriter
 from team.wire.bus import Outgoing
 
 JOINT_LANDMARKS = 2000
-"""An own map with more landmarks carries their 2 × 2 covariances only: a message has at most 64
-MiB."""
+"""Landmarks beyond which a map has only 2 × 2 covariances: a message has at most 64 MiB."""
 
 
 class MapExchange:
-    """The rounds of one robot.
+    """Rounds of one robot.
 
-    exchanges: whether the rule fuses own maps. lockstep: each map is answered before the robot goes
-    on. answered: the last round that was answered; awaited: that of the last map that was sent.
-    last: the sequence of the last map that was sent; −1: none.
+    exchanges: the rule fuses own maps. lockstep: the robot waits for answers. answered: last
+    answered round; awaited: round of the last sent map. last: its sequence; −1: none.
     """
 
     def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
@@ -37,25 +35,25 @@ class MapExchange:
 
     @property
     def waits(self) -> bool:
-        """Whether a map that was sent has no answer yet."""
+        """Whether a sent map has no answer yet."""
         return self.lockstep and self.awaited > self.answered
 
     def take_answer(self, round_: int) -> bool:
-        """Take the answer of a round; returns whether it is new."""
+        """Record the answer of a round; returns whether it is new."""
         if not self.lockstep or round_ <= self.answered:
             return False
         self.answered = round_
         return True
 
     def is_sent(self, stamp_ns: int) -> bool:
-        """Note a new map; returns whether it is sent: for viewers, or because a round is due."""
+        """Record a new map; returns whether to send it, for viewers or a due round."""
         self._map_ns = stamp_ns
         since = None if self._sent_ns is None else stamp_ns - self._sent_ns
         return not self.exchanges or since is None or since >= self._every_ns
 
     @property
     def unsent_ns(self) -> int | None:
-        """The stamp of the last map, if an exchange is still to have it."""
+        """Stamp of the last map, if no exchange had it."""
         is_new = self.exchanges and self._map_ns != self._sent_ns
         return self._map_ns if is_new else None
 
@@ -68,7 +66,7 @@ class MapExchange:
         *,
         joint: bool,
     ) -> Outgoing:
-        """The message of a map; one that is exchanged opens a round."""
+        """Make the message of a map; one that is exchanged opens a round."""
         if self.exchanges:
             self._sent_ns, self.last = stamp_ns, sequence
             self.awaited = self.answered + 1 if self.lockstep else self.awaited

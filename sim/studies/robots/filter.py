@@ -1,4 +1,4 @@
-"""The functions of which a recursive estimator over a state of its own consists."""
+"""The functions of a recursive estimator over its own state."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,10 +15,10 @@ from team.robot.own_map import InitialPose
 
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
-"""The dispositions of a measurement that such an estimator takes."""
+"""Dispositions of a measurement that such an estimator uses."""
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""The motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and the
-measurements' own covariances (`team.estimation.scans`) at its end.
+"""Motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and own covariances
+(`team.estimation.scans`) at its end.
 """
 InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 FilterStep = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
@@ -28,14 +28,11 @@ Judged = Callable[
 
 
 class Filter(NamedTuple):
-    """A recursive estimator over a state of its own.
+    """A recursive estimator over its own state.
 
-    looks: whether it takes landmarks; claims: whether it takes those with covariances of their own;
-        maps: whether it has a map.
-    joint: whether its map has covariances between landmarks.
-    absorbed: the state with the given landmarks in the place of its own.
-    particles: the particles of a state, for viewers.
-    innovation: of a step's measurements, as the state before it predicts them.
+    looks: accepts landmarks; claims: with covariances of their own; maps: has a map. joint: with
+    covariances between landmarks. absorbed: the state with the given landmarks. particles: of a
+    state, for viewers. innovation: of a step's measurements, predicted by the state before.
     """
 
     initial_state: InitialState

@@ -1,4 +1,4 @@
-"""The estimators that have one state over a whole stream, by name."""
+"""Estimators with one state over a whole stream, by name."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -33,8 +33,6 @@ from team.robot.own_map import InitialPose
 
 
 def _random(filter_step: Callable[..., Any]) -> FilterStep:
-    """The step of an estimator that draws random numbers."""
-
     def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
         increment, *scan, _ = step
         return filter_step(state, increment, config.sensor, *scan, generator)
@@ -45,8 +43,6 @@ def _random(filter_step: Callable[..., Any]) -> FilterStep:
 def _exact(
     initial_state: Callable[..., Any], filter_step: Callable[..., Any]
 ) -> tuple[InitialState, FilterStep]:
-    """Start and step of an estimator that draws none."""
-
     def start(
         config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
     ) -> Any:
@@ -62,7 +58,7 @@ def _exact(
 def _thesis_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> hybrid_thesis.ThesisState:
-    """The thesis knows the start exactly."""
+    """The thesis assumes an exact start."""
     return hybrid_thesis.started(np.zeros(3) if initial.pose is None else initial.pose)
 
 
@@ -87,12 +83,11 @@ def _thesis_step(
 
 
 def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
-    """The innovation against the particles of a state."""
     return lambda state, *measurements: innovation(particles(state), *measurements)
 
 
 def _without_claims(judged: Callable[..., Innovation]) -> Judged:
-    """The innovation of an estimator that takes no claims."""
+    """Innovation of an estimator that ignores measurements' own covariances."""
     return lambda state, *measurements: judged(state, *measurements[:-1])
 
 
@@ -112,7 +107,6 @@ def _thesis_absorbed(
 def _coded_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> CodedState:
-    """The start is known exactly, as in the thesis."""
     pose = np.zeros(3) if initial.pose is None else initial.pose
     return hybrid_thesis_coded.started(pose, config.front_end.particles)
 
@@ -134,7 +128,7 @@ def _with_start(
 ) -> S:
     """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
 
-    The noise is turned into the pose's own axes: C = GᵀPG, G = blkdiag(R(θ), 1).
+    In the pose's own axes the noise is C = GᵀPG, G = blkdiag(R(θ), 1).
     """
     at = np.zeros(3) if initial.pose is None else initial.pose
     state = initial_state(at)
@@ -164,7 +158,7 @@ def _plain_step(
 
 
 def _plain(proposal: Proposal) -> Filter:
-    """FastSLAM over the whole stream, whatever the front end's own proposal is."""
+    """FastSLAM over the whole stream; the front end's own proposal is ignored."""
 
     def initial_state(
         config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
@@ -192,10 +186,9 @@ def _plain(proposal: Proposal) -> Filter:
 def _localisation_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
-    """At an unknown initial pose anywhere from where the sensor may see a landmark of the known
-    map.
+    """An unknown initial pose is uniform where the sensor may detect a landmark of the known map.
 
-    That is the map's box widened by the sensor's reach, at most by half the box's longer side.
+    That is the map's box widened by the sensor's reach, at most by half its longer side.
     """
     front = config.front_end
     landmarks = known.landmarks
@@ -228,7 +221,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         _localisation_initial_state,
         _random(localisation.filter_step),
         localisation.pose_gaussian,
-        lambda state: NO_LANDMARKS,  # it was told its map, so there is nothing to say of one
+        lambda state: NO_LANDMARKS,  # its map was given, not estimated
         _without_claims(localisation.innovation),
         used=IN_POSE,
         maps=False,

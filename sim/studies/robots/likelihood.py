@@ -1,4 +1,4 @@
-"""FastSLAM 1.0 that associates for itself from its first detection without an identity on."""
+"""FastSLAM 1.0 with data association from its first detection without an identity on."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 
 
 def with_association(plain: Filter) -> Filter:
-    """The filter with names until the first scan without; from there on no scan has any.
+    """The filter with identities until the first scan without; later scans ignore identities.
 
-    Its particles go on from where they are, and what they have mapped by name is left behind.
+    Particles keep their poses; landmarks mapped by identity are dropped.
     """
     assert plain.particles is not None
     particles_of = plain.particles

@@ -1,5 +1,5 @@
-"""The mappers of robots of a comparison: Hybrid-SLAM whose own map is exchanged, and estimators
-with one state over a whole stream.
+"""Mappers of comparison robots: Hybrid-SLAM that exchanges its own map, and whole-stream
+estimators.
 """
 
 from collections.abc import Sequence
@@ -33,9 +33,9 @@ from team.wire import messages as m
 
 
 class ExchangingMapper(Mapper):
-    """Hybrid-SLAM whose own map goes out in exchanges, or for viewers where the rule takes no maps.
+    """Hybrid-SLAM that sends its own map in exchanges, or for viewers if the rule fuses no maps.
 
-    joint: whether its map has a joint covariance.
+    joint: with a joint covariance.
     """
 
     joint = True
@@ -50,11 +50,11 @@ class ExchangingMapper(Mapper):
         self.exchange.last = -1
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether a map is published at the end of this window, or may be exchanged."""
+        """Whether a map is published or may be exchanged at the end of this window."""
         return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
 
     def publish_map(self, stamp_ns: int) -> None:
-        """Publish the running map for viewers, or in an exchange that is due."""
+        """Publish the running map for viewers, or in a due exchange."""
         if self.exchange.is_sent(stamp_ns):
             self._send_map(stamp_ns)
 
@@ -72,20 +72,19 @@ class ExchangingMapper(Mapper):
 
     @property
     def waits_for_map(self) -> bool:
-        """Whether it waits for the map that it localises in."""
+        """Whether its known map is missing: never."""
         return False
 
     def know(self, message: m.KnownMap) -> None:
-        """Ignore a map to localise in: Hybrid-SLAM makes its own."""
+        """Ignore a known map: Hybrid-SLAM makes its own."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
-        """Replace the landmarks of the own map by the fused ones; submaps never see it."""
+        """Replace the own map's landmarks by the fused ones."""
         self.own_map.whole = absorbed(self.own_map.whole, *landmarks)
 
 
 class StreamMapper(ExchangingMapper):
-    """An estimator with one state from the start of a stream to its end: poses and maps, no
-    submaps.
+    """An estimator with one state over a stream: poses and maps, no submaps.
 
     After a fault it continues with the state as it is.
     """
@@ -102,18 +101,18 @@ class StreamMapper(ExchangingMapper):
         self.ledger.used, self.joint = self.estimator.used, self.estimator.joint
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Raise ValueError: there are no submaps to resume from."""
+        """Raise ValueError: there are no submaps."""
         raise ValueError(f"the estimator {self.config.estimator} has no submaps to resume from")
 
     @property
     def waits_for_map(self) -> bool:
-        """Whether it waits for the map that it localises in."""
+        """Whether its known map is missing."""
         return self._known is None
 
     def know(self, message: m.KnownMap) -> None:
-        """Take the map to localise in; of two the newer one by its stamp.
+        """Store the known map; of two the newer one by its stamp.
 
-        Landmarks beyond the bounds are left out.
+        Landmarks beyond the bounds are dropped.
         """
         if self._known_ns is not None and message.stamp_ns <= self._known_ns:
             return
@@ -131,10 +130,8 @@ class StreamMapper(ExchangingMapper):
             raise TypeError(f"the estimator {self.config.estimator} absorbs no map")
         self.estimator.absorb(landmarks)
 
-    # Measurements.
-
     def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
-        """Take an odometry interval; it never closes a window."""
+        """Process an odometry interval."""
         interval, rejected = self.judge_interval(measurement, is_near)
         estimates = None
         if interval is not None:
@@ -157,7 +154,6 @@ class StreamMapper(ExchangingMapper):
         return False
 
     def _publish(self, estimates: Estimates) -> None:
-        """Publish the results of an interval, or of the stream's end."""
         writer, sequence = self.writer, self.sequence
         if estimates.pose_ns is not None:
             self.out += self.poses.publish(estimates.pose_ns, self)
@@ -177,44 +173,42 @@ class StreamMapper(ExchangingMapper):
         self.forget_window()
 
     def note_input(self, number: int) -> None:
-        """There is no window that names its inputs."""
+        """Ignore inputs of windows: there are none."""
 
     def repeat_window(self) -> None:
-        """There is no window to compute again."""
+        """Repeat nothing: there is no window."""
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; returns the reason if it is rejected."""
+        """Process a scan of landmarks; returns the reason of a rejection."""
         return self.estimator.observe(stamp_ns, scan)
 
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
         """Reject inter-robot measurements."""
         return Rejection.NO_TEAMMATES
 
-    # The estimates.
-
     @property
     def associates(self) -> bool:
-        """Whether the estimator takes detections without identities."""
+        """Whether the estimator accepts detections without identities."""
         return isinstance(self.estimator, Associates) and self.estimator.associates
 
     @property
     def sequence(self) -> int:
-        """The number of the running pose and map."""
+        """Number of the running pose and map."""
         return self.estimator.sequence
 
     @property
     def innovation(self) -> Innovation:
-        """The innovation of all measurements that were predicted."""
+        """Innovation of all predicted measurements."""
         return self.estimator.innovation
 
     def own_pose(self, window: LocalMap | None) -> PoseGaussian:
-        """The running pose."""
+        """Running pose."""
         return self.estimator.own_pose()
 
     def own_landmarks(self) -> LandmarkGaussian:
-        """The running map."""
+        """Running map."""
         return self.estimator.own_map()
 
     def open_window(self) -> LocalMap | None:
-        """There is no window."""
+        """None: there is no window."""
         return None

@@ -1,7 +1,7 @@
-"""The node of a robot of a comparison: its centre fuses whole maps or raw measurements.
+"""The node of a comparison robot: its centre fuses whole maps or raw measurements.
 
-Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot's map
-absorbs the fused one, and the robot waits for the answer of each exchange before it goes on.
+Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot waits
+for the fused map of each exchange and absorbs it.
 """
 
 from typing import Any
@@ -30,10 +30,10 @@ class ExchangingRobot(RobotNode):
         super().__init__(*arguments, **options)
         self._centre_is_away = False
         self._reported: tuple[int, int] = 0, 0
-        """An incarnation, and its number of measurements that were reported ahead of their use."""
+        """An incarnation, and its number of measurements reported before their use."""
 
     def receive(self, message: m.Message) -> None:
-        """Take a message that is no measurement."""
+        """Handle a message that is no measurement."""
         match message:
             case m.KnownMap():
                 self.mapper.know(message)
@@ -45,7 +45,7 @@ class ExchangingRobot(RobotNode):
                 super().receive(message)
 
     def _absorb(self, fused: m.FusedMap) -> None:
-        """Take the answer of an exchange: under a rule with feedback the own map absorbs it."""
+        """Absorb the answer of an exchange, under a rule with feedback."""
         if not self.mapper.exchange.take_answer(fused.exchange):
             return
         ids, means = translate.landmarks_of(fused)
@@ -57,19 +57,18 @@ class ExchangingRobot(RobotNode):
 
     @property
     def is_held(self) -> bool:
-        """Whether the robot waits for a map: to localise in, or of its centre unless it is away.
+        """Whether the robot waits for a known map, or for a centre that is present.
 
-        A centre that was never present may still answer: lockstep does not depend on the order in
-        which tokens arrive.
+        A centre that was never present may still answer: lockstep does not depend on the order of
+        tokens.
         """
         waits = self.mapper.exchange.waits and not self._centre_is_away
         return self.mapper.waits_for_map or waits
 
     def consume(self) -> None:
-        """Consume the measurements whose turn has come; a waiting robot reports those received.
+        """Consume the measurements in order; a waiting robot reports those received.
 
-        Otherwise the world would wait for it, and with the world a teammate that needs more
-        measurements for its map, or the end.
+        Otherwise the world would wait for it, and a teammate for the world.
         """
         super().consume()
         if not self.mapper.exchange.lockstep or not self.is_held:
@@ -80,7 +79,7 @@ class ExchangingRobot(RobotNode):
             self.report_progress()
 
     def progress(self) -> m.Progress:
-        """How many measurements were consumed or reported ahead, and the time that has passed."""
+        """Number of measurements consumed or reported ahead, and the time passed."""
         progress = super().progress()
         incarnation, reported = self._reported
         ahead = reported if incarnation == progress.incarnation else 0
@@ -88,7 +87,7 @@ class ExchangingRobot(RobotNode):
         return msgspec.structs.replace(progress, measurements=count)
 
     def statement(self) -> m.Done:
-        """The account of the incarnation, with the sequence of its last map."""
+        """The account of the incarnation, with its last map's sequence."""
         return msgspec.structs.replace(super().statement(), last_map=self.mapper.exchange.last)
 
     def _close_incarnation(self) -> None:
@@ -98,7 +97,7 @@ class ExchangingRobot(RobotNode):
 
 
 class StreamRobot(ExchangingRobot):
-    """A robot whose estimator has one state over its whole stream."""
+    """A robot with one state over its whole stream."""
 
     makes = StreamMapper
 
@@ -106,6 +105,6 @@ class StreamRobot(ExchangingRobot):
 def comparison_robot(
     config: RobotConfig, exchange: Exchange = "continuous", **options: Any
 ) -> ExchangingRobot:
-    """The robot of a comparison for a configuration."""
+    """Make a configuration's comparison robot."""
     made = ExchangingRobot if config.estimator == "hybrid" else StreamRobot
     return made(config, exchange, **options)

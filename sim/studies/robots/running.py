@@ -1,4 +1,4 @@
-"""An estimator that has one state from the start of a stream to its end."""
+"""Run an estimator with one state over a whole stream."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -32,18 +32,17 @@ from team.rejection import Rejection
 from team.robot.own_map import Cloud, InitialPose, thin_out
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a running pose's covariance [m², m², rad²], which may be singular: an exactly known
-start, a motion without lateral noise, fewer than four particles that differ."""
+"""Added to a running pose's covariance [m², m², rad²], singular for an exact start, motion without
+lateral noise, or fewer than four different particles.
+"""
 
 
 class RunningEstimator:
-    """The state after every keyframe so far; its map is published once per window, or at every
-    keyframe.
+    """The state after every keyframe; its map is published once per window, or at every keyframe.
 
-    It makes no submaps, so it can not be resumed: a restarted robot takes its stream from the
-    beginning, and publishes the same messages again.
-    sequence: number of keyframes so far.
-    associates: whether it takes scans without identities; it reports their outcomes at the end.
+    Without submaps it cannot be resumed: a restarted robot processes its stream from the beginning
+    and publishes the same messages again. sequence: number of keyframes. associates: accepts scans
+    without identities; their outcomes are reported at the end.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class RunningEstimator:
 
     @property
     def used(self) -> str:
-        """The disposition of a measurement that it takes."""
+        """Disposition of a measurement that it uses."""
         return self._filter.used
 
     @property
@@ -80,11 +79,11 @@ class RunningEstimator:
 
     @property
     def innovation(self) -> Innovation:
-        """The innovation of all keyframes so far."""
+        """Innovation of all keyframes so far."""
         return self._innovation.plus(self._unsaid)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Takes a scan (ids, ranges, bearings); returns the reason if it is rejected."""
+        """Process a scan (ids, ranges, bearings); returns the reason of a rejection."""
         if not self._filter.looks:
             return Rejection.NO_LANDMARKS
         unnamed = bool((scan.ids >= UNNAMED).any())
@@ -93,7 +92,7 @@ class RunningEstimator:
         return self._segmenter.observe(stamp_ns, *scan)
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
-        """Takes one odometry interval and runs the keyframes that lie in it."""
+        """Process one odometry interval and its keyframes."""
         stamp_ns, begin_ns = interval.end_ns, interval.end_ns - interval.duration_ns
         if self._segmenter.now_ns is None:
             self._segmenter.begin(begin_ns)
@@ -108,9 +107,7 @@ class RunningEstimator:
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
-        """The results since `before` keyframes; the map if it is due, or was not published at the
-        end.
-        """
+        """Results since `before` keyframes; the map if due, or unpublished at the end."""
         now_ns = self.last_keyframe_ns
         if now_ns is None or self._map_ns is None:
             return Estimates()
@@ -128,15 +125,12 @@ class RunningEstimator:
         )
 
     def _cloud(self, map_ns: int | None) -> Callable[[], Cloud] | None:
-        """Returns the particles, where there are any and a map is published."""
         if map_ns is None or self._filter.particles is None:
             return None
         return partial(thin_out, self._filter.particles(self._state), np.zeros(3))
 
     def _take(self, keyframe: Keyframe) -> None:
-        """Takes a keyframe: its scans without identities one by one, then all observations with
-        names.
-        """
+        """Process a keyframe: scans without identities one by one, then all other observations."""
         for look in keyframe.looks:
             self._looks.append(look)
             seen = look.ids, look.ranges, look.bearings, look.own
@@ -149,7 +143,6 @@ class RunningEstimator:
             self._advance(keyframe.stamp_ns, motion, *seen)
 
     def _became(self) -> Became | None:
-        """The landmark of each detection without an identity so far."""
         if not self._looks or self._filter.took is None:
             return None
         numbers = self._filter.took(self._state)
@@ -167,7 +160,7 @@ class RunningEstimator:
         )
 
     def _took(self) -> int:
-        """How many detections the filter has a landmark for; a scan that led nowhere adds none."""
+        """Number of associated detections; a scan without a solution adds none."""
         return 0 if self._filter.took is None else len(self._filter.took(self._state))
 
     def _advance(
@@ -181,7 +174,7 @@ class RunningEstimator:
     ) -> None:
         step = increment, ids, ranges, bearings, own
         after = self._after(step)
-        if after is None:  # what was seen leads nowhere: the motion alone
+        if after is None:  # no solution with the measurements: the motion alone
             self.unsolved += bool(len(ids))
             after = self._after((increment, ids[:0], ranges[:0], bearings[:0], own[:0]))
         if after is not None:
@@ -191,15 +184,11 @@ class RunningEstimator:
         self.last_keyframe_ns = stamp_ns
 
     def _after(self, step: Step) -> tuple[Any, Innovation] | None:
-        """The state after a step, and how well its measurements were predicted; None where there is
-        no state.
-
-        A state without a finite pose is none.
-        """
+        """State after a step and its innovation; None without a finite pose."""
         increment, *scan = step
         judged = NOTHING
         with np.errstate(all="ignore"):
-            with suppress(NotACovarianceError):  # then it is not known how well
+            with suppress(NotACovarianceError):  # then without an innovation
                 judged = self._filter.innovation(self._state, increment, self._config.sensor, *scan)
             try:
                 state = self._filter.filter_step(self._state, self._config, step, self._generator)
@@ -210,9 +199,7 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """Ends the stream: returns the last keyframe and map, and the number of scans that no
-        odometry covered.
-        """
+        """End the stream; returns the last keyframe and map, and the scans without odometry."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:
@@ -222,19 +209,18 @@ class RunningEstimator:
         return msgspec.structs.replace(driven, became=self._became()), uncovered
 
     def own_pose(self) -> PoseGaussian:
-        """The pose at the last keyframe."""
+        """Pose at the last keyframe."""
         pose = self._filter.pose(self._state)
         if self._config.sensor.is_mounted:
             pose = moved_by(pose, inverse(self._mount))
         return PoseGaussian(pose.mean, pose.covariance + POSE_FLOOR)
 
     def own_map(self) -> LandmarkGaussian:
-        """The landmarks so far."""
+        """Landmarks so far."""
         return self._filter.landmarks(self._state)
 
 
 def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
-    """Where the sensor begins: the filter's states are of the sensor."""
     covariance = np.zeros((3, 3)) if initial.covariance is None else initial.covariance
     if initial.pose is None:
         return initial
@@ -243,7 +229,7 @@ def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
 
 
 class AbsorbingEstimator(RunningEstimator):
-    """An estimator whose landmarks are replaced by the fused ones, under a rule with feedback."""
+    """An estimator that absorbs fused landmarks."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the landmarks by the fused ones."""
@@ -254,7 +240,7 @@ class AbsorbingEstimator(RunningEstimator):
 def running_estimator(
     config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
 ) -> RunningEstimator:
-    """The estimator that the configuration names."""
+    """Make the configured estimator."""
     absorbs = FILTERS[config.estimator].absorbed is not None
     made = AbsorbingEstimator if absorbs else RunningEstimator
     return made(config, incarnation, initial, known)

@@ -1,6 +1,4 @@
-"""The rule `batch`: the batch MAP over all robots' raw measurements, solved again as they
-arrive.
-"""
+"""The rule `batch`: the batch MAP over all robots' raw measurements, updated as they arrive."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -24,18 +22,18 @@ from team.wire import channels as ch
 from team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
-"""Most iterations of a broadcast's map, which starts from the last solution, and the Newton step in
-σ that ends them.
+"""Most iterations of a broadcast's map from the last solution, and the Newton step in σ that ends
+them.
 """
 FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
-"""The same for the final map, which has a warning if the iterations do not suffice."""
+"""The same for the final map, which has a warning without convergence."""
 
 
 class BatchCentre(MeasurementCentre):
-    """Every pose of every robot at its keyframes and all landmarks, solved anew at each broadcast.
+    """All poses at the robots' keyframes and all landmarks, solved anew at each broadcast.
 
-    Each robot's newest pose is published with the map, and the whole paths with the final map.
-    Sensor errors that persist, and biases, are taken as white noise, with a warning.
+    The robots' newest poses are published with the map, whole paths with the final map. Persistent
+    sensor errors and biases are treated as white noise, with a warning.
     """
 
     _batch: GrowingBatch
@@ -52,7 +50,7 @@ class BatchCentre(MeasurementCentre):
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """The number of poses, and the joint cost of the last map."""
+        """Number of poses, and cost of the last map."""
         if not self.models:
             return {}
         figures = {"poses": float(len(self._batch.poses))}
@@ -62,9 +60,7 @@ class BatchCentre(MeasurementCentre):
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The errors that are taken as white though they persist, and whether the final map has
-        converged.
-        """
+        """Errors treated as white, and missing convergence."""
         return tuple(self._findings)
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
@@ -94,9 +90,7 @@ class BatchCentre(MeasurementCentre):
         return MapContent(landmarks, self._batch.cost, self._batch.dof, outgoing)
 
     def _grow(self) -> None:
-        """Add the waiting steps; without their measurements, or not at all, where there is no
-        solution.
-        """
+        """Add the waiting steps; without a solution drop their measurements, or all."""
         turns, self._waiting = self._waiting, []
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):
@@ -111,7 +105,6 @@ class BatchCentre(MeasurementCentre):
             )
 
     def _solved(self, grown: GrowingBatch, iterations: int, decrement: float) -> GrowingBatch:
-        """The solution; where there is none, the estimate before it."""
         with suppress(UnsolvableError, ArithmeticError), np.errstate(all="ignore"):
             solution = batch.solved(grown, iterations, decrement)
             _ = solution.marginals
@@ -120,7 +113,6 @@ class BatchCentre(MeasurementCentre):
         return grown
 
     def _poses(self) -> list[Outgoing]:
-        """The newest pose of each robot that has moved since the last map."""
         outgoing = [
             self.pose(each, batch.pose_gaussian(self._batch, robot))
             for robot, each in sorted(self._newest.items())
@@ -154,7 +146,7 @@ class BatchCentre(MeasurementCentre):
 
 
 def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
-    """The errors that are configured to persist, each with the robots that have the same."""
+    """Persistent errors in the configuration, with their robots."""
     declared = defaultdict(list)
     for name, config in sorted(robots.items()):
         sensor, biases = config.sensor, config.front_end.biases

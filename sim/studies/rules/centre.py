@@ -1,7 +1,7 @@
-"""The common part of the comparison centres whose inputs are no submaps.
+"""Common part of the comparison centres without submaps.
 
-Such a centre is a node like the product's (`central.node.CentralNode`): attendance, the end of the
-streams and the conclusion are the product's, the inputs and the maps are its own.
+Attendance, the end of the streams and the conclusion are the product's
+(`central.node.CentralNode`), inputs and maps their own.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class ComparisonCentre(CentralNode):
-    """A centre that acknowledges no submaps and waits for none.
+    """A centre that neither acknowledges nor awaits submaps.
 
     landmarks: number in its newest map.
     """
@@ -26,7 +26,7 @@ class ComparisonCentre(CentralNode):
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """Figures for people."""
+        """Figures for viewers."""
         return {}
 
     @property
@@ -49,12 +49,12 @@ class ComparisonCentre(CentralNode):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute the messages of recorded maps from the inputs that these name."""
+        """Recompute the messages of recorded maps from their named inputs."""
         raise NotImplementedError
 
 
 def recorded_maps(log: "Recorded", fused: m.FusedMap) -> list[m.MapEstimate]:
-    """The robots' own maps in a log that a recorded map names."""
+    """The robots' own maps that a recorded map names."""
     own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
     by_name = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
     names = ((x.robot, x.incarnation, x.sequence, fused.exchange) for x in fused.members)

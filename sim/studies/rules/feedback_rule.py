@@ -1,8 +1,8 @@
-"""The rules that fuse whole maps which the robots absorb again, in lockstep.
+"""Rules that fuse whole maps which the robots absorb, in lockstep.
 
-Each round takes the map that every robot sent for it. The fused map replaces the robots' own
-landmarks, so the next round's maps contain this round's: under `kalman` and `kalman-per-axis` the
-same measurements are counted again and again, and the covariance has no meaning.
+The fused map of a round replaces the robots' own landmarks, so the next round's maps contain it:
+under `kalman` and `kalman-per-axis` measurements are counted repeatedly, and the covariance has no
+meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ _NOT_VALID = "this rule counts measurements more than once: its covariance is no
 class RoundsCentre(ComparisonCentre):
     """Fuses the maps of each round in the order of the robots' names; a round names those before.
 
-    It stores the robots' submaps for their next processes.
+    Stores the robots' submaps for their next processes.
     """
 
     inputs = (ch.START, ch.SUBMAP, ch.OWN_MAP)
@@ -54,7 +54,7 @@ class RoundsCentre(ComparisonCentre):
         self._fused: m.FusedMap | None = None
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """File a map under the round that it names."""
+        """File a map under its round."""
         if isinstance(message, m.MapEstimate):
             if message.exchange >= self._next:
                 self._rounds.setdefault(message.exchange, {})[message.robot] = message
@@ -63,9 +63,9 @@ class RoundsCentre(ComparisonCentre):
         return []
 
     def publish_due(self) -> list[Outgoing]:
-        """The map of every round that has the maps of all robots that may still send one.
+        """Map of every round complete but for robots that send no more.
 
-        A centre that was started again continues with the present round.
+        A restarted centre continues with the present round.
         """
         later = min(self._rounds, default=self._next)
         if self._is_complete(later):
@@ -84,7 +84,7 @@ class RoundsCentre(ComparisonCentre):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute the rounds in their order, each from the recorded maps that it names."""
+        """Recompute the rounds in order, each from its named recorded maps."""
         for fused in sorted(maps, key=lambda each: each.exchange):
             yield self._fuse(fused.exchange, recorded_maps(log, fused))
         for fused in finals:
@@ -105,7 +105,6 @@ class RoundsCentre(ComparisonCentre):
         return msgspec.structs.replace(last, final=True, reasons=reasons)
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> Outgoing:
-        """The fused map of a round."""
         values = {
             x.robot: LandmarkGaussian(
                 *translate.landmarks_of(x), translate.landmark_covariance_of(x)

@@ -22,15 +22,13 @@ from team.wire.bus import Outgoing
 RESAMPLE_BELOW = 1.0
 """Resamples at every step, as algorithm 1 does."""
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a pose's covariance [m², m², rad²], which is singular where fewer than four particles
-differ.
-"""
+"""Added to a pose's covariance [m², m², rad²], singular for fewer than four different particles."""
 
 
 class JointFastSlamCentre(MeasurementCentre):
     """One particle filter over all robots' paths and one map.
 
-    The particles are those of FastSLAM 1.0, `particles` of them.
+    The proposal is that of FastSLAM 1.0.
     """
 
     _state: JointFastSlam
@@ -62,7 +60,7 @@ class JointFastSlamCentre(MeasurementCentre):
 
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
         blind = [turn.blind for turn in turns]
-        for some in (turns, blind):  # at the last the particles stay where they are
+        for some in (turns, blind):  # if both fail the particles stay unchanged
             with suppress(NotACovarianceError, np.linalg.LinAlgError), np.errstate(all="ignore"):
                 after = joint_fastslam.filter_step(self._state, some, self._generator)
                 if np.isfinite(after.poses).all() and np.isfinite(after.log_weights).all():

@@ -1,9 +1,8 @@
-"""Rules that fuse whole maps which the robots then absorb, for comparison.
+"""Fusion of whole maps that the robots then absorb, for comparison.
 
-`kalman_per_axis` and `kalman` treat the maps as independent. They are not once a robot has absorbed
-a fused map and sends its own again: every measurement is then counted again with each exchange, and
-the covariance loses its meaning. Covariance intersection stays consistent for any correlation of
-the landmarks that it fuses; the price is that it gives away independent information.
+`kalman_per_axis` and `kalman` treat the maps as independent. Once a robot has absorbed a fused map
+they are not: every exchange counts measurements again, and the covariance loses its meaning.
+Covariance intersection is consistent for any correlation, at the price of independent information.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +34,7 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """Full-covariance Kalman fusion in the given order, as if the maps were independent.
 
     K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's further landmarks follow
-    by regression on c. Counts measurements again when its result is absorbed and sent once more.
+    by regression on c. Counts measurements again when its result is absorbed.
     """
     return _one_by_one(_kalman_pair, maps)
 
@@ -43,9 +42,8 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
 
-    TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and
-    S = S^A S^B/(S^A + S^B). Counts measurements again when its result is absorbed and sent once
-    more.
+    TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and S =
+    S^A S^B/(S^A + S^B). Counts measurements again, as `kalman` does.
     """
     return _one_by_one(_per_axis_pair, maps)
 
@@ -57,8 +55,7 @@ def covariance_intersection(
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
     of the least trace or determinant of C. The landmarks of one map alone follow by regression on
-    the common ones in that map; the residual of the regression counts as that map's own
-    information.
+    the common ones in that map; its residual counts as that map's own information.
     """
 
     def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
@@ -84,10 +81,10 @@ def fused_totally(
     maps: Mapping[str, LandmarkGaussian],
     coordinate_m: float,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """The fusion of the robots' maps, and the maps that were left out, with reasons.
+    """Fuse the robots' maps; returns the result and the rejected maps, with reasons.
 
-    A map is left out if it exceeds the bounds, or if the rule has no result with it: then the maps
-    are fused one by one in the given order.
+    Rejected maps exceed the bounds, or the rule has no result with them: then maps are fused one by
+    one in order.
     """
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []
@@ -113,7 +110,7 @@ def fused_totally(
 def _tried(
     rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian], maps: Sequence[LandmarkGaussian]
 ) -> LandmarkGaussian | None:
-    """The rule's result; None where there is none, or none in finite numbers."""
+    """The rule's result; None without a finite one."""
     try:
         with np.errstate(all="ignore"):
             fused = rule(maps)
@@ -124,7 +121,6 @@ def _tried(
 
 
 def _shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
-    """Indices of the common landmarks' coordinates in a and in b."""
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     return _points(in_a), _points(in_b)
 
@@ -134,7 +130,7 @@ def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
 
 
 def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
-    """`fused` with those landmarks of `a` that it lacks, by regression on the others."""
+    """Add the landmarks of `a` that `fused` lacks, by regression on the others."""
     in_a, in_fused = _shared(a, fused)
     mean, covariance = carried_along(
         a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused

@@ -1,4 +1,4 @@
-"""The rules on robots' whole maps that no robot absorbs: fused once, or not at all."""
+"""Rules on whole maps that no robot absorbs: fused once, or not at all."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 class NewestMapsCentre(ComparisonCentre):
-    """Stores the newest map of every robot, and the initial poses of the streams.
+    """Stores the newest map of every robot, and the streams' initial poses.
 
-    names_inputs: whether a map follows from the maps that it names alone.
+    names_inputs: a map follows from its named maps alone.
     """
 
     inputs = (ch.START, ch.OWN_MAP)
@@ -38,7 +38,7 @@ class NewestMapsCentre(ComparisonCentre):
         self._starts: dict[Stream, m.InitialPose] = {}
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """Store an initial pose, or a map that is newer than the robot's last one."""
+        """Store an initial pose, or a newer map."""
         match message:
             case m.InitialPose():
                 self._starts[message.robot, message.incarnation] = message
@@ -51,7 +51,7 @@ class NewestMapsCentre(ComparisonCentre):
         return []
 
     def has_received(self, done: m.Done) -> bool:
-        """Whether the robot's last map and the initial pose of its stream have arrived."""
+        """Whether the robot's last map and initial pose have arrived."""
         found = self._maps.get(done.robot)
         last = (done.incarnation, done.last_map)
         return done.last_map < 0 or (
@@ -65,7 +65,7 @@ class NewestMapsCentre(ComparisonCentre):
         return []
 
     def publish_final(self) -> list[Outgoing]:
-        """The map of the newest maps by robot."""
+        """The fused map of the robots' newest maps."""
         maps = [self._maps[robot] for robot in sorted(self._maps)]
         final = self.fuse(maps, self._starts, self.attendance.now_ns, final=True)
         return [Outgoing(ch.FINAL_MAP, "", final)]
@@ -78,13 +78,13 @@ class NewestMapsCentre(ComparisonCentre):
         *,
         final: bool,
     ) -> m.FusedMap:
-        """The fused map of these maps."""
+        """Fuse these maps."""
         raise NotImplementedError
 
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute each map from the recorded maps that it names; the reasons name others, too."""
+        """Recompute each map from its named recorded maps; the reasons name others, too."""
         firsts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
         starts = {s: start for s, start in firsts.items() if isinstance(start, m.InitialPose)}
         for channel, recorded in ((ch.FUSED_MAP, maps), (ch.FINAL_MAP, finals)):
@@ -99,9 +99,8 @@ class NewestMapsCentre(ComparisonCentre):
 class LatestCentre(NewestMapsCentre):
     """The latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
 
-    Each map rests on its own robot's measurements alone, so the maps are independent and no
-    measurement is counted twice: the result is as consistent as the maps are. A robot whose initial
-    pose is not known has its map in a frame of its own and is left out.
+    Each map uses its own robot's measurements alone, so the result is as consistent as the maps. A
+    robot with an unknown initial pose is left out.
     """
 
     names_inputs = False
@@ -114,14 +113,14 @@ class LatestCentre(NewestMapsCentre):
         self._published_ns: int | None = None
 
     def publish_due(self) -> list[Outgoing]:
-        """A map broadcast_s of team time after the last one, if there is a newer map of a robot."""
+        """A map broadcast_s of team time after the last, if a robot has a newer one."""
         last_ns, now_ns = self._published_ns, self.attendance.now_ns
         if last_ns is not None and now_ns - last_ns < self.config.broadcast_s * 1e9:
             return []
         return self.publish_newest()
 
     def publish_newest(self) -> list[Outgoing]:
-        """A map at once, if there is a newer map of a robot than in the last one."""
+        """A map at once, if a robot has a newer one."""
         maps = [self._maps[robot] for robot in sorted(self._maps)]
         named = {(x.robot, x.incarnation): x.sequence for x in maps if is_placed(x, self._starts)}
         if all(self._published.get(stream, -1) >= last for stream, last in named.items()):
@@ -138,7 +137,7 @@ class LatestCentre(NewestMapsCentre):
         *,
         final: bool,
     ) -> m.FusedMap:
-        """The fusion of the maps in the team's frame."""
+        """Fuse the maps in the team's frame."""
         placed = [each for each in maps if is_placed(each, starts)]
         values = {x.robot: _value(x) for x in placed}
         value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
@@ -157,7 +156,7 @@ class LatestCentre(NewestMapsCentre):
 
 
 class AloneCentre(NewestMapsCentre):
-    """No fusion: publishes a final map for single-robot teams only."""
+    """No fusion: a final map for single-robot teams only."""
 
     def fuse(
         self,
@@ -167,7 +166,7 @@ class AloneCentre(NewestMapsCentre):
         *,
         final: bool,
     ) -> m.FusedMap:
-        """The map of the one robot; of several robots a map without landmarks, with the reason."""
+        """The map of a single robot; for several an empty map, with the reason."""
         reason = ""
         if not maps:
             reason = "no fusion, and this estimator makes no map"
@@ -188,7 +187,7 @@ class AloneCentre(NewestMapsCentre):
 
 
 def is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
-    """Whether a map is in the team's frame: its stream's initial pose is known."""
+    """Whether the initial pose of a map's stream is known."""
     start = starts.get((estimate.robot, estimate.incarnation))
     return start is not None and bool(start.pose)
 

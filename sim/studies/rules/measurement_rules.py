@@ -1,4 +1,4 @@
-"""The common part of centres on raw measurements: keyframes of the team in, poses and map out."""
+"""Common part of centres on raw measurements: keyframes of the team in, poses and map out."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MapContent:
-    """The contents of a map: the landmarks and, where the rule has one, the joint cost.
+    """Contents of a map: the landmarks and the joint cost, if any.
 
-    before: messages that go out before it.
+    before: messages that precede it.
     """
 
     landmarks: LandmarkGaussian = NO_LANDMARKS
@@ -44,9 +44,9 @@ class MapContent:
 class MeasurementCentre(ComparisonCentre):
     """An estimate over all robots' raw measurements at the centre.
 
-    The keyframes of one team time are one step; they are the clock of the maps. The robots announce
-    their models. A robot with an unknown initial pose is left out; where no initial pose is known
-    the first robot's is the frame. A map's members name each robot's last measurement in it.
+    The keyframes of one team time are one step, the clock of the maps. The robots announce their
+    models. A robot with an unknown initial pose is left out; if none is known the first robot's is
+    the frame. A map's members name each robot's last measurement in it.
     """
 
     inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)
@@ -70,16 +70,14 @@ class MeasurementCentre(ComparisonCentre):
 
     @abstractmethod
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
-        """Process one step of the team, which the members already name; returns the poses to
-        publish.
-        """
+        """Process one step of the team, already in the members; returns poses to publish."""
 
     @abstractmethod
     def _content(self, *, final: bool) -> MapContent:
         """The map of all steps so far."""
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """File a measurement, a robot's models or the last counters."""
+        """File a measurement, models or the last counters."""
         match message:
             case m.Measurement():
                 self._keyframes.put(message)
@@ -101,17 +99,15 @@ class MeasurementCentre(ComparisonCentre):
 
     @property
     def has_all_measurements(self) -> bool:
-        """Whether every measurement of every stream has been used."""
+        """Whether all measurements have been used."""
         return self._keyframes.complete
 
     def requests(self) -> list[m.MeasurementsRequest]:
-        """Requests for measurements that the link has lost."""
+        """Requests for lost measurements."""
         return [] if self.finished else self._keyframes.requests(self.attendance.now_ns)
 
     def publish_due(self) -> list[Outgoing]:
-        """Process the complete steps; broadcast_s of team time after the last map, one before the
-        next step.
-        """
+        """Process the complete steps, with a map every broadcast_s of team time."""
         if not self.models and not self._begin():
             return []
         out: list[Outgoing] = []
@@ -131,7 +127,7 @@ class MeasurementCentre(ComparisonCentre):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute everything from the whole stream, since each map changes the next."""
+        """Recompute from the whole stream, since each map changes the next."""
         for message in _inputs_in_order(log):
             self.file(message)
         yield from self.publish_due()
@@ -170,7 +166,6 @@ class MeasurementCentre(ComparisonCentre):
     def _sensors_start(
         self, robot: str, pose: Pose, covariance: Matrix | None
     ) -> tuple[Pose, Matrix | None]:
-        """The initial pose of the robot's sensor, of which the keyframes are."""
         sensor = self.models[robot].sensor
         if not sensor.is_mounted:
             return pose, covariance
@@ -179,7 +174,6 @@ class MeasurementCentre(ComparisonCentre):
         return start.mean, None if covariance is None else start.covariance
 
     def _is_placed(self, start: m.InitialPose) -> bool:
-        """Whether the initial pose is known, and within the bounds."""
         value = translate.start_of(start)
         return value is not None and start_beyond(value, self.config.bounds) is None
 
@@ -207,7 +201,7 @@ class MeasurementCentre(ComparisonCentre):
         return self._take(step, turns)
 
     def pose_is_due(self, each: RobotKeyframe) -> bool:
-        """Whether the robot's `pose_s` have passed since its last pose."""
+        """Whether a pose is due, by the robot's `pose_s`."""
         last_ns = self._pose_ns.get(each.robot)
         pose_ns = self.models[each.robot].pose_s * 1e9
         return last_ns is None or each.stamp_ns - last_ns >= pose_ns
@@ -233,7 +227,7 @@ class MeasurementCentre(ComparisonCentre):
 
     @property
     def set_digest(self) -> bytes:
-        """The name of the set of measurements so far."""
+        """Digest of the set of measurements so far."""
         members = (self.members[robot] for robot in sorted(self.members))
         named = b"".join(f"{x.robot}/{x.incarnation}/{x.sequence} ".encode() for x in members)
         return digest_of(self.config_digest, named)

@@ -1,9 +1,9 @@
 """Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
 
 Every robot's submaps make one map by least squares in the frame of its own initial pose (section
-4.1). A robot's map is then moved into the frame of the others' by a singular value decomposition
-over the common landmarks, and the landmarks are joined (section 4.3). The initial pose of the first
-robot fixes the frame; those of the others have no influence.
+4.1). It is moved into the others' frame by a singular value decomposition over the common
+landmarks, and the landmarks are joined (section 4.3). Only the first robot's initial pose matters:
+it fixes the frame.
 """
 
 import math
@@ -46,9 +46,9 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """The submaps of a stream so far: their number, their map, and the digest of its inputs.
+    """The submaps of a stream so far: number, map, and digest of the inputs.
 
-    refused: the submap at which the chain has ended and why, if there is one.
+    refused: the submap that ended the chain, with the reason.
     """
 
     count: int
@@ -60,8 +60,8 @@ class _Joined:
 class SvdFold(SubmapFold):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
-    A later incarnation of a robot is a stream of its own, in a frame of its own. A running map
-    contains everything that has arrived; a later one may place any of it elsewhere.
+    A later incarnation is a stream in its own frame. A later running map may place stored submaps
+    elsewhere.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class SvdFold(SubmapFold):
         ahead: bool = True,
         recorded: RecordedFields | None = None,
     ) -> list[Outgoing]:
-        """The map of the stored set: a function of it alone."""
+        """Make the map of the stored set: a function of it alone."""
         channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
         return [Outgoing(channel, "", self._fused(final=tail == "final"))]
 
@@ -124,7 +124,6 @@ class SvdFold(SubmapFold):
         )
 
     def _believed(self, message: m.InitialPose) -> Pose | None:
-        """The initial pose of a stream, if it is known and within the bounds."""
         start = translate.start_of(message)
         if start is None or start_beyond(start, self.config.bounds) is not None:
             return None
@@ -133,10 +132,10 @@ class SvdFold(SubmapFold):
     def _extended(
         self, stream: Stream, chain: Sequence[m.Submap], initial_pose: Pose | None, final: bool
     ) -> _Joined:
-        """The map of a stream's chain, from the longest one that was made before.
+        """The map of a stream's chain, from its longest stored part.
 
-        Running maps continue from the last solution with each submap; the final one is solved until
-        it converges, including a search for other minima.
+        Running maps continue from the last solution; the final one is solved until it converges,
+        including a search for other minima.
         """
         begin = svd_joining.initial_state(
             {stream[0]: np.zeros(3) if initial_pose is None else initial_pose}, self._weighting
@@ -162,13 +161,12 @@ class SvdFold(SubmapFold):
 
 
 class SvdCentre(CentralNode):
-    """The centre that makes its maps by `SvdFold`."""
+    """The centre of `SvdFold`."""
 
     fold_class = SvdFold
 
 
 def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
-    """The map with one more submap; None where it has no solution or no covariance."""
     try:
         with np.errstate(all="ignore"):
             after = svd_joining.filter_step(state, robot, local)
@@ -180,7 +178,6 @@ def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoi
 
 
 def _solution(state: SubmapJoining) -> SubmapJoining:
-    """The full solution; where there is none, the state before it."""
     try:
         with np.errstate(all="ignore"):
             return svd_joining.solved(state)
@@ -195,11 +192,11 @@ def tied(
     full: bool,
     sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """Greedily aligns the map that has the most landmarks in common with those that are aligned.
+    """Align greedily the map with the most landmarks in common with the aligned ones.
 
-    sightings: by two streams in their order, the robots' own positions in both maps where they
-    measured each other (`mutual_sighting`); they are aligned like common landmarks, but not with
-    `full`. A map with too few common points is left out, with the reason.
+    sightings: by two streams in order, the robots' positions in both maps where they measured each
+    other (`mutual_sighting`); aligned like common landmarks, but not with `full`. A map with too
+    few common points is left out, with the reason.
     """
     fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}
@@ -242,7 +239,7 @@ def _seen(
     frames: Mapping[Stream, Pose],
     sightings: Mapping[tuple[Stream, Stream], PointPairs],
 ) -> PointPairs:
-    """The points of a stream with all those in the map, in the map's frame and in its own."""
+    """Points that a stream shares with the map, in the map's frame and in its own."""
     found = [NO_PAIRS]
     for other, frame in frames.items():
         pairs = sightings.get((min(stream, other), max(stream, other)))

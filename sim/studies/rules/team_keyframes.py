@@ -1,4 +1,6 @@
-"""All robots' raw measurements as one sequence of keyframes, the same for any order of arrival."""
+"""Merge all robots' raw measurements into one sequence of keyframes, independent of arrival
+order.
+"""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -17,9 +19,7 @@ from team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):
-    """One robot's motion and its measurements at the end; `number`: of the measurement that closed
-    it.
-    """
+    """One robot's motion and final measurements; `number`: of the measurement that closed it."""
 
     stamp_ns: int
     robot: str
@@ -31,7 +31,7 @@ class RobotKeyframe(NamedTuple):
 class _Stream:
     """The measurements of one robot, from its initial pose on.
 
-    covered_ns: no keyframe before this team time can still come. start: measurement 0.
+    covered_ns: no keyframe before this team time can follow. start: measurement 0.
     """
 
     robot: str
@@ -47,12 +47,12 @@ class _Stream:
 
     @property
     def complete(self) -> bool:
-        """True once every measurement of it has been taken."""
+        """Whether all measurements have been used."""
         end = self.end
         return self.broken or (end is not None and self.inbox.complete(end))
 
     def take(self) -> None:
-        """Cut the measurements that are complete into keyframes."""
+        """Cut the complete measurements into keyframes."""
         if self.config is None:
             return
         while (measurement := self.inbox.take_next()) is not None:
@@ -99,25 +99,25 @@ class _Stream:
 class TeamKeyframes:
     """The team's keyframes by (stamp, robot), as far as every robot's stream is known.
 
-    So the sequence is a function of the streams alone. A stream that begins anew at an unknown pose
-    ends there; inter-robot measurements are not used.
+    A function of the streams alone. A stream that restarts at an unknown pose ends there;
+    inter-robot measurements are not used.
     """
 
     def __init__(self, robots: Sequence[str]) -> None:
         self._streams = {robot: _Stream(robot) for robot in sorted(robots)}
 
     def configure(self, robot: str, config: RobotConfig) -> None:
-        """Set the models of a robot; its measurements wait for them."""
+        """Set a robot's models."""
         if robot in self._streams and self._streams[robot].config is None:
             self._streams[robot].config = config
 
     def put(self, measurement: m.Measurement) -> None:
-        """Take a measurement, in any order."""
+        """Add a measurement, in any order."""
         if measurement.robot in self._streams:
             self._streams[measurement.robot].inbox.put(measurement)
 
     def end(self, end: m.End) -> None:
-        """The last counters of the streams."""
+        """Set the last counters of the streams."""
         for name, stream in self._streams.items():
             mine = [s for s in end.streams if s.robot == name]
             stream.end = (
@@ -128,7 +128,7 @@ class TeamKeyframes:
 
     @property
     def starts(self) -> dict[str, tuple[RobotConfig, m.InitialPose]] | None:
-        """Every robot's models and initial pose; None until all are here."""
+        """Every robot's models and initial pose, once complete."""
         found = {}
         for name, stream in self._streams.items():
             stream.take()
@@ -140,16 +140,16 @@ class TeamKeyframes:
 
     @property
     def broken(self) -> list[str]:
-        """Robots whose stream began anew."""
+        """Robots whose stream restarted."""
         return [name for name, stream in self._streams.items() if stream.broken]
 
     @property
     def complete(self) -> bool:
-        """Whether every measurement of every stream has been taken."""
+        """Whether all measurements have been used."""
         return all(stream.complete for stream in self._streams.values())
 
     def steps(self) -> Iterator[list[RobotKeyframe]]:
-        """The keyframes that are complete, those of one team time together."""
+        """Complete keyframes by team time."""
         for stream in self._streams.values():
             stream.take()
         horizon = min(stream.covered_ns for stream in self._streams.values())
@@ -163,7 +163,7 @@ class TeamKeyframes:
             yield list(step)
 
     def requests(self, now_ns: int) -> list[m.MeasurementsRequest]:
-        """Requests to the source for measurements that are missing."""
+        """Requests to the source for missing measurements."""
         found = []
         for name, stream in self._streams.items():
             missing = stream.inbox.missing(stream.end)

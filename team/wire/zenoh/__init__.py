@@ -1,1 +1,1 @@
-"""Everything of Zenoh: sessions, the router, the bus, and the recovery of lost samples."""
+"""Zenoh sessions, router and bus, and the recovery of lost samples."""

@@ -1,8 +1,8 @@
-"""Access control at the router: each node may publish its own keys, and receive those of its team.
+"""Access control at the router: a node publishes its own keys and receives those of its team.
 
-Zenoh's rules select by message, direction (as the router sees it) and key; a subject is the common
-name of a certificate. There are no templates, so each node has a rule. Beside its own keys a node
-needs those of the caches and heartbeats of its advanced publishers, `…/@adv/pub/*/*/*`.
+Zenoh's rules select by message, direction as the router sees it, and key; a subject is a
+certificate's common name. There are no templates, so each node has a rule. It includes its advanced
+publishers' caches and heartbeats, `…/@adv/pub/*/*/*`.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,10 @@ TRUTHS = (TRUTH, TRUTH_LANDMARKS, TRUTH_LABELS, TRUTH_POSITIONS)
 
 
 def owned(node: str) -> tuple[str, ...]:
-    """The keys, relative to the team, that only this node may publish, answer and hold tokens on.
+    """Keys, relative to the team, that only this node may publish, answer and hold tokens on.
 
-    They are those of the table of channels, of a fixed depth: what no channel has, the router
-    drops. The world is the driver of every robot's sensors, so it shares those with each
-    `source-…`.
+    They are those of the table of channels, of a fixed depth. The world drives every robot's
+    sensors, so it shares those keys with each `source-…`.
     """
     kind, _, name = node.partition("-")
     if node == REPLAY:
@@ -41,7 +40,6 @@ def owned(node: str) -> tuple[str, ...]:
 
 
 def _keys_of(channel: Channel, kind: str, name: str) -> tuple[str, ...]:
-    """The keys of one channel that a node publishes, answers or holds a token on."""
     first, _, rest = channel.template.partition("/")
     if first == "{node}":
         return channel.selectors(f"{kind}/{name}" if name else kind)
@@ -54,7 +52,7 @@ def _keys_of(channel: Channel, kind: str, name: str) -> tuple[str, ...]:
 
 
 def access_control(roster: Roster) -> dict[str, Any]:
-    """Zenoh's `access_control` for a team: whatever no rule allows is refused."""
+    """Zenoh's `access_control` for a team; everything else is refused."""
     prefix = f"team/{roster.team}/"
     every = [f"{prefix}**", f"{prefix}**/@adv/**"]
     truths = [key for channel in TRUTHS for key in channel.selectors()]
@@ -68,7 +66,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
         _rule("ask at the door", "ingress", ("query",), door),
         _rule("be told at the door", "egress", ("reply",), door),
     ]
-    # A node without a rule of its own, as one with a revoked certificate, is told so here.
+    # Answers nodes without a rule of their own, such as those with a revoked certificate.
     subjects: list[dict[str, object]] = [{"id": "any certificate", "link_protocols": ["tls"]}]
     policies = [
         {"rules": ["ask at the door", "be told at the door"], "subjects": ["any certificate"]}
@@ -88,7 +86,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
 
 
 def _keys(prefix: str, keys: Sequence[str]) -> list[str]:
-    """The keys and those of their publishers' caches and heartbeats."""
+    """Add the keys of the publishers' caches and heartbeats."""
     return [f"{prefix}{key}{rest}" for key in keys for rest in ("", "/@adv/pub/*/*/*")]
 
 

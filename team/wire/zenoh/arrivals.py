@@ -1,9 +1,7 @@
-"""Tracks which publications of a publisher have arrived: delivers each once, finds the missing
-ones.
+"""Track the publications of a publisher: deliver each once and find the missing ones.
 
 A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats.
-A receiver therefore knows of everything that it lacks, at the beginning, in between and at the end,
-for as long as the publisher lives: `docs/decisions/07-delivery-by-counts.md`.
+As long as it lives, a receiver can detect every gap: `docs/decisions/07-delivery-by-counts.md`.
 """
 
 from dataclasses import dataclass, field
@@ -12,33 +10,33 @@ from typing import Generic, TypeVar
 from team.wire.intervals import IntervalSet
 
 PATIENCE_S = 0.5
-"""Time [s] for which a publication is missing before it is requested from its publisher."""
+"""Age [s] at which a gap is requested."""
 LONGEST_S = 8.0
-"""Longest interval [s] between two requests; intervals double up to it."""
+"""Longest interval [s] between two requests, which double."""
 DELAY_S = 2.0
-"""Longest time [s] for which publications after a gap are delayed."""
+"""Longest delay [s] of publications after a gap."""
 MOST_GAPS = 4096
-"""Largest number of gaps of one publisher on one key; beyond it the oldest gap is given up."""
+"""Largest number of gaps per publisher and key; then the oldest is given up."""
 T = TypeVar("T")
 
 
 @dataclass
 class Arrivals(Generic[T]):
-    """The publications of one publisher on one key; those before `first` are not requested.
+    """Publications of one publisher on one key; those before `first` are not requested.
 
-    All numbers come from the wire, so memory is in proportion to what has arrived, not to them.
+    Memory is proportional to the arrivals, not to the numbers, which come from the wire.
 
-    in_order: whether publications after a gap are delayed for a while, until the gap is closed.
-    newest: the last number known, from an arrival or a heartbeat.
+    in_order: delay publications after a gap until it is closed or overdue. newest: last number
+    received.
     """
 
     first: int
     in_order: bool = True
     newest: int = -1
     _settled: IntervalSet = field(default_factory=IntervalSet, init=False)
-    """The numbers from `first` on that have arrived or are gone."""
+    """Numbers from `first` on that arrived or are gone."""
     _gone: IntervalSet = field(default_factory=IntervalSet, init=False)
-    """The numbers that the publisher itself no longer has, and those of gaps that were given up."""
+    """Numbers that the publisher no longer has, and gaps given up."""
     _delayed: dict[int, T] = field(default_factory=dict, init=False)
     _since_s: float | None = field(default=None, init=False)
     _due_s: float = field(default=0.0, init=False)
@@ -46,15 +44,13 @@ class Arrivals(Generic[T]):
     _loose: bool = field(default=False, init=False)
 
     def take(self, number: int, item: T) -> list[T]:
-        """Records an arrival; returns the items to be delivered now, none if it had arrived
-        before.
-        """
-        if number < self.first:  # was not asked for: Zenoh hands it over once
+        """Record an arrival; returns the items to deliver now, none for a duplicate."""
+        if number < self.first:  # not requested: Zenoh delivers it once
             return [item]
         if number in self._settled:
             return []
         if number <= self.newest:
-            self._since_s = None  # a gap closes: patience begins anew
+            self._since_s = None  # a gap closes: its age starts anew
         self.newest = max(self.newest, number)
         self._settled.add(number, number)
         if len(self._settled) > MOST_GAPS:
@@ -65,26 +61,25 @@ class Arrivals(Generic[T]):
         return self._released(self._whole)
 
     def know(self, newest: int) -> None:
-        """Records the last number that a heartbeat of the publisher contained."""
+        """Record the last number of a heartbeat."""
         self.newest = max(self.newest, newest)
 
     @property
     def missing(self) -> tuple[int, int] | None:
-        """The first and the last missing number; some numbers in between may have arrived."""
+        """First and last missing number."""
         last = self._settled.last_absent(self.newest)
         return (self._whole, last) if last >= self._whole else None
 
     @property
     def lacking(self) -> list[tuple[int, int]]:
-        """The intervals that are missing, those that the publisher no longer has first."""
+        """Missing intervals, first those that the publisher no longer has."""
         return [*self._gone, *self._open()]
 
     def due(self, now_s: float) -> tuple[int, int | None] | None:
-        """The interval to be requested now, if a gap has lasted long enough; end None: everything
-        since.
+        """Interval to request now, if a gap is old enough; end None: everything since.
 
-        A repeated request is for everything since: the newest is always in the cache, so that a
-        reply without the missing numbers shows that they are gone.
+        A repeated request is for everything since: the cache always holds the newest publication,
+        so a reply without the missing numbers shows that they are gone.
         """
         missing = self.missing
         if missing is None:
@@ -100,21 +95,19 @@ class Arrivals(Generic[T]):
         return missing if self._asked == 1 else (missing[0], None)
 
     def overdue(self, now_s: float) -> list[T]:
-        """The items delayed too long by a gap, in order; until the gap is closed nothing more is
-        delayed.
-        """
+        """Release the items of an overdue gap; none are delayed until it is closed."""
         if self._since_s is None or now_s - self._since_s < DELAY_S:
             return []
         self._loose = True
         return self._released(self.newest + 1)
 
     def answered(self, first: int, newest: int, known: int | None = None) -> list[T]:
-        """Records that the publisher's reply with all it has from `first` to `newest` is complete.
+        """Record the publisher's complete reply for `first` to `newest`; returns the items to
+        deliver.
 
-        What is still missing in that interval is gone; returns the items that it had delayed.
-        known: the last number known when it was requested. A larger one than the publisher has,
-            and nothing newer since, was that of another key: Zenoh can deliver a heartbeat, too,
-            under another key after a cut.
+        Numbers still missing are gone. known: the last number at the request. If it exceeds the
+        publisher's and nothing newer arrived since, it was that of another key: after a cut Zenoh
+        can deliver a heartbeat under another key.
         """
         for begin, end in self._open():
             self._give_up(max(begin, first), min(end, newest))
@@ -124,11 +117,11 @@ class Arrivals(Generic[T]):
 
     @property
     def _whole(self) -> int:
-        """The first number from `first` on that has not arrived and is not gone."""
+        """First number that neither arrived nor is gone."""
         return self._settled.next_absent(self.first)
 
     def _give_up(self, first: int, last: int) -> None:
-        """Records the numbers first … last as gone; nothing if last < first."""
+        """Record the numbers first … last as gone; none if last < first."""
         self._gone.add(first, last)
         self._gone.join_first(MOST_GAPS)
         self._settled.add(first, last)

@@ -1,10 +1,10 @@
-"""Packs and unpacks the attachment of a publication: its stamps, its counter, a hash of its key.
+"""Pack and unpack the attachment of a publication: its stamps, its counter, a hash of its key.
 
-32 bytes, `<qqq8s`: team time [ns], the publisher's wall clock [ns], the publisher's counter of this
+32 bytes, `<qqq8s`: team time [ns], the publisher's wall clock [ns], the publisher's counter of the
 key, and a hash of the whole key (BLAKE2b with a digest of 8 bytes, of the key's UTF-8). Zenoh
-abbreviates keys by numbers that both ends of a link agree on; what is still on its way when a link
-is cut is read with the numbers of the new link, and can arrive under another key. The hash shows
-it. The length is the version of the format: an attachment of 24 bytes has no hash.
+abbreviates keys by numbers per link; data in flight when a link is cut is read with the numbers of
+the new link and can arrive under another key. The hash reveals that. The length is the version of
+the format: 24 bytes have no hash.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ _WITHOUT_HASH = 24
 
 
 class Attachment(NamedTuple):
-    """Team time [ns], the publisher's wall clock [ns], and the publisher's counter of the key."""
+    """Team time [ns], the publisher's wall clock [ns], and its counter of the key."""
 
     stamp_ns: int
     wall_ns: int
@@ -25,22 +25,22 @@ class Attachment(NamedTuple):
 
 
 class AttachmentError(ValueError):
-    """A publication without a sound attachment, or one that was published on another key."""
+    """A publication without a sound attachment, or published on another key."""
 
 
 @lru_cache(maxsize=4096)
 def hash_of(key: str) -> bytes:
-    """The hash of a whole key, with its `team/<team>/`: 8 bytes."""
+    """Hash of a whole key, with its `team/<team>/`: 8 bytes."""
     return hashlib.blake2b(key.encode(), digest_size=8).digest()
 
 
 def pack(key: str, attachment: Attachment) -> bytes:
-    """The bytes beside a publication on a whole key."""
+    """Pack the attachment of a publication on a whole key."""
     return _FORMAT.pack(*attachment, hash_of(key))
 
 
 def unpack(key: str, data: bytes) -> Attachment:
-    """The attachment of a publication that arrived on a whole key; raises `AttachmentError`."""
+    """Unpack the attachment of a publication on this key; raises `AttachmentError`."""
     if len(data) == _WITHOUT_HASH:
         raise AttachmentError("its attachment has no hash of the key: an older version's publisher")
     if len(data) != _FORMAT.size:

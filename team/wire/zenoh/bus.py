@@ -1,11 +1,10 @@
-"""The bus over Zenoh: how a process of the team publishes, receives, queries and answers.
+"""The bus over Zenoh: publish, subscribe, query and answer for one process of the team.
 
-Each payload has an attachment: stamps, the publisher's counter of this key, and a hash of the key
-(`team.wire.zenoh.attachment`). `team.wire.zenoh.delivery` implements a channel's delivery; samples
-that Zenoh itself does not recover are requested (`team.wire.zenoh.recovery`).
+Each payload has an attachment (`team.wire.zenoh.attachment`). `team.wire.zenoh.delivery` implements
+a channel's delivery; `team.wire.zenoh.recovery` requests samples that Zenoh does not recover.
 
-Samples, queries and liveliness go from Zenoh's receiving thread directly into one unbounded queue:
-there is no thread of ours, the order of arrival is preserved across subscriptions, and a slow node
+Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue:
+there is no further thread, the order of arrival is preserved across subscriptions, and a slow node
 never blocks the link (the team's credit bounds the queue). A bus does not receive its own samples.
 """
 
@@ -33,19 +32,19 @@ from team.wire.zenoh.queries import Queries, Question, Reply
 from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
 from team.wire.zenoh.session import RouterLink, client
 
-if TYPE_CHECKING:  # a node without keys needs none of it
+if TYPE_CHECKING:  # not needed without keys
     from team.keys.credentials import Credentials
 
 _ALIVE_TIMEOUT_S = 5.0
 _FLUSH = "router/flush"
-_FLUSH_S = 10.0  # that a closing bus waits for a router that reads slowly, or is stopped
+_FLUSH_S = 10.0  # a closing bus waits this long for a router that reads slowly or is stopped
 MOST_WAITING = 1_000
-"""Number of samples that wait for an observing node before dispensable ones are dropped.
+"""Queue length of an observing node beyond which dispensable samples are dropped.
 
-Each sample keeps the buffer alive that it arrived in: some 10 kB.
+Each sample keeps its receive buffer alive: some 10 kB.
 """
 MOST_KEYS = 16_384
-"""Number of keys of which a bus receives samples; a team of 100 robots has 4,500."""
+"""Most keys on which a bus receives samples; a team of 100 robots has 4,500."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +53,15 @@ class _Token:
 
 
 _Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | None
-"""What the receiving thread queues; None wakes a receiver when the bus closes."""
+"""Items of the receiving thread's queue; None wakes a receiver when the bus closes."""
 
 
 class ZenohBus:
     """A bus over one Zenoh session: a client of the router at `connect`.
 
-    keys: the certificate that this node presents to the router, over TLS; None: none, over TCP.
-        Raises `BusError` when no router answers there within `patience_s`, or one that refuses us
-        or that we refuse. One thread publishes and receives; `close` may be called from any.
-    stop: of a process of the team, which waits for a router that is silent until it is set.
+    keys: this node's certificate for TLS; None: TCP. stop: with it, wait for a silent router until
+    the event is set. Raises `BusError` when no router answers within `patience_s`, or either side
+    refuses the other. One thread publishes and receives; `close` may be called from any.
     """
 
     def __init__(
@@ -88,8 +86,9 @@ class ZenohBus:
         self.tap: Tap | None = None
         """Receives all samples that this bus publishes and receives."""
         self.dropped = 0
-        """Number of received samples on keys of no channel, without a sound attachment, or under
-        another key than their publisher's."""
+        """Samples dropped for a key of no channel, an unsound attachment, or another publisher's
+        key.
+        """
         self._keys_received: set[str] = set()
         self._counting = threading.Lock()
         self._closed = threading.Event()
@@ -111,7 +110,7 @@ class ZenohBus:
         self.close()
 
     def close(self) -> None:
-        """Leaves: publishes what is pending, withdraws the tokens, wakes a waiting receiver."""
+        """Publish what is pending, withdraw the tokens, and wake a waiting receiver."""
         if not self._closed.is_set():
             with suppress(BusError):
                 self.publish_totals()
@@ -121,11 +120,10 @@ class ZenohBus:
             self._queue.put(None)
 
     def _flush(self) -> None:
-        """Waits until the router has received what was published: a closing session may drop what
-        its link has not sent yet.
+        """Wait until the router has received the publications, which a closing session may drop.
 
-        The query follows the samples on their link, and nobody answers it, so its end comes from
-        the router. Without a link it ends at once.
+        The query follows them on their link and nobody answers it, so its end comes from the
+        router. Without a link it ends at once.
         """
         with suppress(zenoh.ZError):
             for _ in self._session.get(
@@ -137,8 +135,8 @@ class ZenohBus:
                 pass
 
     def publish_totals(self) -> Tally | None:
-        """Reports to a recorder the number of samples of each key, this report included: the last
-        ones may have been lost. None for a process without a token.
+        """Report the sample count of each key, this report included, to reveal lost samples at the
+        end. None for a process without a token.
         """
         if not self._tokens:
             return None
@@ -156,8 +154,7 @@ class ZenohBus:
         return tally
 
     def publish(self, out: Outgoing) -> int:
-        """Encodes and publishes, stamped with this machine's wall clock; returns the payload's size
-        in bytes.
+        """Encode and publish, stamped with the wall clock; returns the payload's size [bytes].
 
         Blocks while the link is busy; after ten seconds Zenoh drops the link and connects anew.
         """
@@ -169,10 +166,7 @@ class ZenohBus:
         return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
-        """Publishes a sample unchanged, with the delivery that the table promises for its key.
-
-        A key that is not in the table is a stream.
-        """
+        """Publish a sample unchanged, with its key's delivery (default: stream)."""
         self._check_open()
         if len(sample.payload) > LARGEST_PAYLOAD:
             raise BusError(
@@ -200,11 +194,9 @@ class ZenohBus:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribes: from now on `receive` returns what is published there; a repeated call
-        changes nothing.
+        """Subscribe to a channel; repetition has no effect.
 
-        whole: for a `latest` channel all samples that its publishers still have, not only the
-            newest one.
+        whole: for a `latest` channel all samples that its publishers still have.
         """
         self._check_open()
         if {(channel.name, "*"), (channel.name, name)} & self._requested:
@@ -224,9 +216,9 @@ class ZenohBus:
                 self._recovery.watch(key)
 
     def _admit(self, item: _Item) -> None:
-        """Queue what was received, but for samples on keys of no channel, or of too many keys.
+        """Queue a received item, except samples on keys of no channel or of too many keys.
 
-        Called on Zenoh's receiving threads, before anything is stored.
+        Called on Zenoh's receiving threads.
         """
         if isinstance(item, zenoh.Sample | _Token):
             sample = item.sample if isinstance(item, _Token) else item
@@ -242,7 +234,6 @@ class ZenohBus:
         self._queue.put(item)
 
     def _drop(self, key: str, why: str) -> None:
-        """Count and log a sample that is dropped."""
         with self._counting:
             self.dropped += 1
         LOG.warning("%s: dropped, %s (%d so far)", cut(key, 80), why, self.dropped)
@@ -252,20 +243,17 @@ class ZenohBus:
         return row is not None and row.name in self._sheds
 
     def _shed(self, item: _Item) -> None:
-        """Queues a sample that an observing node can do without, unless the node is too far
-        behind.
-        """
+        """Queue an observing node's dispensable sample, unless it is too far behind."""
         if self._queue.qsize() < MOST_WAITING:
             self._admit(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """All samples received since the last call, in order; waits at most `timeout_s` for the
-        first one.
+        """Return all samples received since the last call, in order; waits at most `timeout_s` for
+        the first.
 
-        Queries are answered here, on the caller's thread: a node's state needs no lock. Samples
-        that have been missing for a while are requested; they are returned when they arrive, after
-        later ones. Samples that arrive during the call wait for the next one, so that a team that
-        publishes faster than this node reads can not keep it here.
+        Queries are answered here, on the caller's thread: a node's state needs no lock. Missing
+        samples are requested and returned when they arrive, after later ones. Samples that arrive
+        during the call are left for the next, which bounds it for a fast team.
         """
         self._check_open()
         self._link.look(time.monotonic())
@@ -311,25 +299,23 @@ class ZenohBus:
         whole = str(item.key_expr)
         try:
             beside = unpack(whole, b"" if item.attachment is None else item.attachment.to_bytes())
-        except AttachmentError as error:  # has not arrived: its publisher's cache is asked for it
+        except AttachmentError as error:  # counts as missing: recovered from its publisher's cache
             self._drop(whole, str(error))
             return
         key = whole.removeprefix(self._prefix)
         sample = Sample(key, item.payload.to_bytes(), *beside)
-        if item.source_info is None or self._can_do_without(key):  # what is lost is not asked for
+        if item.source_info is None or self._can_do_without(key):  # lost samples are not requested
             samples.append(sample)
         else:
             samples += self._recovery.arrived(sample, item.source_info)
 
     def again(self) -> None:
-        """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
+        """Request and deliver all samples of `all` channels and whole subscriptions once more."""
         self._recovery.again()
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples that are known to exist and were not received: by key, intervals of a publisher's
-        counters.
-
-        It includes samples that their publisher no longer has.
+        """Samples published and not received, even if no longer available: by key, intervals of a
+        publisher's counters.
         """
         return self._recovery.lacking()
 
@@ -338,46 +324,41 @@ class ZenohBus:
         return self._recovery.awaited()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answers the queries of `channel`, within `receive`; a ValueError's text is sent to the
-        asker.
-        """
+        """Answer the queries of `channel` within `receive`; a ValueError's text is the reply."""
         self._check_open()
         self._queries.answer(channel, name, answer)
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads in their order; empty when nobody answers.
+        """Query and return the replies' payloads in order; empty when nobody answers.
 
-        Raises `BusError` when a reply is not complete within `timeout_s`, or is an error. Meanwhile
-        this bus answers no queries: two nodes must not query each other at once.
+        Raises `BusError` for an error or timeout. Meanwhile this bus answers no queries: two nodes
+        must not query each other at once.
         """
         self._check_open()
         payloads = self._queries.ask(channel, name, request, timeout_s)
         if self.tap is not None and channel in REPLIES and channel is not KEPT:
             wall_ns = time.time_ns()
-            with suppress(WireError):  # whoever asked opens them, and says what is wrong
+            with suppress(WireError):  # the caller decodes them and reports the error
                 self.tap([replied(channel, name, payload, wall_ns) for payload in payloads])
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Sends a query without waiting: `receive` returns the replies, as samples of their
-        channels.
+        """Query without waiting: `receive` returns the replies as samples.
 
-        Does nothing while the same query is open.
+        No effect while the same query is open.
         """
         self._check_open()
         self._queries.request(channel, name, request)
 
     def declare_alive(self, node: str) -> None:
-        """Holds a liveliness token until the bus is closed or its process dies."""
+        """Hold a liveliness token until the bus is closed or its process dies."""
         self._check_open()
         if node not in self._tokens:
             key = self._prefix + ALIVE.key(node)
             self._tokens[node] = self._session.liveliness().declare_token(key)
 
     def watch_alive(self, node: str = "*") -> None:
-        """Receives `Liveliness` samples when others' tokens appear and disappear, present ones
-        first.
-        """
+        """Receive `Liveliness` samples of other nodes' tokens, present ones first."""
         self._check_open()
 
         def notice(sample: zenoh.Sample) -> None:
@@ -389,14 +370,14 @@ class ZenohBus:
             )
 
     def is_alive(self, node: str) -> bool:
-        """Whether anyone holds the node's liveliness token, as far as the router knows."""
+        """Whether the router has the node's liveliness token."""
         self._check_open()
         key = self._prefix + ALIVE.key(node)
         replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
 
     def other_teams(self) -> list[str]:
-        """The teams whose processes are at this router, but for the bus's own."""
+        """Other teams with processes at this router."""
         self._check_open()
         keys = [
             str(reply.ok.key_expr)

@@ -1,11 +1,11 @@
-"""Implements a channel's delivery, as the table of channels promises it, by Zenoh's own means.
+"""Implement the deliveries of the table of channels by Zenoh's means.
 
-All publishers block while their link to the router is busy; the router drops samples to a receiver
-that is slower than the team (`team.wire.zenoh.router`).
+All publishers block while their link to the router is busy; the router drops samples to a slow
+receiver (`team.wire.zenoh.router`).
 
-stream: a plain publisher; samples sent while a link is cut, and those dropped, are lost.
+stream: a plain publisher; samples of a cut, and dropped ones, are lost.
 latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut or a drop
-    the receiver requests what it missed by the heartbeat, as far back as the cache reaches.
+the receiver requests the missed ones, as far back as the cache reaches.
 all: as `latest` with everything cached, and a late joiner requests everything.
 """
 
@@ -22,15 +22,13 @@ _HEARTBEAT_S = 0.25
 _BLOCK = zenoh.CongestionControl.BLOCK
 _RELIABLE = zenoh.Reliability.RELIABLE
 PRIORITY = zenoh.Priority.DATA
-"""The priority of all samples: one for all, so that the order across keys is preserved."""
+"""One priority for all samples preserves the order across keys."""
 _REPLIES = ext.RepliesConfig(congestion_control=_BLOCK, priority=PRIORITY)
 Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
 
 def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
-    """A publisher with the delivery of the key's row; a key that is not in the table is a
-    stream.
-    """
+    """Declare a publisher with the key's delivery (default: stream)."""
     row = row_of(key)
     if row is None or row.delivery == "stream":
         return session.declare_publisher(
@@ -62,7 +60,7 @@ def subscribe(
     *,
     whole: bool,
 ) -> None:
-    """Passes the samples of other publishers to `put`, on Zenoh's thread. whole: as
+    """Pass the samples of other publishers to `put`, on Zenoh's thread. whole: as
     `ZenohBus.subscribe`.
     """
     callback = Callback(put, indirect=False)
@@ -81,8 +79,8 @@ def subscribe(
 
 
 def _history(channel: Channel, *, whole: bool) -> ext.HistoryConfig:
-    # Where one is wanted, no detection of late publishers: after a cut the publisher counts as
-    # late, and a query for one sample would take the place of the recovery of all.
+    # No detection of late publishers for one sample: after a cut the publisher counts as late, and
+    # a query for one sample would replace the recovery of all.
     if channel.delivery == "latest" and not whole:
         return ext.HistoryConfig(max_samples=1, detect_late_publishers=False)
     return ext.HistoryConfig(max_samples=WHOLE_CACHE, detect_late_publishers=True)

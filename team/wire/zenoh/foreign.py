@@ -1,4 +1,4 @@
-"""Reads and publishes keys that are not a team's, such as those of ROS 2, as raw samples."""
+"""Read and publish keys outside a team, such as those of ROS 2, as raw samples."""
 
 import json
 import time
@@ -13,21 +13,19 @@ from zenoh.handlers import FifoChannel
 from team.wire.bus import BusError
 
 TOKENS_S = 5.0
-"""Longest time [s] to wait for the tokens that are present."""
+"""Timeout [s] for the list of tokens that are present."""
 CAPACITY = 65_536
-"""Number of messages of a subscription that wait for `receive`. Only a full channel blocks Zenoh's
-thread, and with it the router, which then drops messages.
+"""Capacity [messages] of a subscription. A full channel blocks Zenoh's thread, and with it the
+router, which then drops messages.
 """
 AT_ONCE = 10_000
-"""Largest number of messages of a subscription that one call of `receive` returns."""
+"""Largest number of messages per subscription and call of `receive`."""
 LOOK_S = 0.005
-"""Interval [s] of polling while nothing has arrived."""
+"""Polling interval [s] while nothing has arrived."""
 
 
 class ForeignSample(NamedTuple):
-    """One publication with its attachment; for a liveliness token both are empty, and `alive` says
-    whether it appeared or disappeared.
-    """
+    """A publication with its attachment, or a liveliness token (`alive`: it appeared)."""
 
     key: str
     payload: bytes
@@ -39,10 +37,10 @@ class ForeignSample(NamedTuple):
 class ForeignKeys:
     """Subscriptions to keys and tokens at a router or peer; raises BusError where none answers.
 
-    Samples wait in one channel per subscription, which Zenoh's thread fills without running Python:
-    a process that is busy decoding does not block it. `receive` reads from these channels; samples
-    of one key are in their publisher's order, those of different keys are in none. latched: keys
-    of which what was published before is requested, too, from the publishers' caches.
+    Zenoh's thread fills one channel per subscription without running Python, so a process that is
+    busy decoding does not block it. Samples of one key keep their publisher's order, those of
+    different keys have none. latched: keys whose earlier samples are requested from the publishers'
+    caches.
     """
 
     def __init__(
@@ -60,14 +58,14 @@ class ForeignKeys:
             "connect/timeout_ms": max(1, round(1e3 * patience_s)),
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
-            "timestamping/enabled": True,  # caches of latched keys need it
+            "timestamping/enabled": True,  # required by the caches of latched keys
         }
         for name, value in settings.items():
             config.insert_json5(name, json.dumps(value))
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise BusError(f"nobody answers at {connect} ({patience_s:g} s): {error}") from None
+            raise BusError(f"no answer at {connect} ({patience_s:g} s): {error}") from None
         self._announced: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
         self._first = [
@@ -92,7 +90,7 @@ class ForeignKeys:
             )
             for key in latched
         ]
-        # Of publishers whose cache answers on their own key, as those of older versions.
+        # For publishers whose cache answers on their own key, as in older versions.
         self._cached = [
             _of_sample(reply.ok)
             for key in latched
@@ -113,7 +111,7 @@ class ForeignKeys:
 
     @property
     def identity(self) -> str:
-        """The session's Zenoh identity, as liveliness tokens name it."""
+        """The session's Zenoh identity, as in liveliness tokens."""
         return str(self._session.info.zid())
 
     def announce(self, token: str) -> None:
@@ -124,9 +122,9 @@ class ForeignKeys:
     def publish(
         self, key: str, payload: bytes, attachment: bytes | None = None, *, latched: bool = False
     ) -> None:
-        """Publish on a key; a late subscriber receives the newest sample of a latched one.
+        """Publish on a key; a late subscriber receives a latched one's newest sample.
 
-        A message that a slow network can not take is dropped: the next one replaces it.
+        A message that a slow network cannot take is dropped.
         """
         publisher = self._publishers.get(key)
         if publisher is None:
@@ -142,9 +140,7 @@ class ForeignKeys:
         publisher.put(payload, attachment=attachment)
 
     def receive(self, timeout_s: float) -> list[ForeignSample]:
-        """The samples received, at most AT_ONCE of each subscription; waits at most `timeout_s` for
-        the first.
-        """
+        """Return up to AT_ONCE samples per subscription; waits `timeout_s` for the first."""
         until = time.monotonic() + timeout_s
         while True:
             found = self._taken()

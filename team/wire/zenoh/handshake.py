@@ -1,9 +1,8 @@
-"""Examines a link to a router that fails: Zenoh reports nothing but a timeout.
+"""Diagnose a failing link to a router, for which Zenoh reports only a timeout.
 
-One TLS handshake by the standard library, beside Zenoh, distinguishes the cases. Only positive
-evidence refuses a link: a TLS alert about our certificate, a router's certificate that can not be
-verified, an answer that is not TLS. A timeout, a closed connection or any other error of the
-network is no evidence, and is reported as a reason to wait.
+One TLS handshake by the standard library distinguishes the cases. Only evidence refuses a link: a
+TLS alert about our certificate, a router certificate that fails verification, an answer that is not
+TLS. A timeout, a closed connection or another network error is a reason to wait.
 """
 
 import re
@@ -22,9 +21,9 @@ _ALERTS = {
     "UNKNOWN_CA": "it is of another authority than the router's: copy ca.pem and both files of "
     "this node from one folder",
     "CERTIFICATE_EXPIRED": "it has expired by the router's clock: renew it, or put the clock right",
-    "CERTIFICATE_REQUIRED": "it wants one: give --keys DIR",
-    "CERTIFICATE_UNKNOWN": "it does not take it for one of its team",
-    "BAD_CERTIFICATE": "it does not take it for one of its team",
+    "CERTIFICATE_REQUIRED": "it requires one: give --keys DIR",
+    "CERTIFICATE_UNKNOWN": "it is not one of its team",
+    "BAD_CERTIFICATE": "it is not one of its team",
     "DECRYPT_ERROR": "it is of another authority than the router's, of the same name",
 }
 _NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL", "HTTP_REQUEST")
@@ -33,12 +32,11 @@ _NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL"
 
 @dataclass(frozen=True)
 class Examined:
-    """The result of one handshake.
+    """Result of one handshake.
 
     refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
-    is no link yet, in words; empty if the handshake succeeded. router_ends: when the router's
-    certificate expires [s since 1970], if it was received. accepts: whether connections are
-    accepted there, though perhaps not answered.
+    is no link yet; empty after success. router_ends: expiry of the router's certificate [s since
+    1970], if received. accepts: connections are accepted, though perhaps not answered.
     """
 
     refused: str | None = None
@@ -48,7 +46,7 @@ class Examined:
 
 
 def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT_S) -> Examined:
-    """Make one handshake with the router at `connect`; takes at most three times `timeout_s`."""
+    """Make one handshake with the router; takes at most three times `timeout_s`."""
     at = _ENDPOINT.match(connect)
     if at is None:
         return Examined()
@@ -76,7 +74,7 @@ def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> 
         tls = context.wrap_socket(link, server_hostname=host)
     except ssl.SSLCertVerificationError as error:
         return Examined(
-            f"{connect}: the router's certificate is not good: {error.verify_message}. If the host "
+            f"{connect}: the router's certificate is invalid: {error.verify_message}. If the host "
             "is not in it: `teamslam keys TEAM -o DIR --router HOST`; if it is of another "
             f"authority than {keys.authority}: copy both from one folder"
         )
@@ -95,7 +93,6 @@ def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> 
 
 
 def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
-    """The result of a handshake that raised an error."""
     if isinstance(error, TimeoutError):
         return Examined(waits_for="connections are accepted, TLS is not answered")
     reason = (error.reason if isinstance(error, ssl.SSLError) else error.strerror) or str(error)
@@ -110,7 +107,7 @@ def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
 
 
 def _without_keys(link: socket.socket, connect: str) -> Examined:
-    """Whether it is a router with keys, which answers a greeting in TLS."""
+    """Test for a router with keys, which answers a greeting in TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -119,6 +116,4 @@ def _without_keys(link: socket.socket, connect: str) -> Examined:
             pass
     except OSError:
         return Examined(waits_for="connections are accepted and not answered")
-    return Examined(
-        f"{connect}: the router there has keys and refuses whoever has none: give --keys DIR"
-    )
+    return Examined(f"{connect}: the router there requires keys: give --keys DIR")

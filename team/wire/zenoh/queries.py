@@ -1,4 +1,4 @@
-"""Queries over a session: those that a node answers, and those that it sends."""
+"""Queries that a node answers, and those that it sends, over one session."""
 
 import logging
 import time
@@ -19,13 +19,13 @@ _LOG = logging.getLogger("teamslam")
 
 @dataclass(frozen=True, repr=False)
 class Question:
-    """A received query, with the function that answers it."""
+    """A received query and the function that answers it."""
 
     query: zenoh.Query
     answer: Answer
 
     def reply(self) -> None:
-        """Answers the query; where the request is not sound its sender receives the error."""
+        """Answer the query; the sender of an unsound request receives the error."""
         request = b"" if self.query.payload is None else self.query.payload.to_bytes()
         with self.query as query:
             try:
@@ -37,7 +37,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Reply:
-    """One reply to a request; without a payload it marks the end, or an error with its reason."""
+    """One reply to a request; without a payload the end, or an error with its reason."""
 
     channel: Channel
     name: str
@@ -46,9 +46,7 @@ class Reply:
 
 
 class Queries:
-    """The queries of one session. Zenoh's thread passes questions and replies to `put`; all other
-    methods are for one thread.
-    """
+    """Queries of one session. Zenoh's thread calls `put`; all other methods are for one thread."""
 
     def __init__(
         self, session: zenoh.Session, prefix: str, put: Callable[[Question | Reply], None]
@@ -59,9 +57,7 @@ class Queries:
         self._requests: set[tuple[str, str]] = set()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Passes the queries of this channel to `put` from now on, with the function that answers
-        them.
-        """
+        """Pass the queries of this channel to `put`, with the function that answers them."""
 
         def take(query: zenoh.Query) -> None:
             self._put(Question(query, answer))
@@ -71,7 +67,7 @@ class Queries:
         )
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """The replies' payloads in their order; raises `BusError` as the bus does."""
+        """Query and return the replies' payloads in order; raises `BusError` as the bus does."""
         key = self._prefix + channel.key(name)
         replies = self._session.get(
             key,
@@ -89,9 +85,7 @@ class Queries:
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Sends a query without waiting: replies are passed to `put`. Does nothing while the same
-        is open.
-        """
+        """Query without waiting: replies go to `put`. No effect while the same query is open."""
         if (channel.name, name) in self._requests:
             return
         self._requests.add((channel.name, name))
@@ -112,7 +106,7 @@ class Queries:
         )
 
     def taken(self, reply: Reply) -> list[Sample]:
-        """A reply as a sample of its channel; nothing where it is the end, or no sound reply."""
+        """Convert a reply to a sample; empty for the end or an unsound reply."""
         key = reply.channel.key(reply.name)
         if reply.payload is None:
             self._requests.discard((reply.channel.name, reply.name))
@@ -127,6 +121,5 @@ class Queries:
 
 
 def _reason(error: zenoh.ReplyError | None) -> str:
-    """The reason for a missing reply."""
     text = "" if error is None else error.payload.to_bytes().decode("utf-8", "replace")
     return text or "no answer"

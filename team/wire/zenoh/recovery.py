@@ -1,14 +1,13 @@
-"""Requests publications that have not arrived from their publisher's cache.
+"""Request missing publications from their publisher's cache.
 
-Zenoh's advanced subscriber does most of this, but some late joiners receive only a part of the
-history. The arrivals of each publisher are therefore counted (`team.wire.zenoh.arrivals`) and
-compared with its heartbeats, and what has been missing for half a second is requested.
+Zenoh's advanced subscriber gives some late joiners only a part of the history. The arrivals of each
+publisher are therefore counted (`team.wire.zenoh.arrivals`) and compared with its heartbeats, and
+gaps older than half a second are requested.
 
-Keys, publishers and numbers come from the wire. The publishers tracked on the keys of one node, and
-those of all nodes, are bounded: samples of a publisher beyond the bound are delivered as they come,
-and are not requested where they are missing. A robot has some 30 keys with a cache, the centre five
-for each robot, and a process that is started again is a new publisher, so that a team of a hundred
-robots, each started again thirty times, is within the bounds.
+Keys, publishers and numbers come from the wire, so the publishers tracked per node and in all are
+bounded; samples of further ones are delivered as they come. A robot has some 30 keys with a cache,
+the centre five per robot, and a restarted process is a new publisher: a team of a hundred robots,
+each restarted thirty times, is within the bounds.
 """
 
 import struct
@@ -25,27 +24,27 @@ from team.wire.logs import LOG
 from team.wire.zenoh.arrivals import Arrivals
 
 ADVANCED = "/@adv/pub/"
-"""Part of the keys on which an advanced publisher sends its heartbeats."""
-_BEAT = struct.Struct("<I")  # a heartbeat's payload: the number of the last publication
-_LOOK_S = 0.1  # between two looks at what is missing
+"""Part of the keys of advanced publishers' heartbeats."""
+_BEAT = struct.Struct("<I")  # payload of a heartbeat: the number of the last publication
+_LOOK_S = 0.1  # interval of the checks for missing samples
 _ANSWER_S = 10.0
 _NEVER = 2**63
-_SEVERAL = ""  # in place of a publisher's key: samples of it arrived on several
+_SEVERAL = ""  # replaces a publisher's key: its samples arrived on several
 MOST_OF_A_NODE = 4_096
-"""Largest number of publishers, each on one key, that are tracked on the keys of one node."""
+"""Most tracked publishers, each on one key, on the keys of one node."""
 MOST_PUBLISHERS = 131_072
-"""Largest number of them in all: some 100 MB."""
+"""Most tracked publishers in all: some 100 MB."""
 MOST_BEATS = 131_072
-"""Number of heartbeats by name beyond which the known ones are forgotten; each is news again."""
+"""Number of stored heartbeats beyond which they are cleared."""
 LONGEST_KEY = 512
 """Longest key, in characters, on which missing samples are requested."""
 MOST_ASKED = 256
-"""Largest number of requests to caches in one look."""
+"""Largest number of cache requests in one check."""
 
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """The number of a publisher's last publication on a key."""
+    """Number of a publisher's last publication on a key."""
 
     key: str
     publisher: str
@@ -54,9 +53,9 @@ class Heartbeat:
 
 @dataclass
 class CacheAnswer:
-    """A complete reply of a publisher's cache: the requested interval, and the samples.
+    """Complete reply of a publisher's cache: the requested interval, and the samples.
 
-    known: the publisher's last number that was known at the request. newest: that of the reply.
+    known: the publisher's last number at the request. newest: that of the reply.
     """
 
     key: str
@@ -69,8 +68,8 @@ class CacheAnswer:
 
 
 class Recovery:
-    """The recovery of one session. Zenoh's thread passes heartbeats and replies to `put`; all other
-    methods are for one thread.
+    """Recovery for one session. Zenoh's thread calls `put`; all other methods are for one
+    thread.
     """
 
     def __init__(
@@ -93,9 +92,7 @@ class Recovery:
         """Number of samples and heartbeats of publishers beyond the bounds."""
 
     def watch(self, key: str) -> None:
-        """Subscribes to the heartbeats of the publishers of a key, given with the session's
-        prefix.
-        """
+        """Subscribe to the heartbeats of a key (with the session's prefix)."""
         self._session.declare_subscriber(
             f"{key}{ADVANCED}**",
             Callback(self._beat, indirect=False),
@@ -103,11 +100,11 @@ class Recovery:
         )
 
     def take_whole(self, channel: str) -> None:
-        """Requests all samples that the publishers of this `latest` channel still have."""
+        """Request all samples that publishers of this `latest` channel still have."""
         self._whole.add(channel)
 
     def _beat(self, sample: zenoh.Sample) -> None:
-        """Passes on a heartbeat with a new number; called on Zenoh's receiving thread."""
+        """Pass on a heartbeat with a new number; called on Zenoh's receiving thread."""
         name, beat = str(sample.key_expr), sample.payload.to_bytes()
         sound = len(beat) == _BEAT.size and len(name) <= LONGEST_KEY
         if sound and self._beats.get(name) != beat:
@@ -120,7 +117,7 @@ class Recovery:
                 self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
 
     def take_heartbeat(self, beat: Heartbeat) -> None:
-        """Records a publisher's last number; nothing if the publisher is that of another key."""
+        """Record a publisher's last number; no effect for a publisher of another key."""
         if self._keys.get(beat.publisher, beat.key) not in (beat.key, _SEVERAL):
             return
         arrivals = self._arrivals_of(beat.key, beat.publisher, beat.newest)
@@ -129,18 +126,18 @@ class Recovery:
             self._incomplete.add((beat.key, beat.publisher))
 
     def answered(self, answer: CacheAnswer) -> list[Sample]:
-        """Records that a cache's reply is complete; returns the samples to be delivered now."""
+        """Record a cache's complete reply; returns the samples to deliver now."""
         if not answer.repeated or answer.failed or answer.newest < 0:
             return []
         arrivals = self._arrivals.get((answer.key, answer.publisher))
         if arrivals is None:  # forgotten since
             return []
         if answer.newest < arrivals.newest:
-            self._beats.clear()  # so that a heartbeat with a number that is unlearnt is news
+            self._beats.clear()  # the next heartbeats count as new
         return arrivals.answered(answer.first, answer.newest, answer.known)
 
     def arrived(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
-        """Records a received publication; returns the samples to be delivered now, each once and in
+        """Record a received publication; returns the samples to deliver now, each once and in
         order.
         """
         publisher, number = _numbered(source)
@@ -155,8 +152,8 @@ class Recovery:
         return delivered
 
     def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample] | None:
-        """The arrivals of one publisher on one key; None beyond the bounds, and on a key of no
-        channel. On a `latest` channel nothing older than the first known number is requested.
+        """Arrivals of one publisher on one key; None beyond the bounds, and on a key of no channel.
+        On a `latest` channel nothing before the first known number is requested.
         """
         found = self._arrivals.get((key, publisher))
         if found is None:
@@ -179,9 +176,7 @@ class Recovery:
         LOG.warning(text, key, self.untracked)
 
     def overdue(self, now_s: float) -> list[Sample]:
-        """Requests what has been missing for a while; returns samples that no longer wait for
-        it.
-        """
+        """Request missing samples; returns those that are no longer delayed by a gap."""
         if now_s < self._look_due or not self._incomplete:
             return []
         self._look_due = now_s + _LOOK_S
@@ -224,12 +219,12 @@ class Recovery:
         )
 
     def again(self) -> None:
-        """Requests and delivers all samples of `all` channels and whole subscriptions once more."""
+        """Request and deliver all samples of `all` channels and whole subscriptions once more."""
         self._arrivals.clear()
         self._tracked.clear()
         self._keys.clear()
         self._incomplete.clear()
-        self._beats.clear()  # so that the next heartbeats are news
+        self._beats.clear()  # the next heartbeats count as new
 
     def awaited(self) -> set[str]:
         """Keys with missing samples that their publisher may still have."""
@@ -240,10 +235,8 @@ class Recovery:
         }
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples that are known to exist and were not received: by key, intervals of a publisher's
-        counters.
-
-        It includes samples that their publisher no longer has.
+        """Samples published and not received, even if no longer available: by key, intervals of a
+        publisher's counters.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):
@@ -253,11 +246,11 @@ class Recovery:
 
 
 def _node_of(key: str) -> str:
-    """The node on whose keys a key is: no process publishes on keys of another node."""
+    """Node that owns a key."""
     first, _, rest = key.partition("/")
     return f"{first}/{rest.partition('/')[0]}" if first in ("robot", "source") else first
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
-    """The publisher, by the name that its heartbeats have, and its number of the publication."""
+    """The publisher as in its heartbeats, and its number of the publication."""
     return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn

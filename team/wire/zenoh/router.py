@@ -22,51 +22,49 @@ from team.wire.zenoh.attachment import AttachmentError, unpack
 from team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
 from team.wire.zenoh.stored import StoredMessages
 
-if TYPE_CHECKING:  # a router without keys needs none of it
+if TYPE_CHECKING:  # not needed without keys
     from team.keys.credentials import Credentials
 
 REFUSALS = "error,zenoh_link_tls=warn"
-"""The part of Zenoh's log that a router with keys shows: refused connections, with the reasons."""
+"""Zenoh's log filter with keys: refused connections, with reasons."""
 DROP_US = 100_000
-"""Time [us] that a publication waits for a subscriber whose queue is full; then it is dropped.
+"""Time [us] that a publication waits for a subscriber's full queue before it is dropped.
 
-Zenoh marks that queue as congested, and drops further publications to it without a wait until the
-subscriber reads again. A subscriber that stops reading therefore delays the others once. It fetches
-the missed samples as after a cut link.
+Zenoh marks that queue as congested and drops further publications to it at once until the
+subscriber reads again: a stopped subscriber delays the others once. It fetches the missed samples
+as after a cut link.
 """
 DROP_LARGE_US = 1_000_000
 """Additional time [us] for a publication of more than one batch."""
 CLOSE_US = 2_000_000
-"""Time [us] that a reply or a query waits for a full queue; then the link is closed.
+"""Time [us] that a reply or a query waits for a full queue before the link is closed.
 
-Its process connects again. A publication that was dropped for its size is fetched by a query, so a
-message of S bytes needs a link of (S - 5 MB) in that time.
+Its process reconnects. A publication dropped for its size is fetched by a query, so a message of S
+bytes needs a link of (S - 5 MB) in that time.
 """
 QUEUE_BATCHES = 16
-"""Batches of 64 kB in the queue to each subscriber, Zenoh's largest number."""
+"""Batches of 64 kB per subscriber's queue, Zenoh's largest number."""
 RX_THREADS = 128
-"""Threads that receive; more than a team has links."""
+"""Receiving threads; more than a team has links."""
 _CONGESTION = "transport/link/tx/queue/congestion_control"
 _DROPS = {
     "messages": ["put"],
     "flows": ["egress"],
     "overwrite": {"congestion_control": "drop"},
 }
-"""Publishers block on a full queue of their own; on its way out of the router a publication does
-not."""
+"""Publishers block on their own full queue; publications leaving the router do not."""
 MOST_TEAMS = 1_000
-"""Number of teams of which a router without keys stores messages."""
+"""Number of teams for which a router without keys stores messages."""
 
 
 @contextmanager
 def router(
     listen: str = "tcp/127.0.0.1:0", keys: "tuple[Credentials, Roster] | None" = None
 ) -> Iterator[str]:
-    """Runs a router in this process; yields the endpoint that it is bound to.
+    """Run a router in this process; yields its endpoint.
 
-    keys: the router's own credentials, and the roster of the nodes that it accepts: then it speaks
-        TLS alone, and reports on stderr or stdout whom it refuses and why. Raises `BusError` when
-        it can not listen there.
+    keys: the router's credentials and the roster of accepted nodes: it then uses TLS only and logs
+    refused nodes, with the reason. Raises `BusError` when it cannot listen there.
     """
     settings: dict[str, object] = {
         "mode": "router",
@@ -78,8 +76,8 @@ def router(
         "transport/link/tx/queue/size/data": QUEUE_BATCHES,
         "qos/network": [_DROPS],
     }
-    # A message that waits for a slow subscriber blocks the thread of its publisher's link, and the
-    # slow link is closed on one of these threads, too. The default is two.
+    # A message to a slow subscriber blocks the thread of its publisher's link, and the slow link is
+    # closed on one of these threads, too. The default is two.
     os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RX_THREADS}))")
     if keys is not None:
         if not listen.startswith("tls/"):
@@ -100,15 +98,15 @@ def router(
         replies = session.get(f"@/{session.zid()}/router", timeout=2.0)
         locators = [json.loads(r.ok.payload.to_string())["locators"] for r in replies if r.ok]
         if not (locators and locators[0]):
-            raise BusError(f"the router at {listen} does not tell its endpoint")
+            raise BusError(f"the router at {listen} does not report its endpoint")
         yield str(locators[0][0])
 
 
 class _Keeper:
-    """Stores each team's ends and operators' orders at the router, and answers queries for them.
+    """Stores each team's ends and operators' orders, and answers queries for them.
 
-    team: the only team of a router with keys, whose access control would withhold from publishers
-    that the router subscribes to the keys of all teams; "*": any team.
+    team: the only team of a router with keys, whose access control would refuse a subscription to
+    all teams' keys; "*": any team.
     """
 
     def __init__(self, session: zenoh.Session, team: str) -> None:
@@ -126,10 +124,10 @@ class _Keeper:
         )
 
     def _of(self, key: zenoh.KeyExpr) -> tuple[StoredMessages, str]:
-        """The stored messages of a key's team, and the key within the team."""
+        """Stored messages of a key's team, and the key within the team."""
         _, team, rest = str(key).split("/", 2)
         if team not in self._teams and len(self._teams) >= MOST_TEAMS:
-            return StoredMessages(), rest  # which nobody keeps
+            return StoredMessages(), rest  # not kept
         return self._teams[team], rest
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -141,7 +139,7 @@ class _Keeper:
         try:
             attached = unpack(str(sample.key_expr), beside)
             stored.take(Sample(key, sample.payload.to_bytes(), *attached), time.monotonic())
-        except (AttachmentError, WireError) as error:  # its receivers drop it, and log that
+        except (AttachmentError, WireError) as error:  # its receivers drop and log it
             LOG.debug("%r: not stored: %s", key[:80], error)
 
     def _token(self, sample: zenoh.Sample) -> None:
@@ -165,7 +163,7 @@ class _Keeper:
 
 
 def _answer_door(session: zenoh.Session, roster: Roster) -> None:
-    """Answer to each certificate of the authority, by common name, whether the roster has it."""
+    """Answer to the authority's certificates whether the roster has their name."""
     names = {roster.common_name(node) for node in roster.nodes}
 
     def answer(query: zenoh.Query) -> None:

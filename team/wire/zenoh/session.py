@@ -1,8 +1,7 @@
-"""A process's link to its team's router: how it is opened, and whether the router still accepts it.
+"""Open a process's link to its team's router and monitor it.
 
-Every process is a client of one router, a star without discovery: a process that is not configured
-can not connect, and the router is the single place where the traffic of a team is controlled or
-watched.
+Every process is a client of one router, a star without discovery: an unconfigured process cannot
+connect, and the router is the single place to control or watch the traffic.
 """
 
 import json
@@ -17,28 +16,28 @@ from team.wire.bus import BusError
 from team.wire.codec import LARGEST_PAYLOAD
 from team.wire.logs import LOG
 
-if TYPE_CHECKING:  # a node without keys needs none of it
+if TYPE_CHECKING:  # not needed without keys
     from team.keys.credentials import Credentials
 
-_LEASE_MS = 5_000  # of silence before a link counts as cut: a stopped process is noticed
-_BLOCK_US = 10_000_000  # that a full queue may stop a publisher before its link is closed
+_LEASE_MS = 5_000  # silence after which a link counts as cut; detects a stopped process
+_BLOCK_US = 10_000_000  # time that a full queue may block a publisher before its link is closed
 FIRST_LOOK_S = 3.0
-"""Time [s] without a connection after which a client finds out why."""
+"""Time [s] without a connection after which a client examines the router."""
 LINK_S = 1.0
-"""Interval [s] between two looks at the link."""
+"""Interval [s] between two checks of the link."""
 LONGEST_S = 30.0
-"""Longest interval [s] between two examinations of a link that fails; intervals double up to it."""
+"""Longest interval [s] between two examinations of a failing link, which double."""
 REPEAT_S = 60.0
-"""Interval [s] at which a client that waits for its router logs the reason again."""
+"""Interval [s] at which a client without a router logs the reason again."""
 ANSWER_S = 5.0
-"""Timeout [s] of the query whether the router accepts our certificate, and of an examination."""
+"""Timeout [s] of the query for our certificate's acceptance, and of an examination."""
 DOOR = "router/door"
-"""Key below which a router with keys answers whether it accepts a certificate, by common name."""
+"""Key prefix on which a router with keys answers for a certificate's common name."""
 ACCEPTED, REVOKED = b"accepted", b"revoked"
 
 
 def opened(settings: dict[str, object]) -> zenoh.Session:
-    """A session with these settings and those that all processes of a team share."""
+    """Open a session with these settings and those that all processes of a team share."""
     config = zenoh.Config()
     always: dict[str, object] = {
         "scouting/multicast/enabled": False,
@@ -60,11 +59,11 @@ def client(
     keys: "Credentials | None",
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
-    """Open a client's session; raises `BusError` when no router answers within `patience_s`, or one
-    that refuses us.
+    """Open a client's session; raises `BusError` if none opens within `patience_s` or the router
+    refuses us.
 
-    stop: of a process of the team, which waits until it is set for a router that accepts
-        connections without answering, as one that is stopped or busy does.
+    stop: with it, wait until the event for a router that accepts connections without answering, as
+    a stopped or busy one does.
     """
     settings: dict[str, object] = {
         "mode": "client",
@@ -118,13 +117,14 @@ def _client_tls(keys: "Credentials") -> dict[str, object]:
 
 
 class RouterLink:
-    """The link of one session to its router: reports why there is none, and when it can not be.
+    """The link of one session to its router: logs why it is down, and raises on evidence against
+    it.
 
-    The absence of an answer never ends a process: a router that is gone, stopped or behind a bad
-    radio link is waited for without limit, and the reason is logged. Only evidence raises
-    `BusError`: what a handshake found (`team.wire.zenoh.handshake`), or the router's own statement
-    that its roster does not have our certificate. Zenoh connects a revoked certificate, too, and
-    drops its messages silently; so each new link is followed by that query.
+    Silence never ends a process: a router that is gone, stopped or behind a bad radio link is
+    waited for without limit. Only evidence raises `BusError`: the result of a handshake
+    (`team.wire.zenoh.handshake`), or the router's statement that its roster lacks our certificate.
+    Zenoh connects a revoked certificate, too, and drops its messages silently; so each new link is
+    followed by that query.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:
@@ -144,7 +144,7 @@ class RouterLink:
         self._refused: str | None = None
 
     def look(self, now_s: float) -> None:
-        """Look at the link every LINK_S seconds; raises `BusError` on evidence against it."""
+        """Check the link every LINK_S seconds; raises `BusError` on evidence against it."""
         if self._refused is not None:
             raise BusError(self._refused)
         if now_s < self._due:
@@ -165,14 +165,14 @@ class RouterLink:
             return
         if router != self._accepted_by and not self._asking:
             self._ask_whether_accepted(router, self._keys)
-        # A link that comes up again just before the certificate's end Zenoh may keep behind it.
+        # Zenoh may keep a link that came up just before its certificate expired.
         if self._router_ends is None or time.time() > self._router_ends:
             self._examine(now_s)
         else:
             self._interval_s = LINK_S
 
     def _wait(self, now_s: float) -> None:
-        """Without a link: find out why, and log it now and then."""
+        """Examine a missing link, and log the reason at intervals."""
         if self._away_since is None:
             self._away_since, self._interval_s = now_s, LINK_S
         away_s = now_s - self._away_since
@@ -187,7 +187,7 @@ class RouterLink:
             )  # fmt: skip
 
     def _examine(self, now_s: float) -> None:
-        """Make a handshake on a thread of its own, at intervals that double."""
+        """Make a handshake on its own thread, at intervals that double."""
         running = self._examining is not None and self._examining.is_alive()
         if running or now_s < self._examine_due:
             return

@@ -1,17 +1,15 @@
-"""The samples of a team that a router stores for processes that were absent: ends and orders.
+"""Samples of a team that a router stores for absent processes: ends and orders.
 
-A stored sample keeps its key, bytes and attachment, so that its author remains who published it:
-with keys the router's access control has let only that node publish on the key. Its receiver
-interprets a sample. A sample is decoded and checked before it is stored, and an
-end that another author publishes replaces no end but its own.
+A stored sample keeps its key, bytes and attachment, and thereby its author: with keys, access
+control lets only that node publish on the key. It is decoded and checked before it is stored, and
+an end replaces only an end of the same author.
 
-Ends (`ENDS`: the centre's final map; without a centre each robot's own final map and conclusion)
-are stored until their author publishes another one. A starting process can not determine by itself
-whether it belongs to the run that has ended or to a new one. The router stores which nodes of that
-run never announced their end (`Tally`): a node of that name missed the end, and is sent it until
-one of its processes announces its end. Orders of operators who have left (a robot withdrawn or
-given up, verdicts on landmarks, the end of a live team) are valid until the centre's final map, or
-until no process of the team is present any more.
+Ends (`ENDS`: the centre's final map; without a centre each robot's final map and conclusion) are
+stored until their author publishes another. A starting process cannot tell whether it belongs to
+the finished run or to a new one. The router stores which nodes of that run never announced their
+end (`Tally`): a node of that name is sent the end until one of its processes announces its own.
+Orders of operators who have left (a robot withdrawn or given up, verdicts on landmarks, the end of
+a live team) are valid until the centre's final map, or until no process of the team is present.
 """
 
 import threading
@@ -23,21 +21,17 @@ from team.wire.codec import WireError, decoded, encoded
 from team.wire.messages import FusedMap, Kept, KeptRequest
 
 MOST_ORDERS = 10_000
-"""Number of orders to a team that are stored, signatures included; an operator who gives more has
-to repeat the others.
-"""
+"""Most stored orders to a team, signatures included; others must be repeated."""
 MOST_ENDS = 400
-"""Number of keys on which ends are stored: two for each robot of the largest team, and others."""
+"""Most keys of stored ends: two per robot of the largest team, and others."""
 
 MOST_NODES = 1_000
-"""Number of nodes of a team whose last words are awaited."""
+"""Number of nodes of a team whose end is tracked."""
 
 
 @dataclass(frozen=True)
 class _End:
-    """A stored end: its channel, the monotonic time of its arrival [s], its reply, and the nodes
-    that missed it.
-    """
+    """A stored end: channel, monotonic time of arrival [s], reply, and the nodes that missed it."""
 
     channel: str
     since_s: float
@@ -47,9 +41,7 @@ class _End:
 
 @dataclass
 class StoredMessages:
-    """The stored messages of one team. Calls may come from any thread; times are a monotonic
-    clock's [s].
-    """
+    """Stored messages of one team. Calls come from any thread; times are monotonic [s]."""
 
     _there: set[str] = field(default_factory=set, init=False)
     _silent: set[str] = field(default_factory=set, init=False)
@@ -59,9 +51,7 @@ class StoredMessages:
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def token(self, node: str, *, alive: bool) -> bool:
-        """Records that a node's liveliness token appears or disappears; returns whether the node
-        crashed.
-        """
+        """Record a node's liveliness token; returns whether the node crashed."""
         with self._lock:
             if alive:
                 self._there.add(node)
@@ -74,16 +64,14 @@ class StoredMessages:
             return node in self._silent
 
     def last_word(self, node: str) -> None:
-        """Records that a process of this node ends in order, so that it does not need the end of
-        the team any more.
-        """
+        """Record the orderly end of a node's process, which needs no stored end."""
         with self._lock:
             self._silent.discard(node)
             for end in self._ends.values():
                 end.missed_by.discard(node)
 
     def take(self, sample: Sample, now_s: float) -> None:
-        """Stores an end or an order. Raises `WireError` where it is no valid one."""
+        """Store an end or an order; raises `WireError` for an invalid one."""
         channel, _, message = opened(sample)
         kept = Kept(
             stamp_ns=sample.stamp_ns,
@@ -122,7 +110,7 @@ class StoredMessages:
         self._named.clear()
 
     def answer(self, request: KeptRequest, now_s: float) -> list[bytes]:
-        """The stored samples that a node requests, the oldest first, as payloads of `Kept`."""
+        """Stored samples for a node, the oldest first, as payloads of `Kept`."""
         with self._lock:
             orders = [reply for reply, name in self._orders.items() if name in request.channels]
             ends = [

@@ -153,7 +153,7 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
         recorder.write(own)
     status, _, err = run("export", alone, "--format", "utias", "-o", tmp_path / "out")
     assert status == 2
-    assert "r1.mcap: it sights r2, of whom it has no measurements; `teamslam log merge`" in err
+    assert "r1.mcap: it has sightings of r2 but not their measurements; `teamslam log merge`" in err
     with Recorder(tmp_path / "gap.mcap", "small", {}) as recorder:
         recorder.write([s for s in own if s.counter != 3 and "sight" not in s.key])
     status, _, err = run("export", tmp_path / "gap.mcap", "--format", "utias", "-o", tmp_path / "o")
