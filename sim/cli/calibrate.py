@@ -1,4 +1,4 @@
-"""The command `teamslam calibrate`: learns the parameters of the models from measurements."""
+"""Command `teamslam calibrate`."""
 
 from pathlib import Path
 from typing import Annotated

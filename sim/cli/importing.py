@@ -1,4 +1,4 @@
-"""The command `teamslam import`."""
+"""Command `teamslam import`."""
 
 import shutil
 import time
@@ -15,7 +15,7 @@ app = typer.Typer()
 ROS2_PROFILE = b"ros2"
 BAG_FILES = (".mcap", ".db3")
 HEAD = 64
-"""Bytes in which an MCAP file names its profile."""
+"""Bytes that contain an MCAP file's profile."""
 
 
 @app.command(name="import")
@@ -74,7 +74,7 @@ def import_(
         report = import_data(request, output)
         elapsed_s = time.monotonic() - began
         notes = dict.fromkeys([*report.notes, *_as_read(output)])  # each once
-    except BaseException:  # half a data set is none, and the next attempt may have its folder
+    except BaseException:  # remove a partial data set, whose folder the next attempt may use
         shutil.rmtree(output, ignore_errors=True)
         raise
     for note in notes:
@@ -86,12 +86,12 @@ def import_(
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a data set must be imported before a team can run on it: a ROS 2 bag or a log."""
+    """Whether a data set must be imported first: a ROS 2 bag or a log."""
     return path.suffix in BAG_FILES or _is_bag_folder(path)
 
 
 def _is_bag_folder(path: Path) -> bool:
-    """Whether it has a bag's metadata.yaml, or nothing but a bag's files."""
+    """Whether it has a bag's metadata.yaml, or only a bag's files."""
     if (path / "metadata.yaml").is_file():
         return True
     inside = {each.suffix for each in path.iterdir()} if path.is_dir() else set()
@@ -99,7 +99,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 
 def imported_into(path: Path, folder: Path) -> Path:
-    """Import a bag or a log; returns the folder, and prints what was imported."""
+    """Import a bag or log and print a summary; returns the folder."""
     from sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
@@ -112,9 +112,7 @@ def imported_into(path: Path, folder: Path) -> Path:
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """Import a ROS 2 bag into a temporary data set and return that; anything else is returned as
-    it is.
-    """
+    """Import a ROS 2 bag into a temporary data set; other paths are returned unchanged."""
     from tempfile import TemporaryDirectory
 
     from team.recording.reader import log_file
@@ -142,7 +140,7 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 
 def _as_read(folder: Path) -> list[str]:
-    """The measurements of each robot, and the notes on unusable rows of its tables."""
+    """Measurements of each robot, and notes on unusable rows."""
     from central.desk.evaluation.clocks import separate_times_warning
     from sim.datasets.tables import DatasetError
     from sim.scenarios.scenario import load, with_options

@@ -1,4 +1,4 @@
-"""`teamslam keys`: the certificates of a team."""
+"""Command `teamslam keys`."""
 
 from pathlib import Path
 from typing import Annotated

@@ -361,7 +361,7 @@ def record(
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
     configurations = []
-    if resolved.is_live:  # other teams' recorders save its 105 MB
+    if resolved.is_live:  # saves other teams' recorders its 105 MB
         from team.wire.digest import configured
 
         configurations = [configured("world", 0, 0, resolved)]
@@ -391,7 +391,7 @@ def record(
 
 
 def _joined(log: Path) -> list[Path]:
-    """Join the parts of a log; name those that remain, with the remedy."""
+    """Join the parts of a log; name remaining parts, with the remedy."""
     from team.recording.parts import join
 
     parts = join(log)
@@ -408,13 +408,12 @@ def _joined(log: Path) -> list[Path]:
 
 
 def _fail_if_provisional(parts: Sequence[Path]) -> None:
-    """End with 1 where the final map lacks robots."""
     if lacks := _lacking_in(parts):
         fail(lacks, FAILED)
 
 
 def _lacking_in(parts: Sequence[Path]) -> str:
-    """The robots that are missing in the final map of a log, in words; empty: none."""
+    """Robots missing in the final map of a log, as text."""
     from team.recording.reader import LogError, open_log
     from team.shell import lacking
     from team.wire.channels import FINAL_MAP, TEAM_FINAL

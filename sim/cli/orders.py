@@ -1,4 +1,4 @@
-"""Commands by which an operator asks or orders a running team: map, withdraw, verdict, end."""
+"""Commands that ask or order a running team: map, withdraw, verdict, end."""
 
 from typing import Annotated
 

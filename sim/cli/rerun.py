@@ -1,4 +1,4 @@
-"""Commands that compute a log again: rerun and verify-ledger."""
+"""Commands that recompute a log: rerun and verify-ledger."""
 
 import math
 import time
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 OFFENDERS = 20
-"""Most violations that are printed; the JSON file has all."""
+"""Most printed violations; the JSON file has all."""
 
 
 @app.command()
@@ -228,7 +228,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 def _print_warnings(
     recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
 ) -> None:
-    """Print the warnings and notes of the computed run, as `launch` does."""
+    """Print the computed run's warnings and notes, like `launch`."""
     from central.desk.report.run import nis_line
 
     lines = [f"warning: {warning}" for warning in changed.warnings]

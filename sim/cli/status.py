@@ -1,4 +1,4 @@
-"""`teamslam status`: the nodes of a running team."""
+"""Command `teamslam status`."""
 
 from typing import Annotated, Any
 
