@@ -106,7 +106,9 @@ def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> L
 
     progress: receives each robot's name before its measurements are replayed.
     """
-    offenders = [f"{_named(r)} is in the log twice, and not the same" for r in log.contradicted]
+    offenders = [
+        f"{_named(r)} is in the log twice with different contents" for r in log.contradicted
+    ]
     streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
     for stream in streams:
@@ -141,7 +143,7 @@ def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]
             continue
         if found.setdefault(submap.sequence, submap) != submap:
             name = f"submap {submap.sequence} of {robot}, incarnation {incarnation}"
-            wrong.append(f"{name} is in the log twice, and not the same")
+            wrong.append(f"{name} is in the log twice with different contents")
     return [found[k] for k in sorted(found)], wrong
 
 
@@ -154,8 +156,8 @@ def _entries(
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
     if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):
         raise RerunError(
-            f"{count:,} measurements of {robot}, incarnation {incarnation}, are spoken of, "
-            f"{len(measurements):,} are in the log: not believed"
+            f"{count:,} measurements of {robot}, incarnation {incarnation}, are announced, "
+            f"{len(measurements):,} are in the log: too many are missing to list"
         )
     holder: list[int | None] = [None] * count
     wrong = []
@@ -207,7 +209,7 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
         found = Counter(entry.disposition for entry in entries[: done.measurements])
         if not resumed and dict(found) != announced:
             yield (
-                f"{done.robot}, incarnation {done.incarnation} says {announced}, the log gives "
+                f"{done.robot}, incarnation {done.incarnation} reports {announced}, the log has "
                 f"{dict(found)}"
             )
 
@@ -231,7 +233,7 @@ def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
             if n > 1
         ]
         wrong += [
-            f"map {digest} uses submaps of {robot}, which it says is withdrawn"
+            f"map {digest} uses submaps of {robot}, which it lists as withdrawn"
             for robot, _ in streams
             if robot in fused.withdrawn
         ]

@@ -140,7 +140,7 @@ def give_up(
         folds = message.node == "central" or message.node.startswith("robot/")
         if folds and any(text.startswith(f"{robot} is given up") for text in message.warnings):
             return
-    raise WithdrawError(f"nobody has followed within {patience_s:g} s; the order stands")
+    raise WithdrawError(f"no confirmation within {patience_s:g} s; the order stands")
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:

@@ -132,7 +132,7 @@ def _by_truth(
     learnt = with_figures(scenario, of_motion, of_sensor, own.robots)
     folds = []
     for label, world in worlds:
-        progress(f"joined map of {label} with what was learnt")
+        progress(f"joined map of {label} with the calibrated models")
         team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
         folds.append(team.fold)
     marker = marker_spread(data, depth=depth)
@@ -204,7 +204,7 @@ def _by_the_map(
         learnt = with_figures(scenario, figures, ())
     teams = []
     for label, world in worlds:
-        progress(f"joined map of {label} with what was learnt")
+        progress(f"joined map of {label} with the calibrated models")
         teams.append(joined_team(world, learnt))
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:

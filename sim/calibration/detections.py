@@ -236,7 +236,7 @@ def claim_notes(
     detected = value.get("detection_probability")
     if detected is not None and abs(detected - settings.detection_probability) > UNLIKE:
         notes.append(
-            f"{detected:.0%} of the landmarks in view are detected, the scenario says "
+            f"{detected:.0%} of the landmarks in view are detected, the scenario has "
             f"{settings.detection_probability:.0%}"
         )
     return tuple(notes)

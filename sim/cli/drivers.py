@@ -36,7 +36,7 @@ AT_ONCE = 500
 @app.command()
 def driver(
     robot: Annotated[str, typer.Argument(help="The robot's name, as r1.")],
-    ros2: Annotated[Path, typer.Option(help="TOML file: which topics are what.", metavar="FILE")],
+    ros2: Annotated[Path, typer.Option(help="TOML file that assigns topics.", metavar="FILE")],
     team: Annotated[str, typer.Option(help="The team's name: its scenario's.")],
     connect: Connect = LOOPBACK,
     ros2_connect: Annotated[

@@ -39,10 +39,10 @@ def import_(
         ),
     ] = None,
     columns: Annotated[
-        Path | None, typer.Option(help="TOML file: which columns are what.", metavar="FILE")
+        Path | None, typer.Option(help="TOML file that maps columns.", metavar="FILE")
     ] = None,
     ros2: Annotated[
-        Path | None, typer.Option(help="TOML file: which topics are what.", metavar="FILE")
+        Path | None, typer.Option(help="TOML file that assigns topics.", metavar="FILE")
     ] = None,
     truth: Annotated[
         Path | None,

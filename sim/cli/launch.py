@@ -227,9 +227,7 @@ def _keep_showing(url: str, log: Path) -> None:
     """Serve the page until the user ends the command."""
     from team.shell import process
 
-    with process(
-        "launch", endless=True
-    ) as stop:  # the printed line names Ctrl-C, which may follow at once
+    with process("launch", endless=True) as stop:  # Ctrl-C may follow the line at once
         typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
         stop.wait()
 

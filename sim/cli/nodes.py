@@ -76,7 +76,7 @@ def router(
     at = over_tls(listen) if keys else listen
     with process("router", endless=True) as stop, zenoh_router(at, own) as endpoint:
         if own is not None and own[1].revoked:
-            _LOG.info("revoked, and not let in: %s", ", ".join(sorted(own[1].revoked)))
+            _LOG.info("revoked and refused: %s", ", ".join(sorted(own[1].revoked)))
         typer.echo(f"listening at {endpoint}")
         while not stop.wait(1.0):
             if own is not None and time.time() > own[0].ends.timestamp():

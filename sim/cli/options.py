@@ -76,8 +76,8 @@ Peers = Annotated[
 Pieces = Annotated[
     int | None,
     typer.Option(
-        help="Cut the log of a data set of one robot into so many robots, which do not know where "
-        "they begin.",
+        help="Cut the log of a data set of one robot into this many robots with unknown "
+        "initial poses.",
         min=1,
         max=100,
         metavar="N",

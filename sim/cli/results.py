@@ -22,7 +22,7 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
     from central.desk.report.run import Run
     from central.desk.verification.recorded import RerunError, recorded
 
-    steps.begin("reading what the robots received")
+    steps.begin("reading the robots' inputs")
     messages = recorded(log)
     found, why = None, Run.no_ledger
     if proves_ledger:

@@ -226,7 +226,7 @@ def _number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        comma = "; decimals have a point, thousands nothing" if "," in text else ""
+        comma = "; use a decimal point and no thousands separator" if "," in text else ""
         raise ValueError(f"{text[:SHOWN]!r} is not a number{comma}") from None
     if not isfinite(value):
         raise ValueError(f"{text[:SHOWN]!r} is not finite")

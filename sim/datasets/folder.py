@@ -165,7 +165,7 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
     if len(intervals.end_ns):
         driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
     else:
-        notes.append("no odometry: only what it saw is given")
+        notes.append("no odometry: only its observations are used")
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
     unnamed = _within(detections_of(place, robot), driven)

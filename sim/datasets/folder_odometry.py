@@ -53,7 +53,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     form = forms[0]
     rows.drop(
         np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
-        "another row has the same time, so it lasts no time",
+        "another row has the same time",
     )
     _drop_other_clocks(rows)
     stamps = rows.stamps_ns + offset_ns
@@ -148,7 +148,7 @@ def _without_resets(
     rows.note(
         np.append(False, reset),
         f"at which its pose jumps, by {lengths[reset].max():.1f} m at most: its odometry was reset "
-        "there, or the row is wrong; it is taken to have moved on as before",
+        "there, or the row is wrong; the previous motion is assumed",
     )
     return np.where(reset[:, np.newaxis], rates * seconds[:, np.newaxis], steps)
 

@@ -75,7 +75,7 @@ def log_of(
     measurements, measurement_notes = measurements_of(measured, subject_of)
     truth_ns, truth, truth_notes = truth_of(true_rows)
     missing = (
-        "no odometry: only what it saw is given" if not len(intervals.end_ns) else "",
+        "no odometry: only its observations are used" if not len(intervals.end_ns) else "",
         "no measurements: only its odometry is given" if not len(measurements.stamps_ns) else "",
         "no ground truth: its trajectory's error can not be computed" if not len(truth) else "",
     )

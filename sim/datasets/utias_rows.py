@@ -42,7 +42,7 @@ def intervals_of(
         count_note(
             int(np.count_nonzero(~lasting)),
             "odometry row",
-            "dropped: another row has the same time, so it lasts no time",
+            "dropped: another row has the same time",
         ),
     ]
     if np.any(duration > LONG_GAP_NS):

@@ -49,7 +49,7 @@ def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
 
 def _question(path: Path, bag: Bag, found: Proposal) -> str:
     return (
-        f"{path}: which topics are what?\n{listing(bag.topics)}\n"
+        f"{path}: the topics are ambiguous.\n{listing(bag.topics)}\n"
         + "".join(f"{doubt}\n" for doubt in found.warnings)
         + "Write it into a file, as topics.toml, beginning with this:\n\n"
         + as_toml(found)

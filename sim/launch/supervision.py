@@ -118,7 +118,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
         watch.restarts[service.name] = service.restarts + 1
         watch.note(f"{ended.name} (pid {ended.pid}) {ended.how}: it is started again")
         return
-    deaths = f"it died {service.fruitless} times without getting any further, and is given up"
+    deaths = f"it died {service.fruitless} times without progress, and is given up"
     watch.given_up.append(service.name)
     watch.failures.append(f"{failure(ended)}; {deaths}")
     node = node_of(service.name)
@@ -151,7 +151,7 @@ def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
             name = f"{service.name} (pid {service.child.pid})"
             stopped = ", since it was stopped" if service.child.is_stopped else ""
             watch.failures.append(
-                f"{name} had not left after the final map, and nothing moved for {LEAVING_S:g} s"
+                f"{name} had not left after the final map, with no activity for {LEAVING_S:g} s"
                 f"{stopped}: it was ended"
             )
 
@@ -221,7 +221,7 @@ class Silence:
             self._last_note[MANY] = now
             named = ", ".join(service.name for service, _ in new[:FEW])
             watch.note(
-                f"{len(self._silent)} processes, {named} among them, have said nothing for "
+                f"{len(self._silent)} processes, {named} among them, have sent no message for "
                 f"{SILENT_S:.0f} s: this computer may be too busy for the team, which goes on "
                 "slower"
             )
@@ -234,7 +234,7 @@ class Silence:
         restart = f". To have it started again: kill -9 {pid}"
         remedy = restart if stands_still and state != COMPUTING else ""
         watch.note(
-            f"{service.name} (pid {pid}) {state} and has said nothing for {silent_s:.0f} s: "
+            f"{service.name} (pid {pid}) {state} and has sent no message for {silent_s:.0f} s: "
             f"the team may wait for it{remedy}"
         )
 

@@ -107,7 +107,7 @@ class Watch:
                     f"teamslam end --without {robot} {self.place}"
                 )
             elif status.state == "waiting":
-                yield f"the driver of {robot} is there and has handed over no odometry yet"
+                yield f"the driver of {robot} is running and has sent no odometry yet"
 
     @property
     def missing_robots(self) -> list[str]:

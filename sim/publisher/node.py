@@ -383,9 +383,7 @@ class WorldNode:
         warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
         if self._blocked_by is not None and self._clock_s - self._blocked_by[1] >= BLOCKED_S:
             who, since = self._blocked_by
-            warnings = (
-                f"{who} holds the team up: it has got no further for {self._clock_s - since:.0f} s",
-            )
+            warnings = (f"{who} blocks the team: no progress for {self._clock_s - since:.0f} s",)
         return m.Status(
             stamp_ns=self.now_ns,
             node="world",

@@ -76,7 +76,7 @@ def check_known(name: str, known: list[str], at: str) -> None:
     where = f"at {at}" if at else "at the top"
     hint = close(name, known)
     if name in TOP_LEVEL:
-        hint = f"; `{name}` is said once for the whole team, at the top of the file"
+        hint = f"; `{name}` is set once for the whole team, at the top of the file"
     raise ScenarioError(f"unknown field `{name}` {where}; known: {', '.join(known)}{hint}")
 
 

@@ -47,8 +47,8 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
         return folder(scenario.world, scenario.robots)
     if isinstance(scenario.world, LiveWorld):
         raise ScenarioError(
-            f"{scenario.name}: a live team has no world: its robots' drivers say what they "
-            "measure (docs/your_robot.md); for recorded data give --dataset"
+            f"{scenario.name}: a live team has no world: its robots' drivers publish the "
+            "measurements (docs/your_robot.md); for recorded data give --dataset"
         )
     return utias(scenario.world, scenario.robots)
 

@@ -77,13 +77,13 @@ def credentials_of(
         if found.not_valid_after_utc <= now:
             raise KeysError(
                 f"{path}: expired at {found.not_valid_after_utc:%Y-%m-%d %H:%M} UTC "
-                f"(this machine's clock says {now:%Y-%m-%d %H:%M}): renew it by "
+                f"(this machine's clock reads {now:%Y-%m-%d %H:%M}): renew it by "
                 f"`teamslam keys TEAM -o DIR --renew {node}` and copy it, or put the clock right"
             )
         if found.not_valid_before_utc > now:
             raise KeysError(
                 f"{path}: not valid before {found.not_valid_before_utc:%Y-%m-%d %H:%M} UTC; this "
-                f"machine's clock says {now:%Y-%m-%d %H:%M}: put the clock right"
+                f"machine's clock reads {now:%Y-%m-%d %H:%M}: put the clock right"
             )
     common, owner = _named(certificate)
     if not re.fullmatch(rf"{re.escape(node)}(\.\d+)?", common):

@@ -188,7 +188,7 @@ class Inventory:
                 lost = sum(last - first + 1 for first, last in missing)
                 yield key, f"{lost} {kind} {of} missing: {intervals(missing)}"
             if found.contradicted:
-                yield key, f"{found.contradicted} {kind} {of} there twice, and not the same"
+                yield key, f"{found.contradicted} {kind} {of} present twice with different contents"
 
 
 def _name(sample: Sample) -> int:

@@ -130,7 +130,7 @@ class Log:
                     raise ValueError("a message without its times")
                 number, sequence, log_time, wall_ns = unpack(data, start)
                 if number not in keys:
-                    raise ValueError(f"message on channel {number}, which nothing describes")
+                    raise ValueError(f"message on undeclared channel {number}")
                 if (key := keys[number]) is not None:
                     payload = data[start + size : end]
                     stamp_ns = log_time or _stamp_in(payload)

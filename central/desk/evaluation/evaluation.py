@@ -325,7 +325,7 @@ def _never_came(log: Collected) -> list[str]:
         if lost and math.isfinite(lost):
             warnings.append(
                 f"{robot}: {lost:,.0f} messages of its topics are not in its stream, beside "
-                f"{figures.get('messages', 0.0):,.0f} that are; its driver's warnings say why"
+                f"{figures.get('messages', 0.0):,.0f} that are; see its driver's warnings"
             )
     return warnings
 

@@ -41,7 +41,7 @@ def robot_states(
         if name in fused.withdrawn:
             return RobotState("withdrawn", because.get(name, UNNAMED_REASON))
         if name in fused.lost:
-            return RobotState("lost", "its stream is not wholly in the map")
+            return RobotState("lost", "its stream is incomplete in the map")
         if name in apart:
             return RobotState("not joined", apart[name])
         if name in members:

@@ -176,7 +176,7 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhline(1.0, color="#888888", linewidth=0.8)
     _scale(axis, max(largest, *highs, 1.5))
     axis.set_ylabel("NIS per dof")
-    axis.set_title("Measurements against what the particles expected: needs no truth", fontsize=10)
+    axis.set_title("Measurements against the particles' predictions: needs no truth", fontsize=10)
 
 
 def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:

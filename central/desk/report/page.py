@@ -273,7 +273,7 @@ def _measurements(run: Run) -> list[str]:
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
         tables = _sheet(disposition_sheet(ledgers)) if any(ledgers.values()) else []
-        return [*tables, _note(f"As the robots report it. The ledger: {run.no_ledger}.")]
+        return [*tables, _note(f"As reported by the robots. The ledger: {run.no_ledger}.")]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())

@@ -101,7 +101,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     """Team figures: name and value."""
     fused = evaluation.map
     if fused is None:
-        return [("final map", "none: the run did not come to its end")]
+        return [("final map", "none: the run did not finish")]
     errors, arbitrary = fused.errors, evaluation.arbitrary_frame
     states = state_rows(evaluation)
     if not len(fused.ids) and fused.reasons:

@@ -66,8 +66,8 @@ class Drawn(NamedTuple):
         text = f"{self.own + self.views} messages, {self.views} of them views"
         if self.before and self.before != self.views:
             text += (
-                f" ({self.before} in the log: a viewer of the run draws nothing of what comes "
-                "before it has joined and after it has left)"
+                f" ({self.before} in the log: a viewer of the run draws only what it "
+                "receives between joining and leaving)"
             )
         return text
 
