@@ -121,7 +121,6 @@ def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> L
 
 
 def _withdrawn(log: Recorded) -> tuple[str, ...]:
-    """Robots withdrawn in the last map."""
     last = next(iter(reversed((*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)))), None)
     return last.withdrawn if isinstance(last, m.FusedMap) else ()
 

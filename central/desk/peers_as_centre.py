@@ -97,7 +97,6 @@ class PeersAsCentre:
         self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
 
     def _agreed(self) -> Sample | None:
-        """Final map, once all peers agree."""
         agreed = self.agreement.agreed
         if agreed is None or agreed.payload == self._final:
             return None
@@ -132,7 +131,6 @@ class PeersAsCentre:
 
 
 def _withdrawn(sample: Sample) -> str | None:
-    """Robot withdrawn by a peer's fold."""
     try:
         return decoded(sample.payload, m.Withdrawal).robot
     except WireError:

@@ -287,8 +287,6 @@ def _alarms(figures: Sequence[Figure], scenario: Scenario) -> tuple[str, ...]:
 
 
 def _mistrusting(scenario: Scenario) -> Scenario:
-    """Multiply the scenario's odometry noise densities by MISTRUST."""
-
     def wider(noise: MotionNoise) -> MotionNoise:
         fields = msgspec.structs.asdict(noise)
         return MotionNoise(**{name: MISTRUST * value for name, value in fields.items()})

@@ -91,7 +91,6 @@ def is_foreign(path: Path) -> bool:
 
 
 def _is_bag_folder(path: Path) -> bool:
-    """Whether it has a bag's metadata.yaml, or only a bag's files."""
     if (path / "metadata.yaml").is_file():
         return True
     inside = {each.suffix for each in path.iterdir()} if path.is_dir() else set()
@@ -132,7 +131,6 @@ def readable(path: Path) -> Iterator[Path]:
 
 
 def _is_ros2_mcap(path: Path) -> bool:
-    """Whether it is an MCAP file written by ROS 2."""
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:

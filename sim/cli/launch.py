@@ -248,7 +248,6 @@ def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStre
 
 
 def _time_warnings(streams: "WorldStreams | None") -> list[str]:
-    """Warnings about implausible time units or different clocks."""
     if streams is None:
         return []
     from central.desk.evaluation.clocks import separate_times_warning

@@ -225,7 +225,6 @@ def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Expo
 
 
 def _channels(names: str | None) -> "list[Channel] | None":
-    """Channels by name; exits at an unknown name."""
     if names is None:
         return None
     from team.wire.channels import CHANNELS

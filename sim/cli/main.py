@@ -94,7 +94,6 @@ class _Plain:
 
 
 def _is_checked(path: Any, checks: Any) -> bool:
-    """Whether Typer checks a path."""
     restricted = checks.exists or checks.writable or not (checks.file_okay and checks.dir_okay)
     return (
         restricted or checks.resolve_path or (os.path.exists(path) and not os.access(path, os.R_OK))

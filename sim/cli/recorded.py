@@ -151,7 +151,6 @@ def report(
 
 
 def _width(text: str | None, look: Look | None) -> float | None:
-    """Width of paper pictures [inches]."""
     if text is None:
         return None
     if look is not Look.PAPER:

@@ -228,7 +228,6 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 def _print_warnings(
     recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
 ) -> None:
-    """Print the computed run's warnings and notes, like `launch`."""
     from central.desk.report.run import nis_line
 
     lines = [f"warning: {warning}" for warning in changed.warnings]

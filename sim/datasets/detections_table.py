@@ -124,7 +124,6 @@ def _where(seen: Detections, chosen: np.ndarray) -> Detections:
 
 
 def _any(values: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
-    """Chosen rows; None if all are NaN."""
     return None if values is None or np.isnan(values[rows]).all() else values[rows]
 
 

@@ -193,7 +193,6 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
 
 
 def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detections | None:
-    """Scans between these times."""
     if seen is None or driven is None:
         return seen
     first, last = np.searchsorted(seen.stamps_ns, [driven[0], driven[1] + 1])
@@ -230,7 +229,6 @@ def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> R
 
 
 def _with_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:
-    """Add empty messages at these times."""
     empty_ns = np.setdiff1d(empty_ns, seen.stamps_ns)
     stamps = np.concatenate([seen.stamps_ns, empty_ns])
     counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(empty_ns), np.int64)])

@@ -178,7 +178,6 @@ def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray
 
 
 def _filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, " rows"]:
-    """Mask of rows with these columns filled."""
     if not table.has(*columns):
         return np.zeros(len(table), np.bool_)
     return np.asarray(~np.isnan(table.known_numbers(*columns)).any(axis=1))

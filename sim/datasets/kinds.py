@@ -41,7 +41,6 @@ def kind_of(path: str | Path) -> Kind:
 
 
 def _other_tables(place: Path) -> list[str]:
-    """CSV files of a folder and its sub-folders."""
     if not place.is_dir():
         return []
     found = [*sorted(place.glob("*.csv")), *sorted(place.glob("*/*.csv"))]

@@ -71,7 +71,6 @@ def optional_table(
 
 
 def _damage(name: str, lines: list[str], columns: tuple[str, ...], otherwise: str) -> DatasetError:
-    """Error of the first bad line."""
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].split()
         problem = _problem(words, columns) if words else None

@@ -193,7 +193,6 @@ def _of_steps(
 def _columns(
     polar: Float[np.ndarray, "R 2"],
 ) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
-    """Ranges, and bearings in (−π, π]."""
     return polar[:, 0].copy(), np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi)
 
 

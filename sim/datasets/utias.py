@@ -79,7 +79,6 @@ def _streams(
 
 
 def _subjects(barcodes: Float[np.ndarray, "B 2"]) -> dict[int, int]:
-    """Map barcodes to subjects."""
     if not len(barcodes) or np.any(barcodes != np.rint(barcodes)) or np.any(barcodes < 0):
         raise DatasetError("Barcodes.dat: expected rows of two whole numbers, subject and barcode")
     subject_of = {int(code): int(subject) for subject, code in barcodes}

@@ -96,7 +96,6 @@ def _odometry_rows(stream: RobotStream) -> list[Row]:
 
 
 def _measured_rows(stream: RobotStream, number: Mapping[str, int], shift: int) -> list[Row]:
-    """Landmarks and teammates by time, as barcodes."""
     subject_of = np.array([number[name] for name in stream.teammates], dtype=np.int64)
     landmarks, teammates = stream.landmark_detections, stream.teammate_detections
     subjects = (landmarks.ids.astype(np.int64) + shift, subject_of[teammates.ids])

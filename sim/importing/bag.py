@@ -149,7 +149,6 @@ def _static_frames(bag: Bag, odometry: str) -> Frames:
 
 
 def _records(bag: Bag, topics: Collection[str]) -> Iterator[Record]:
-    """Valid messages of these topics."""
     for raw in bag.messages(topics):
         try:
             yield decode(raw.kind, raw.data, bag.store)

@@ -58,7 +58,6 @@ def _question(path: Path, bag: Bag, found: Proposal) -> str:
 
 
 def _proposed(bag: Bag, robot: str | None) -> Proposal:
-    """Topics of each robot as proposed by names, types and frames."""
     found = bag.topics
     tagged = _tags_in(bag)
     bases = {topic.name: _base_in(bag, topic) for topic in found if topic.kind in ODOMETRY}
@@ -167,7 +166,6 @@ def _robot_name(space: str, robot: str | None) -> str:
 
 
 def _tags_in(bag: Bag) -> set[str]:
-    """Transform topics that contain tags."""
     found = set()
     for topic in bag.topics:
         if topic.kind != TRANSFORMS or topic.name.rpartition("/")[2] == STATIC:

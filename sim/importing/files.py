@@ -137,7 +137,6 @@ def _texts(numbers: Float[np.ndarray, " rows"]) -> list[str]:
 
 
 def _joined(tables: Sequence[CsvTable]) -> CsvTable:
-    """Join tables side by side, by row."""
     first = tables[0]
     columns = dict(first.columns)
     for other in tables[1:]:

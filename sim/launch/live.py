@@ -227,7 +227,6 @@ def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
 
 
 def _map_lines(watch: Watch) -> list[str]:
-    """Contents and warnings of the team's map."""
     fused, central = watch.fused, watch.statuses.get("central")
     if fused is None:
         return ["no fused map yet"]

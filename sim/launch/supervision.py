@@ -46,7 +46,6 @@ def node_of(name: str) -> str:
 
 
 def _is_needed(name: str, watch: Watch) -> bool:
-    """Whether the map requires this process."""
     return name in _WITHOUT_IT_NO_MAP and not (name == "central" and watch.peers)
 
 

@@ -109,7 +109,6 @@ class LiveErrors:
         robot.judge()
 
     def _take_map(self, fused: m.FusedMap) -> None:
-        """Replace the map."""
         self.landmarks = NeesTally()
         if self._frames.has(fused.frame) and (fit := self._truth.fit(fused)) is not None:
             self.landmarks.take(fit.nees, 2)

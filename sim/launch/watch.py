@@ -185,7 +185,6 @@ class Watch:
 
 
 def _robot(status: m.Status) -> str:
-    """Robot of a driver's status."""
     return status.node.removeprefix("source/")
 
 

@@ -142,7 +142,6 @@ def _sightings(t: s.SightingMeasurement, name: Name) -> m.Sightings:
 
 
 def _odometry(odometry: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
-    """An interval in its odometry's form."""
     if odometry.increment is not None:
         return m.Increment(
             **name,

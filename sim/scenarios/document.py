@@ -114,7 +114,6 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
 
 
 def _unnamed(world: Fields, count: object) -> list[Fields]:
-    """Robots of a document that names none."""
     if count is not None:
         return [{}] * checked_count(count)
     if world.get("kind") == "folder":

@@ -62,7 +62,6 @@ def _rows(
     *,
     hidden: bool,
 ) -> Detections:
-    """Restrict every message to the chosen rows."""
     count = len(seen.stamps_ns)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(message[chosen], minlength=count))))
     was = seen.hidden

@@ -63,7 +63,6 @@ def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
 
 
 def _positions(stream: RobotStream, times: Int64[np.ndarray, " T"]) -> Float[np.ndarray, "T 2"]:
-    """True positions, linearly interpolated."""
     if stream.truth is None or stream.truth_ns is None or not len(stream.truth):
         raise ValueError(f"radio.comm_range_m needs the truth of {stream.robot}: there is none")
     x, y = (np.interp(times, stream.truth_ns, stream.truth[:, axis]) for axis in (0, 1))

@@ -239,7 +239,6 @@ def _observations(
     stamps_ns: Int64[np.ndarray, " K_plus_1"],
     seed: int,
 ) -> Detections:
-    """One, possibly empty, landmark message for each step."""
     first = 0 if world.observe_at_start else 1
     at_ns = stamps_ns[first:]
     seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
@@ -366,7 +365,6 @@ def _visible(
 
 
 def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
-    """True visibility ranges of the world, or else the sensor's limits."""
     nearest = sensor.min_range if world.visible_from_m is None else world.visible_from_m
     farthest = sensor.max_range if world.visible_to_m is None else world.visible_to_m
     return nearest, farthest

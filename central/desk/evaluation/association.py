@@ -160,7 +160,6 @@ def _robots(log: Collected, channel: ch.Channel) -> list[str]:
 
 
 def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
-    """Labels by robot, scan stamp and row."""
     found: dict[tuple[str, int, int], int] = {}
     for robot in _robots(log, ch.TRUTH_LABELS):
         for message in log.messages(ch.TRUTH_LABELS, robot):
@@ -245,7 +244,6 @@ def _pairs(
 
 
 def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
-    """Number of pairs of equal rows."""
     if not len(rows):
         return 0
     _, counts = np.unique(rows, axis=0, return_counts=True)

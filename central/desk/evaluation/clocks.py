@@ -250,7 +250,6 @@ class _Pairs:
         return _turned(two[:, :2] - one[:, :2], -one[:, 2]), two[:, 2] - one[:, 2]
 
     def _again(self, late_ns: int) -> Float[np.ndarray, "k 2"]:
-        """D(τ)⁻¹ b_i."""
         d, turn = self._motion(late_ns)
         return _turned(self.b_i - d, -turn)
 

@@ -291,7 +291,6 @@ def _clocks(log: Collected) -> tuple[str, ...]:
 
 
 def _config(log: Collected, robot: str) -> RobotConfig:
-    """Announced configuration of a robot, or the default."""
     announced = log.sound(log.latest.get(ch.ROBOT_CONFIG.key(robot)))
     if isinstance(announced, m.Configuration):
         with suppress(msgspec.MsgspecError):
@@ -478,7 +477,6 @@ class _World(msgspec.Struct):
 
 
 def _data_set(log: Collected) -> str:
-    """Name of the measurements' folder or file; may be empty."""
     message = log.sound(log.last(ch.WORLD_CONFIG))
     if not isinstance(message, m.Configuration):
         return ""
@@ -592,7 +590,6 @@ def _own_map(
     true_ids: UInt32[np.ndarray, " T"],
     positions: Float[np.ndarray, "T 2"],
 ) -> MapErrors | None:
-    """Errors of the robot's last own map."""
     message = log.sound(log.latest.get(ch.OWN_MAP.key(robot)))
     if not isinstance(message, m.MapEstimate):
         return None
@@ -659,7 +656,6 @@ def _robot_result(
 
 
 def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> float | None:
-    """RMS position error of a path after a rigid motion."""
     true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None

@@ -67,7 +67,6 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
 
 
 def _detections(submap: m.Message) -> Iterator[tuple[tuple[str, int, int, int], int]]:
-    """Number of detections of each unnamed landmark of a submap."""
     assert isinstance(submap, m.Submap)
     numbers = ids(submap.ids, "ids")
     unnamed = (numbers[numbers >= UNNAMED] - UNNAMED).tolist()

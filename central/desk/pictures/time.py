@@ -369,7 +369,6 @@ def latency_picture(history: History, path: FilePath) -> bool:
 def _medians(
     history: History, stamps_ns: Int64[np.ndarray, " n"], values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
-    """Median in each non-empty BINS interval."""
     where = _bins(history, stamps_ns)
     filled = np.unique(where)
     middles = np.array([np.median(values[where == each]) for each in filled])

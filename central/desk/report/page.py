@@ -119,7 +119,6 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
 
 
 def _taken_home(run: Run, directory: Path) -> list[Path]:
-    """Write map and paths as tables; returns the files."""
     home, written = run.taken_home, []
     if run.evaluation.map is not None:
         written += write_map(
@@ -162,7 +161,6 @@ def _page(
 
 
 def _identities(run: Run) -> list[str]:
-    """Section on unnamed landmarks: scores, closures, merges."""
     evaluation = run.evaluation
     parts = [] if evaluation.association is None else _sheet(score_sheet(evaluation.association))
     return parts + (_sheet(decision_sheet(evaluation.decisions)) if evaluation.decisions else [])
@@ -193,7 +191,6 @@ def _notes(run: Run) -> str:
 
 
 def _own_maps(run: Run) -> list[str]:
-    """Robots' own maps, without a fused map."""
     return _sheet(own_sheet(run.evaluation)) if is_unfused(run.evaluation) else []
 
 

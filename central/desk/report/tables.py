@@ -143,7 +143,6 @@ def team_rows(evaluation: Evaluation) -> Rows:
 
 
 def _without_truth(evaluation: Evaluation) -> str:
-    """Reason for missing map errors."""
     if evaluation.map is not None and evaluation.map.matching is not None:
         return str(evaluation.map.matching)
     if not len(evaluation.true_landmarks):

@@ -81,7 +81,6 @@ def _recomputed(
 def _from_submaps(
     log: Recorded, kind: type[SubmapFold], maps: Sequence[m.FusedMap]
 ) -> Iterator[Outgoing]:
-    """Messages of maps whose inputs are submaps."""
     recorded = _RecordedSet(log)
     config, digest = log.central_config()
     fold: SubmapFold | None = None

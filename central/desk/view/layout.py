@@ -104,7 +104,6 @@ def _split(direction: str, first: object, second: object, percentage: int) -> di
 
 
 def _column(panels: Sequence[str]) -> object:
-    """Stack panels of equal height."""
     if len(panels) == 1:
         return panels[0]
     return _split("column", panels[0], _column(panels[1:]), round(100 / len(panels)))

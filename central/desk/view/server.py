@@ -98,7 +98,6 @@ class Feed:
         return bool(samples)
 
     def _faults(self) -> list[str]:
-        """Log faults, as text."""
         found = [] if self.error is None else [self.error]
         if self.tail.damaged:
             found.append(
