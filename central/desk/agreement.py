@@ -1,7 +1,6 @@
 """Final map of a team without a centre: the map on which all peers agree.
 
-A robot publishes its own final map and conclusion only. If peers differ, the team has no final map,
-and the differing peers are named.
+If peers differ, the team has no final map, and the differing peers are named.
 """
 
 import hashlib

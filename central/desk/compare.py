@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 Row = tuple[str, tuple[str, ...]]
 MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
-"""Colour and marker of the maps in `draw_maps`."""
 
 
 def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:

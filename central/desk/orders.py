@@ -20,7 +20,6 @@ CENTRE_S = 10.0
 """Time [s] within which a running centre or robot is detected."""
 LOOK_S = 0.05
 PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
-"""Channels of peers' own folds."""
 _LANDMARK = re.compile(rf"({ROBOT.pattern})/(\d+)/(\d+)/(\d+)")
 
 

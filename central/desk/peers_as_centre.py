@@ -30,7 +30,6 @@ LISTENS = (
     ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_WITHDRAWAL, ch.WORLD_CONFIG,
     *OF_AGREEMENT,
 )  # fmt: skip
-"""Channels that are presented, or that select the source."""
 _FOLD = "fold."
 _LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)
 """Used unless a centre has published them; a late centre may not replace them."""

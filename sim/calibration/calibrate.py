@@ -1,16 +1,15 @@
 """Calibrate odometry and sensor models from measurements.
 
-With truth, every figure is a maximum-likelihood estimate against the true poses and landmarks.
-Sensor constants are per robot where robots differ significantly (`own`).
+With truth, every figure is a maximum-likelihood estimate. Sensor constants are per robot where
+robots differ significantly (`own`).
 
 Without truth the reference is the joined map and its paths, in alternation (expectation and
-maximisation). The join trusts odometry less, so that ranges set the scale. Then only odometry
-scales, drag and veer are calibrated: a team cannot observe the scale of its own ranges.
+maximisation). The join trusts odometry less, so that ranges set the scale. Only odometry scales,
+drag and veer are calibrated: a team cannot observe the scale of its own ranges.
 
-Detections without identities give clutter and miss rates (`detections`), without labels.
-
-The submaps' consistency (`covariance_factor`, the monitor's `normal_scale`) is calibrated without
-truth in both cases, from maps of single robots (`consistency`).
+Detections without identities give clutter and miss rates (`detections`). Submap consistency
+(`covariance_factor`, the monitor's `normal_scale`) is calibrated without truth in both cases, from
+maps of single robots (`consistency`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -62,9 +61,8 @@ Progress = Callable[[str], None]
 class Calibration:
     """Calibrated figures by part of a robot's configuration, and notes.
 
-    robots: sensor figures of single robots. detections: clutter and misses. clocks:
-    `clock_offset_s` of every robot with enough measurements, if the two clocks of one differ. team:
-    robots of the data.
+    clocks: `clock_offset_s` of every robot with enough measurements, if the two clocks of one
+    differ.
     """
 
     motion: tuple[Figure, ...]

@@ -29,7 +29,6 @@ LEAST = 200
 """Least number of detections, and of odometry turns."""
 ROUNDS = 6
 STEP_NS = 10_000_000
-"""Time step of the derivative."""
 LARGEST_S = 2.0
 """Largest plausible clock offset."""
 BEYOND_DOUBT = 4.0

@@ -106,8 +106,7 @@ def factor_by_cost(
     """Factor, at least 1, that makes the map's joint cost equal its degrees of freedom.
 
     For too few robots: covers only errors that differ between windows. Landmarks are associated
-    anew under each factor, as a larger one accepts more. Standard deviation from χ². None without
-    degrees of freedom.
+    anew under each factor. Standard deviation from χ². None without degrees of freedom.
     """
     factor = central.covariance_factor
     for _ in range(MOST_ROUNDS):
@@ -126,9 +125,9 @@ def landmark_sigma(
 ) -> Figure | None:
     """σ [m] that explains the joined maps' shape errors: Σ χ²(σ) = Σ dof with covariances P + σ² I.
 
-    If robots' maps agree, the remaining error is common to all: they measure another point than the
-    surveyed one. teams: fold and true landmarks of each world. Standard deviation: half the range
-    of Σ χ² = Σ dof ± √(2 Σ dof). None without a shape; 0 if P suffices.
+    Robots whose maps agree share the remaining error: they measure another point than the surveyed
+    one. teams: fold and true landmarks of each world. Standard deviation: half the range of Σ χ² =
+    Σ dof ± √(2 Σ dof). None without a shape; 0 if P suffices.
     """
     settings = replace(join_settings(central), landmark_sigma=0.0)
     maps = []

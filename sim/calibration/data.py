@@ -28,9 +28,9 @@ FASTEST_TURN_RAD_S = 3.0
 class Reference:
     """One robot's odometry and landmark measurements, with reference poses and landmarks.
 
-    name: world label and robot id. gap_ns: longest interpolated gap of `path`. landmarks: positions
-    by id in the path's frame. teammates: paths of the others. mount: sensor pose on the base.
-    turns_first: between poses the robot turns, then drives straight (else an arc).
+    name: world label and robot id. gap_ns: longest interpolated gap of `path`. landmarks: in the
+    path's frame. mount: sensor pose on the base. turns_first: between poses the robot turns, then
+    drives straight (else an arc).
     """
 
     name: str
@@ -118,9 +118,12 @@ def poses_at(
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Path poses at these times, and a mask of known ones.
 
-    Between two poses the path is their arc: at a share s from (p, θ) the pose is (p + s
-    sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ). With turns_first it is the chord with the
-    final heading. Unknown: outside the path, in a gap longer than gap_ns, or beside a heading jump.
+    Between two poses the path is their arc; at a share s from (p, θ) the pose is
+
+        (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ).
+
+    With turns_first it is the chord with the final heading. Unknown: outside the path, in a gap
+    longer than gap_ns, or beside a heading jump.
     """
     if len(path.stamps_ns) < 2:
         return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)

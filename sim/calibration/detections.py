@@ -29,7 +29,6 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 
 LEAST_TRIALS = 50
-"""Least number of trials for the rates."""
 LEAST_SEEN = 3
 """Detections that exclude clutter. Only such landmarks define a scan's coverage, since clutter may
 lie beyond the visible range.
@@ -54,9 +53,8 @@ UNITS = {
 class WindowLooks(NamedTuple):
     """Repeated detections in the scans of one window.
 
-    trials, again: for each landmark, scans that cover its place after its first detection, and the
-    detections among them. further: other detections. area [m²]: view area times scans. cost, dof:
-    of the smoothed window.
+    trials, again: for each landmark, scans that cover its place after its first detection, and
+    detections among them. area [m²]: view area times scans. cost, dof: of the smoothed window.
     """
 
     trials: Int64[np.ndarray, " L"]

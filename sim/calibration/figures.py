@@ -19,7 +19,6 @@ GROUPS = 5
 """Least number of parts left out in turn; fewer robots are cut into equal time stretches."""
 
 HUBER = 2.0
-"""Huber threshold [standard deviations]."""
 
 T = TypeVar("T")
 Fit = Callable[[Sequence[T]], Mapping[str, float]]

@@ -8,8 +8,8 @@ shrunk towards the mean of all robots by the spread s of e:
 Robots are alike unless τ² is significant for some constant (F test). s is a robust estimate, so one
 moved camera does not count.
 
-Landmarks have an own error, too: a marker that hangs higher or is larger reads too far by a share
-of the range, for every robot (`marker_spread`).
+Landmarks, too, have range-proportional errors common to all robots, such as a marker that hangs
+higher or is larger (`marker_spread`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,9 +24,7 @@ from sim.calibration.figures import CalibrationError, Figure, groups_of
 from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
 
 LEAST_ROBOTS = 3
-"""Least number of robots for their variation."""
 LEAST_LANDMARKS = 4
-"""Least number of landmarks for their variation."""
 BEYOND_DOUBT = 0.99
 COMMON_DOF = 2
 """Prior of the common range scale, as a number of further worlds with a robot's own spread."""

@@ -48,8 +48,8 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
     """Text of `output`: the user's scenario `own` with the calibrated figures.
 
     Common figures replace all robots' values, except figures of single robots. Other fields stay. A
-    scenario must name all robots or none: if it names none and a robot has an own figure, all
-    robots of the data are named.
+    scenario must name all robots or none, so all are named if it names none and a robot has figures
+    of its own.
     """
     document = own_document(own)
     world = document.get("world", {})

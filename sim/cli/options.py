@@ -60,7 +60,6 @@ ASSUMED = (
     "the built-in one `recorded` is taken. It assumes odometry that is off by 5 cm and 2° after a "
     "metre and by 6° after a radian, ranges by 5 cm and 2 %, bearings by 1.7°"
 )
-"""Assumptions of that scenario."""
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
 TeamOption = Annotated[

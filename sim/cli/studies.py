@@ -8,7 +8,6 @@ from sim.cli.options import WRONG_USE, fail
 
 STUDIES = "sim.studies"
 COMMANDS = ("experiment", "batch-reference", "limit")
-"""Commands registered by `sim.studies.commands`."""
 
 
 def add_studies(app: typer.Typer) -> None:

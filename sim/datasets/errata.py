@@ -34,7 +34,6 @@ ERRATA: Mapping[str, Erratum] = {
         ),
     ),
 }
-"""Errata by content digest."""
 
 
 def erratum_of(

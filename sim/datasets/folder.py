@@ -54,7 +54,6 @@ TABLES = {
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
 }  # fmt: skip
-"""Allowed columns of each table."""
 REQUIRED = {
     "odometry": ("t_s",),
     "observations": ("t_s", "landmark"),

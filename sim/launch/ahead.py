@@ -1,8 +1,7 @@
 """Start the template before `launch` imports anything else.
 
-A team's imports take a second and a half, meanwhile the launch reads command line and scenario on
-another core. This module's own imports are minimal, so the template starts within a hundredth of a
-second: docs/decisions/12.
+A team's imports take 1.5 s; meanwhile the launch reads command line and scenario on another core.
+This module's imports are minimal, so the template starts within 10 ms: docs/decisions/12.
 """
 
 import os
@@ -34,7 +33,7 @@ _ROOM = 4_096
 class Template:
     """Process from which a team's processes are forked, and its request socket.
 
-    output: error descriptor until it has an own file.
+    output: error descriptor until it has its own file.
     """
 
     def __init__(self, output: int) -> None:

@@ -37,8 +37,8 @@ class Outcome:
     """Result of a launch.
 
     deaths: processes killed at the end and not restarted; no failure if map and log are whole.
-    restarts: number of restarts by process. used: resources by process over all its lives.
-    compiling_s: share of wall_s spent compiling kernels. end_reason: as text.
+    used: resources by process over all its lives. compiling_s: share of wall_s spent compiling
+    kernels.
     """
 
     log: Path

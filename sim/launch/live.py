@@ -177,7 +177,7 @@ _NARROW = ("steps", "submaps", "pose_sigma_m", "nis_per_dof")
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
-"""Most robots with an own row, since a higher table would be cut."""
+"""Most robots with a row each, since a higher table would be cut."""
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:

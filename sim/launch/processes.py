@@ -103,10 +103,9 @@ class Process:
 class Starter:
     """Start the processes of one run; a context that ends the template.
 
-    warm: estimator and rule whose kernels a template loads before forking: the one started ahead,
-    if any. With None, without orphan adoption, or after a template's death, processes start from
-    scratch. log: file for the template's errors. compiled: receives the number of compiled kernels
-    and the estimated total.
+    warm: estimator and rule whose kernels a template loads before forking. With None, without
+    orphan adoption, or after a template's death, processes start from scratch. log: file for the
+    template's errors. compiled: receives the number of compiled kernels and the estimated total.
     """
 
     def __init__(

@@ -37,9 +37,8 @@ def is_live(watch: Watch) -> bool:
 def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
     """Failures and node warnings; absent nodes after PATIENCE_S only.
 
-    During the start every node misses every other, so the world's warning stands for all. Unjoined
-    robots are named with the map instead. silent_s: age [s] beyond which a node's warning is
-    dropped, as it may no longer hold; 0: never.
+    During the start every node misses every other, so the world's warning stands for all. silent_s:
+    age [s] beyond which a node's warning is dropped, as it may no longer hold; 0: never.
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
         return list(watch.failures)

@@ -1,8 +1,7 @@
 """Supervise a team's processes: restart dead ones, give up those without progress.
 
-If recorder or viewer is given up, the team continues, and the run fails at its end. A robot given
-up is named as lost in the final map. Without router, world or centre the run ends; peers need no
-centre.
+Without recorder or viewer the team continues, and the run fails at its end. A robot given up is
+named as lost in the final map. Without router, world or centre the run ends; peers need no centre.
 """
 
 import math

@@ -11,7 +11,6 @@ from sim.launch.processes import Starter, Used
 from team.wire.text import one_line
 
 LAST_LINES = 12
-"""Lines shown of a failed process's output."""
 GRACE_S = 5.0
 """Time [s] for a requested stop."""
 FRUITLESS = 5
@@ -126,8 +125,8 @@ class Child:
 class Supervised:
     """Process restarted by the same command on death, after growing waits.
 
-    Given up after FRUITLESS deaths in a row without progress. reached: progress at its last death,
-    in its own unit. ended_s: detection of its end (monotonic). used: resources of earlier lives.
+    Given up after FRUITLESS deaths in a row without progress. reached: progress at its last death.
+    ended_s: detection of its end (monotonic). used: resources of earlier lives.
     """
 
     name: str

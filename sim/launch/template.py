@@ -1,8 +1,8 @@
 """Warm template: a single-threaded process with a team's imports and kernels loaded.
 
 Forking from it takes milliseconds instead of two seconds and shares memory. A forked process has
-the launch as parent, its own session, no input and its own output file, and continues as if started
-by its command line: docs/decisions/12-processes-forked-from-a-template.md.
+the launch as parent, its own session and output file, no input, and continues as if started by its
+command line: docs/decisions/12-processes-forked-from-a-template.md.
 """
 
 import gc

@@ -30,7 +30,6 @@ from team.wire.channels import SUBMAP, channel_of
 
 _VERSIONS = (sys.version, numba.__version__, binding.get_host_cpu_name())
 _STEPS = 48
-"""One-second steps of the small team's run."""
 FORMS = 287
 """Kernel forms that a small team compiles with Hybrid-SLAM and joined submaps."""
 PLACES = np.array([[10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0], [10.0, 20.0]])

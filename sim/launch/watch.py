@@ -40,12 +40,11 @@ def _no_errors() -> "LiveErrors":
 class Watch:
     """State of a running team: last status of each node, last map.
 
-    robots: names. drivers: awaited drivers of a live team. errors: of poses and map, given truth.
-    place: options by which other commands reach the team; call: the same for a driver's program.
-    notes: process events. restarts: by process. given_up: nodes. last_message: time of each node's
-    last status. peers: robots that need a final map; concluded: those that have it, since
-    concluded_s. centre: presents peers' messages as a centre's. signer: signs orders, if there are
-    keys.
+    drivers: awaited drivers of a live team. place: options by which other commands reach the team;
+    call: the same for a driver's program. notes: process events. restarts: by process.
+    last_message: time of each node's last status. peers: robots that need a final map; concluded:
+    those that have it, since concluded_s. centre: presents peers' messages as a centre's. signer:
+    signs orders.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)

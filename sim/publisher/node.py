@@ -41,10 +41,9 @@ class WorldNode:
     expected: nodes that must be alive first. speed: team seconds per clock second; infinite for
     credit-limited. cache: last measurements of a robot that can be requested again; None: all. An
     older request begins a new incarnation instead: unknown initial pose, counters from zero.
-    configurations: expected announcements; the world does not begin while one forbids it.
-    tells_map: publish true landmarks for localisation-only robots. batch_s: most team time between
-    checks for messages. peers: robots whose own final maps the world waits for, until all have the
-    same set.
+    configurations: expected announcements; a wrong one holds back the world. tells_map: publish
+    true landmarks for localisation-only robots. batch_s: most team time between checks for
+    messages. peers: robots whose own final maps are awaited, until all have the same set.
     """
 
     streams: WorldStreams

@@ -1,9 +1,8 @@
 """Simulate a robot's radio at its bus: drop messages of robots out of reach on arrival.
 
-The world announces in advance which robots reach each other (`world/radio`). A message counts as
-sent at its stamp, so a run does not depend on the speed of team time; its bytes and receiver decide
-random loss. Only messages of robots and their drivers go by radio; world, recorder and operator
-belong to the test bench.
+The world announces radio reach in advance (`world/radio`). A message counts as sent at its stamp,
+so a run does not depend on the speed of team time; its bytes and receiver decide random loss. Only
+messages of robots and their drivers go by radio.
 """
 
 import heapq

@@ -15,7 +15,6 @@ _IN_WORDS = {
     "^[a-z][a-z0-9_]{0,31}$": "a small letter, then small letters, digits and _ (32 at most)",
     "^[A-Za-z0-9_.-]{1,64}$": "letters, digits, _, . and - (64 at most)",
 }
-"""Descriptions of name patterns."""
 
 
 LARGEST_SIGMA_RAD = 0.5

@@ -45,10 +45,9 @@ LEAST_RADIUS = 1.5
 def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
     """Streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
 
-    Robot i follows path i; without a path, or with slip or arc motion, it steers to its path's or
-    random way-points. Each step ends with one, possibly empty, landmark message, and one of
-    teammates if any is seen. With a late odometry clock, team time starts later, so no stamp is
-    negative.
+    Robot i follows path i; without a path, or with slip or arc motion, it steers to way-points.
+    Each step ends with one, possibly empty, landmark message, and one of teammates if any is seen.
+    With a late odometry clock, team time starts later, so no stamp is negative.
     """
     landmarks = _landmarks(world, seed)
     ids = np.arange(1, len(landmarks) + 1, dtype=np.uint32)

@@ -34,11 +34,10 @@ class StartPose:
 class Intervals:
     """Odometry intervals: end stamp, length, mean forward speed [m/s] and yaw rate [rad/s].
 
-    Interval k ends where k + 1 begins. steered: a car's, with wheel speed [m/s] as forward and
-    steering angle [rad] as yaw_rate. increments: measured motions instead, poses (x, y, theta) of
-    the end in the frame of the start; speeds are then zero. covariances: of the increments, in the
-    frame of the end. A NaN increment: the interval has speeds; a NaN covariance: the motion has
-    none.
+    Interval k ends where k + 1 begins. steered: a car's, with wheel speed [m/s] and steering angle
+    [rad]. increments: measured motions instead, poses (x, y, theta) of the end in the frame of the
+    start; speeds are then zero. covariances: of the increments, in the frame of the end. A NaN
+    increment: the interval has speeds; a NaN covariance: none.
     """
 
     end_ns: Int64[np.ndarray, " I"]
@@ -82,10 +81,10 @@ class Detections:
 
     ids: landmark identities, or indices of teammates. points: measured (x, y) in the sensor frame
     [m], from which ranges and bearings are computed. covariances: (rr, rb, bb) of range and bearing
-    or (xx, xy, yy) of points, carried by measurements. A NaN point was measured as range and
-    bearing; a NaN covariance is absent; rows of a message are alike. hidden: messages published
-    without identities (None: none), whose ids are for scoring, NO_LABEL for clutter. signatures:
-    similar numbers for the same landmark, hidden ones only.
+    or (xx, xy, yy) of points. A NaN point was measured as range and bearing; a NaN covariance is
+    absent; rows of a message are alike. hidden: messages published without identities (None: none),
+    whose ids are for scoring, NO_LABEL for clutter. signatures: similar numbers for the same
+    landmark, hidden ones only.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -161,9 +160,9 @@ class RobotStream:
     stamps_ns and rows.
 
     start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth
-    (x, y, θ) in the team's frame at truth_ns, or None. notes: repairs and missing data.
-    clock_offset_ns: stamps are team time; published odometry stamps read this much less. positions:
-    robot positions by another sensor, such as GPS, at positions_ns in its own frame.
+    (x, y, θ) in the team's frame at truth_ns. notes: repairs and missing data. clock_offset_ns:
+    stamps are team time; published odometry stamps read this much less. positions: by another
+    sensor, such as GPS, at positions_ns in its own frame.
 
     Raises ValueError for a measurement before the initial pose, or non-contiguous odometry.
     """

@@ -26,11 +26,10 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
     """Write each sample once to a new log `out`, in order of team time.
 
     Equal stamps keep the order of logs and files. Samples of equal key, counter, wall clock and
-    payload are one publication recorded several times, such as a restarted robot's repeated
-    configuration. Measurements, submaps and inter-robot measurements are identified by content,
-    since one recorder may have requested them. All samples are in memory at once. Raises
-    `LogError`, before creating `out`, for logs of different teams or a damaged one; `RecorderError`
-    if `out` exists.
+    payload are one publication, as is a restarted robot's repeated configuration. Measurements,
+    submaps and inter-robot measurements are identified by content, since one recorder may have
+    requested them. All samples are in memory at once. Raises `LogError`, before creating `out`, for
+    logs of different teams or a damaged one; `RecorderError` if `out` exists.
     """
     first = logs[0]
     for log in logs[1:]:

@@ -131,8 +131,8 @@ class RecordLoop:
     def take(self, samples: list[Sample]) -> None:
         """Write samples; report progress of due robots, or of all without samples.
 
-        A new submap is reported at once, since its robot waits for that to leave. Progress is
-        credit: a writing thread far behind stops the reports.
+        A new submap is reported at once, since its robot stays until then. Progress is credit: a
+        writing thread far behind stops the reports.
         """
         noted = [(each, self._noted(each)) for each in samples if row_of(each.key) is not None]
         self._dropped += len(samples) - len(noted)
@@ -339,9 +339,8 @@ def record(
     """Record until the final map is present and all nodes have left, or until `stop`; then close.
 
     Returns the number of messages written. expected: nodes whose absence is a warning. inventory,
-    more: inventory of earlier parts, and the opener of the next. scenario: configurations logged
-    for a team without a world. peers: as `RecordLoop`. Raises `RecorderError` on a write error: at
-    once without `more`, else at the end.
+    more, peers: as `RecordLoop`. scenario: configurations logged for a team without a world. Raises
+    `RecorderError` on a write error: at once without `more`, else at the end.
     """
     stop = threading.Event() if stop is None else stop
     loop = RecordLoop(bus, recorder, expected, inventory, more, peers)

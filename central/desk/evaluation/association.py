@@ -61,11 +61,10 @@ class AssociationResult:
     """Association scores of a run: over all detections, inside windows, and of the map.
 
     label_of: label of each unnamed landmark, UNKNOWN without one. duplicates: landmarks beyond the
-    first of a label; confirmed: those with at least two submaps, or all for an estimator without
-    submaps; shown: those in the final map. merges_right, merges_wrong: pairs of robots that share
-    landmarks, by whether at least half of those labelled by both are right. merges_refused: pending
-    attempts. left_out: labelled detections in no submap. clutter_in_map: unlabelled ones in a
-    submap.
+    first of a label; confirmed: with at least two submaps, or all for an estimator without submaps;
+    shown: in the final map. merges_right, merges_wrong: pairs of robots that share landmarks, by
+    whether at least half of those labelled by both agree. merges_refused: pending attempts.
+    left_out: labelled detections in no submap. clutter_in_map: unlabelled ones in a submap.
     """
 
     pairs: Pairs

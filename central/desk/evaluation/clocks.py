@@ -1,12 +1,12 @@
 """Estimate the time offset of a robot's detections against its odometry, without truth.
 
-A landmark measured at t_i and t_j is at points b_i, b_j in the robot's base frame. With the
-odometry motion D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise; D depends on τ if the
-speeds at t_i and t_j differ. Neither map nor true path is needed.
+A landmark measured at t_i and t_j is at points b_i, b_j in the base frame. With the odometry motion
+D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise; D depends on τ if the speeds at t_i and
+t_j differ. Neither map nor true path is needed.
 
 Effects similar to τ are estimated jointly: sensor mount, range offset, odometry scales and drift.
-The variance is the sandwich over stretches of time (Liang and Zeger 1986), so errors may be
-correlated within a stretch.
+The variance is the sandwich over stretches of time (Liang and Zeger 1986), which allows for
+correlation within a stretch.
 """
 
 import math
@@ -35,7 +35,6 @@ STEP_NS = 250_000_000
 uncorrelated with that of D.
 """
 HUBER = 2.0
-"""Huber threshold [standard deviations]."""
 ROUNDS = 20
 SETTLED_NS = 1_000_000
 LEAST_SLOPE = 0.2
@@ -49,7 +48,6 @@ BEYOND_DOUBT = 5.0
 LEAST_S = 0.02
 """Smallest reported offset [s]."""
 UNIX_S = 1e9
-"""Times [s] from here on are Unix times."""
 
 
 @dataclass

@@ -67,11 +67,11 @@ UPLINK = {
 class MapResult:
     """Final map: L landmarks by id and their joint covariance (blocks unless `joint`).
 
-    truth: true positions, zero rows without truth; known: rows with truth; errors: of those.
-    cost_per_dof: χ² of the join per degree of freedom. covariance_scale: factor by which the submap
-    covariances should be multiplied; None: unknown. withdrawn: robots left out. lost: robots that
-    are incomplete. gospa: all landmarks against all true ones after truth_from_map. matching: how
-    unnamed landmarks got true positions; None: by identity or label.
+    truth: true positions, zero without truth; known: rows with truth; errors: of those.
+    cost_per_dof: χ² of the join. covariance_scale: factor by which the submap covariances should be
+    multiplied; None: unknown. withdrawn: robots left out. lost: incomplete robots. gospa: of all
+    landmarks after truth_from_map. matching: how unnamed landmarks got true positions; None: by
+    identity or label.
     """
 
     rule: str
@@ -96,7 +96,6 @@ class MapResult:
 
 
 PACKED = (".zip", ".mcap", ".db3")
-"""Suffixes of single-file data sets."""
 USUAL = ("hybrid", "join")
 """Default estimator and rule."""
 TeamMotion = tuple[Float[np.ndarray, "3"], str]

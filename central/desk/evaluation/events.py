@@ -24,7 +24,6 @@ Kind = Literal[
 MOST = 2000
 """Most events of a run, above the rate of one new warning per node and second."""
 FIRST = 1
-"""First incarnation of every stream."""
 _NUMBER = re.compile(r"\d+\.\d+")
 _AWAITED = (
     "waiting for ",

@@ -12,7 +12,6 @@ from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 
 LEAST = 10
-"""Least number of positions."""
 GAP_NS = 1_500_000_000
 """Largest gap between fixes that is interpolated."""
 SHIFTS_S = np.arange(-1.0, 1.01, 0.25)

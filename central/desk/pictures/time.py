@@ -35,7 +35,6 @@ if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axis import Axis
 
 BINS = 40
-"""Number of time bins."""
 RATE_POINTS, RATE_WINDOWS = 200, 10.0
 """Points of a rate line, and run length in windows."""
 BAND = 0.95

@@ -44,7 +44,6 @@ NIS_NOTE = (
     "(range_white, bearing_white): the particles take every error for a new one."
 )
 _ORIGIN = ("commit", "seed", "command", "python")
-"""Log metadata shown first."""
 
 _STYLE = """
 :root { color-scheme: light; }

@@ -19,7 +19,6 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
 Stream = tuple[str, int]
-"""(robot, incarnation)."""
 T = TypeVar("T")
 Identity = tuple[object, ...]
 """Message key and names of its inputs."""
@@ -180,7 +179,6 @@ def _parsed(text: str, kind: type[T], what: str) -> T:
 _CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
          ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_CONFIGURING))
-"""Channels that are indexed."""
 
 
 def recorded(log: Log) -> Recorded:

@@ -120,7 +120,7 @@ def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
 
     A `Done` names the process that it closes: last measurement and number of steps. A process that
     resumed after a submap is computed from there. After a missing measurement, the computation
-    continues behind the next recorded submap.
+    continues after the next recorded submap.
     """
     for incarnation in log.incarnations(robot):
         measurements = log.measurements[(robot, incarnation)]

@@ -1,11 +1,10 @@
 """Recompute every recomputable message of a log and compare.
 
-A log has the recorder's order, not a node's, so no run is replayed: each message is computed from
-the inputs that it names. Submaps, own maps and own poses follow from measurements and
-configuration; a team pose from the prior whose digest it names; fused and final maps, priors and
-trajectories from the recorded submaps of the map's version vector; the exchanges of a feedback rule
-from the round's recorded maps. So an error is located in one message; its successors are judged by
-its recorded bytes.
+A log has the recorder's order, not a node's, so each message is computed from the inputs that it
+names. Submaps, own maps and own poses follow from measurements and configuration; a team pose from
+the prior whose digest it names; fused and final maps, priors and trajectories from the recorded
+submaps of the map's version vector; the exchanges of a feedback rule from the round's recorded
+maps. So an error is located in one message; its successors are judged by its recorded bytes.
 """
 
 from collections.abc import Mapping

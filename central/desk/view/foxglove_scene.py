@@ -21,7 +21,6 @@ TRUTH: Shade = ("#8a93a3", 0.9)
 LANDMARK: Shade = ("#f5b83d", 1.0)
 _FLAT_M = 0.002
 _LEAST_M = 0.01
-"""Least thickness and width of an ellipse."""
 
 
 _LAST_NS = 2**32 * 1_000_000_000 - 1
