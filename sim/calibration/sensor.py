@@ -278,10 +278,10 @@ def _persistence(
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
     counts, sums, times = (np.zeros(len(LAGS_S) - 1) for _ in range(3))
-    for apart in range(1, min(NEIGHBOURS, len(relative))):
-        pair = (series[apart:] == series[:-apart]) & inside[apart:] & inside[:-apart]
-        lag = (seconds[apart:] - seconds[:-apart])[pair]
-        product = (relative[apart:] * relative[:-apart])[pair]
+    for step in range(1, min(NEIGHBOURS, len(relative))):
+        pair = (series[step:] == series[:-step]) & inside[step:] & inside[:-step]
+        lag = (seconds[step:] - seconds[:-step])[pair]
+        product = (relative[step:] * relative[:-step])[pair]
         at = np.searchsorted(LAGS_S, lag) - 1
         counted = (at >= 0) & (at < len(counts))
         counts += np.bincount(at[counted], minlength=len(counts))
@@ -316,9 +316,9 @@ def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[st
         measured = own.distances(seen.ranges, seen.bearings)
         for index, name in enumerate(each.names):
             if name in each.teammates:
-                there, there_known = poses_at(each.teammates[name], stamps, each.gap_ns)
-                chosen = known & there_known & (seen.ids == index) & np.isfinite(measured)
-                distance = np.hypot(*(there - here)[chosen, :2].T)
+                teammate_poses, teammate_known = poses_at(each.teammates[name], stamps, each.gap_ns)
+                chosen = known & teammate_known & (seen.ids == index) & np.isfinite(measured)
+                distance = np.hypot(*(teammate_poses - here)[chosen, :2].T)
                 errors.append(measured[chosen] - distance)
                 distances.append(distance)
     error, distance = np.concatenate(errors), np.concatenate(distances)

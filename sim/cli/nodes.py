@@ -346,11 +346,11 @@ def record(
         "seed": str(resolved.seed),
         "scenario": dumps(resolved),
     }
-    again = output.exists()
-    if again and not output.is_file():
+    exists = output.exists()
+    if exists and not output.is_file():
         refuse_existing(output)
     try:
-        is_over = again and not check_continues(output, resolved.team, metadata, same_run=resume)
+        is_over = exists and not check_continues(output, resolved.team, metadata, same_run=resume)
     except LogError as error:
         fail(str(error), WRONG_USE)
     if is_over:
@@ -371,7 +371,7 @@ def record(
     ):
         recorder, inventory = next_part(output, resolved.team, metadata)
         _connected(resolved, connect)
-        if again:
+        if exists:
             _LOG.info("%s goes on in %s", output, recorder.path.name)
         try:
             written = record_until_end(

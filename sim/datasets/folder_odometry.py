@@ -238,8 +238,8 @@ def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
     if len(found) == 1 or (found in MIXED and table.has("duration_s")):
         return found
     forms = " or ".join(",".join(form) for form in FORMS)
-    what = "more than one form of odometry" if found else "no odometry"
-    raise table.fault(f"{what} in its columns; give t_s with one of {forms}")
+    problem = "more than one form of odometry" if found else "no odometry"
+    raise table.fault(f"{problem} in its columns; give t_s with one of {forms}")
 
 
 def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:

@@ -198,9 +198,9 @@ def _own(
     """Covariances of ranges and bearings and of points, NaN where absent."""
     table, claimed = rows.table, np.full((len(rows.table), 3), np.nan)
     allowed = [POLAR_COVARIANCE if form == POLAR else POINT_COVARIANCE for form in forms]
-    there = {c for c in (*POLAR_COVARIANCE, *POINT_COVARIANCE) if table.has(c)}
+    present = {c for c in (*POLAR_COVARIANCE, *POINT_COVARIANCE) if table.has(c)}
     whole = [columns for columns in allowed if table.has(*columns)]
-    if there != {column for columns in whole for column in columns}:
+    if present != {column for columns in whole for column in columns}:
         names = " or ".join(",".join(columns) for columns in allowed)
         raise table.fault(f"a covariance here has the columns {names}, all three")
     if not whole:
@@ -253,7 +253,9 @@ def landmarks_of(
     """True landmarks, ascending."""
     ids, positions = table.names("landmark"), table.numbers(*POINTS)
     order = np.argsort(ids, kind="stable")
-    again = np.flatnonzero(np.diff(ids[order]) == 0)
-    if len(again):
-        raise table.error(int(order[again[0] + 1]), "landmark", "a second position of one landmark")
+    repeated = np.flatnonzero(np.diff(ids[order]) == 0)
+    if len(repeated):
+        raise table.error(
+            int(order[repeated[0] + 1]), "landmark", "a second position of one landmark"
+        )
     return ids[order], positions[order]

@@ -45,9 +45,9 @@ def first_of_each(
     """Mask of the first usable measurement of each (stamp, id)."""
     rows = np.flatnonzero(usable)
     order = rows[np.lexsort((ids[rows], stamps_ns[rows]))]
-    again = (np.diff(stamps_ns[order]) == 0) & (np.diff(ids[order].astype(np.int64)) == 0)
+    repeated = (np.diff(stamps_ns[order]) == 0) & (np.diff(ids[order].astype(np.int64)) == 0)
     single = usable.copy()
-    single[order[1:][again]] = False
+    single[order[1:][repeated]] = False
     return single
 
 

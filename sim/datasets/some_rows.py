@@ -29,9 +29,11 @@ def numbers_in(
     cells = {each: zip(*(table.columns[c] for c in each), strict=True) for each in forms}
     filled = np.array([[any(row) for row in cells[each]] for each in forms]).reshape(len(forms), -1)
     for row in np.flatnonzero(filled.sum(axis=0) != 1)[:1].tolist():
-        what = "in two forms" if filled[:, row].any() else "in no form"
+        defect = "in two forms" if filled[:, row].any() else "in no form"
         names = " or ".join(",".join(each) for each in forms)
-        raise table.error(row, forms[0][0], f"{what}; a row has {names}, its other cells are empty")
+        raise table.error(
+            row, forms[0][0], f"{defect}; a row has {names}, its other cells are empty"
+        )
     numbers = table.known_numbers(*form)
     mine = filled[list(forms).index(form)]
     for row in np.flatnonzero(mine & np.isnan(numbers).any(axis=1))[:1].tolist():

@@ -110,9 +110,9 @@ def start_pose(
     if first == last:
         return None
     poses = truth[first:last]
-    apart = np.abs(on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
-    middle = int(np.argmin(apart.sum(axis=1)))
-    agreeing = apart[middle] <= START_SPREAD_RAD
+    difference = np.abs(on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
+    middle = int(np.argmin(difference.sum(axis=1)))
+    agreeing = difference[middle] <= START_SPREAD_RAD
     since = (truth_ns[first:last][agreeing] - start_ns).astype(np.float64)
     x, y, heading = poses[agreeing].T
     turned = on_circle(heading - poses[middle, 2])

@@ -56,7 +56,7 @@ def beyond_utias(streams: WorldStreams) -> list[str]:
         "landmarks as points": any(each.points is not None for each in seen),
         "covariances of landmarks": any(each.covariances is not None for each in seen),
     }
-    return [form for form, there in found.items() if there]
+    return [form for form, is_present in found.items() if is_present]
 
 
 def landmark_shift(streams: WorldStreams) -> int:

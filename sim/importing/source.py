@@ -132,18 +132,18 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
             raise DatasetError(f"{source}: give folders, one for each robot, or files of one robot")
         inner = {each.name: sorted(each.glob("*.csv")) for each in sorted(source.iterdir())}
         inner = {name: files for name, files in inner.items() if files}
-        beside = sorted(source.glob("*.csv"))
+        common = sorted(source.glob("*.csv"))
         if inner and request.robot:
             raise DatasetError(
                 f"--robot {request.robot}: {source} has a folder for each robot, "
                 f"{', '.join(inner)}, which names it; rename the folder"
             )
         if inner:
-            found |= {name: [*files, *beside] for name, files in inner.items()}
+            found |= {name: [*files, *common] for name, files in inner.items()}
         elif len(request.sources) == 1:
-            found[request.robot or ONE_ROBOT] = beside
+            found[request.robot or ONE_ROBOT] = common
         else:
-            found[source.name] = beside
+            found[source.name] = common
     for name in found:
         if not re.fullmatch(ROBOT_NAME, name):
             raise DatasetError(

@@ -62,11 +62,11 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
 def starting(watch: Watch) -> str:
     """Number of started robots and names of the others."""
     missing = watch.missing_robots
-    there = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
+    started = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
     if not missing:
-        return f"{there}; waiting for the first measurements"
+        return f"{started}; waiting for the first measurements"
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    return f"{there}; waiting for {', '.join(missing[:NAMED])}{more}"
+    return f"{started}; waiting for {', '.join(missing[:NAMED])}{more}"
 
 
 def share(watch: Watch) -> str:

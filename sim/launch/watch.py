@@ -71,23 +71,23 @@ class Watch:
         """The world's status; for a live team, the sum of its drivers'."""
         if self.drivers is None:
             return self.statuses.get("world")
-        there = [s for node, s in self.statuses.items() if node.startswith("source/")]
+        statuses = [s for node, s in self.statuses.items() if node.startswith("source/")]
         figures = {
-            "of": sum(status.figures.get("measurements", 0.0) for status in there),
-            "team_time_s": max((s.figures.get("team_time_s", 0.0) for s in there), default=0.0),
+            "of": sum(status.figures.get("measurements", 0.0) for status in statuses),
+            "team_time_s": max((s.figures.get("team_time_s", 0.0) for s in statuses), default=0.0),
         }
-        states = {status.state for status in there}
+        states = {status.state for status in statuses}
         return m.Status(
-            stamp_ns=max((status.stamp_ns for status in there), default=0),
+            stamp_ns=max((status.stamp_ns for status in statuses), default=0),
             node=DRIVERS,
             state=states.pop() if len(states) == 1 else "measuring" if states else "waiting",
             figures=figures,
-            warnings=tuple(self._drivers_lacking(there)),
+            warnings=tuple(self._drivers_lacking(statuses)),
         )
 
-    def _drivers_lacking(self, there: Sequence[m.Status]) -> Iterator[str]:
+    def _drivers_lacking(self, statuses: Sequence[m.Status]) -> Iterator[str]:
         """Warnings about missing or silent drivers, given the statuses received."""
-        missing = in_order(set(self.drivers or ()) - {_robot(status) for status in there})
+        missing = in_order(set(self.drivers or ()) - {_robot(status) for status in statuses})
         if missing:
             first = missing[0]
             yield (
@@ -97,7 +97,7 @@ class Watch:
                 f"{first} {self.place} goes on without it"
             )
         now = time.monotonic()
-        for status in sorted(there, key=_robot):
+        for status in sorted(statuses, key=_robot):
             robot = _robot(status)
             silent = now - self.last_message.get(status.node, now) > SILENT_S
             if status.state == "left" or (silent and status.state != "ended"):

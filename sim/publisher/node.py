@@ -305,9 +305,9 @@ class WorldNode:
             if stamp_ns > horizon:
                 self._blocked_by = None
                 break
-            if (who := self._without_credit(source)) is not None:
+            if (node := self._without_credit(source)) is not None:
                 before = self._blocked_by
-                self._blocked_by = before if before and before[0] == who else (who, clock_s)
+                self._blocked_by = before if before and before[0] == node else (node, clock_s)
                 self._clock_s = clock_s
                 break
             self._blocked_by = None
@@ -381,8 +381,8 @@ class WorldNode:
         state = "publishing" if self._began_at is not None else "waiting"
         warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
         if self._blocked_by is not None and self._clock_s - self._blocked_by[1] >= BLOCKED_S:
-            who, since = self._blocked_by
-            warnings = (f"{who} blocks the team: no progress for {self._clock_s - since:.0f} s",)
+            node, since = self._blocked_by
+            warnings = (f"{node} blocks the team: no progress for {self._clock_s - since:.0f} s",)
         return m.Status(
             stamp_ns=self.now_ns,
             node="world",

@@ -160,11 +160,11 @@ class RadioBus:
         """
         changed = []
         for robot, alive in self._tokens.items():
-            there = alive and self._reaches(robot, self._now_ns)
-            if there != self._near.get(robot):
-                self._near[robot] = there
+            in_reach = alive and self._reaches(robot, self._now_ns)
+            if in_reach != self._near.get(robot):
+                self._near[robot] = in_reach
                 node = ch.robot_node(robot)
-                token = m.Liveliness(stamp_ns=0, node=node, alive=there)
+                token = m.Liveliness(stamp_ns=0, node=node, alive=in_reach)
                 changed.append(Sample(ch.ALIVE.key(node), encoded(token), 0, time.time_ns(), 0))
         return changed
 

@@ -48,7 +48,7 @@ def measured_increments(
     """
     before, after = poses[:-1], poses[1:]
     true_turn = after[:, 2] - before[:, 2]
-    there = _turned(after[:, :2] - before[:, :2], -before[:, 2])
+    displacement = _turned(after[:, :2] - before[:, :2], -before[:, 2])
     kinds = (motion.forward, motion.lateral, motion.turn)
     sigmas = np.column_stack([deviation(kind, seconds, steps) for kind in kinds])
     shares = np.sqrt(1.0 - correlation**2)
@@ -57,7 +57,7 @@ def measured_increments(
     half = np.sinc(0.5 * turn / np.pi)
     moved = half[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
     measured_turn = true_turn - turn
-    measured = there - _turned(moved, measured_turn)
+    measured = displacement - _turned(moved, measured_turn)
     angle = np.mod(measured_turn + np.pi, 2.0 * np.pi) - np.pi
     C = np.zeros((len(turn), 3, 3))
     C[:, range(3), range(3)] = sigmas**2

@@ -57,10 +57,10 @@ def persistent(
     constant = normals[:, 2:].copy()
     times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
     order = np.lexsort((seen.steps, seen.points))
-    again = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
-    gaps = np.diff(seen.steps[order])[again - 1] * step_s
+    repeated = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
+    gaps = np.diff(seen.steps[order])[repeated - 1] * step_s
     correlation = np.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
-    for row, rho in zip(again.tolist(), correlation, strict=True):
+    for row, rho in zip(repeated.tolist(), correlation, strict=True):
         before = constant[order[row - 1]]
         constant[order[row]] = rho * before + np.sqrt(1.0 - rho**2) * constant[order[row]]
     white = np.array([sensor.range_white, sensor.bearing_white])

@@ -152,14 +152,14 @@ class Recorded:
     def robot_config(self, robot: str) -> tuple[RobotConfig, bytes]:
         """Announced configuration of a robot, and its digest; raises RerunError."""
         announced = self._announced(ch.robot_node(robot))
-        what = f"the configuration of {robot}"
-        return _parsed(announced.configuration, RobotConfig, what), announced.digest
+        subject = f"the configuration of {robot}"
+        return _parsed(announced.configuration, RobotConfig, subject), announced.digest
 
     def central_config(self) -> tuple[CentralConfig, bytes]:
         """Configuration of the centre and its digest; raises RerunError."""
         announced = self._announced("central")
-        what = "the centre's configuration"
-        return _parsed(announced.configuration, CentralConfig, what), announced.digest
+        subject = "the centre's configuration"
+        return _parsed(announced.configuration, CentralConfig, subject), announced.digest
 
     def _announced(self, node: str) -> m.Configuration:
         if node not in self.configured:
@@ -169,11 +169,11 @@ class Recorded:
         return self.configured[node]
 
 
-def _parsed(text: str, kind: type[T], what: str) -> T:
+def _parsed(text: str, kind: type[T], subject: str) -> T:
     try:
         return msgspec.convert(with_current_names(msgspec.json.decode(text)), kind)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise RerunError(f"{what} is not one of this version: {error}") from None
+        raise RerunError(f"{subject} is not one of this version: {error}") from None
 
 
 _CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,

@@ -173,20 +173,20 @@ def _compared(
 
 
 def _difference(
-    output: RecordedOutput, again: m.Message | None, log: Recorded, *, exact: bool
+    output: RecordedOutput, recomputed: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
-    lacks = None if again is not None else _lacking(output.message, log)
-    if again is None:
+    lacks = None if recomputed is not None else _lacking(output.message, log)
+    if recomputed is None:
         none = "none" if lacks is None else f"{lacks}: none"
-        field, there, here = "the message", "there", none
+        field, recorded_text, recomputed_text = "the message", "there", none
     else:
-        found = first_difference(output.message, again, exact=exact)
+        found = first_difference(output.message, recomputed, exact=exact)
         if found is None:
             if not exact:
                 return None
-            field, there, here = "the encoding", "another", "the program's"
+            field, recorded_text, recomputed_text = "the encoding", "another", "the program's"
         else:
-            field, there, here = found.field, found.recorded, found.recomputed
+            field, recorded_text, recomputed_text = found.field, found.recorded, found.recomputed
     sample = output.sample
     names = _names(output.message)
     unknown = lacks is not None
@@ -196,8 +196,8 @@ def _difference(
         counter=sample.counter,
         names=names,
         field=field,
-        recorded=there,
-        recomputed=here,
+        recorded=recorded_text,
+        recomputed=recomputed_text,
         lacks=unknown,
     )
 

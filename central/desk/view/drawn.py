@@ -48,7 +48,7 @@ def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
 def place_points(
     points: Float[np.ndarray, "P 2"], pose: Sequence[float]
 ) -> Float[np.ndarray, "P 2"]:
-    """Transform points from a pose (x, y, theta) to its frame."""
+    """Transform points from pose coordinates to the frame of the pose (x, y, theta)."""
     x, y, theta = pose
     c, s = np.cos(theta), np.sin(theta)
     return np.asarray(points @ np.array([[c, s], [-s, c]]) + (x, y))
