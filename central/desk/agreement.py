@@ -1,8 +1,6 @@
-"""The final map of a team without a centre: the one that every peer has.
+"""Final map of a team without a centre: the map on which all peers agree.
 
-A robot publishes its own final map and its own conclusion only. The team's final map is therefore
-the one on which all peers agree; where they differ there is none, and the differing peers are
-named.
+If peers differ, the team has no final map, and the differing peers are named.
 """
 
 import hashlib
@@ -17,15 +15,14 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
 LISTENS = (ch.TEAM_CONFIG, ch.TEAM_FINAL, ch.CONCLUDED, ch.GIVEN_UP, ch.ORDER)
-"""The channels from which the agreement is computed."""
 _NAMES = frozenset(channel.name for channel in LISTENS)
 
 
 class Agreement:
-    """The final map of each peer, as that peer has announced it.
+    """Final map of each peer, as announced by that peer.
 
-    robots: the peers; None: those that have announced a fold of their own. A robot that an operator
-    has given up or withdrawn need not agree.
+    robots: the peers; None: all that announced a fold of their own. A robot that was given up or
+    withdrawn need not agree.
     """
 
     def __init__(self, robots: Collection[str] | None = None) -> None:
@@ -36,7 +33,7 @@ class Agreement:
         self._concluded: dict[str, m.Concluded] = {}
 
     def take(self, sample: Sample) -> None:
-        """Take one sample; those of other channels, and invalid ones, are ignored."""
+        """Process a sample; ignore other channels and invalid samples."""
         found = ch.channel_of(sample.key)
         if found is None or found[0].name not in _NAMES:
             return
@@ -58,32 +55,30 @@ class Agreement:
             self._finals[name] = hashlib.sha256(sample.payload).digest(), sample
 
     def excuse(self, robot: str) -> None:
-        """A robot need not agree: an operator has given it up or withdrawn it."""
+        """Exempt a robot that was given up or withdrawn."""
         self._excused.add(robot)
 
     @property
     def needed(self) -> list[str]:
-        """The robots that have to agree."""
+        """Robots that have to agree."""
         known = {*self._folding, *self._finals, *self._concluded}
         return sorted(set(known if self.robots is None else self.robots) - self._excused)
 
     def of(self, robot: str) -> bytes | None:
-        """The SHA-256 of a robot's final map by its own conclusion, else of the map itself."""
+        """SHA-256 of a robot's final map: from its conclusion, else of the map itself."""
         if robot in self._concluded:
             return self._concluded[robot].sha256
         return self._finals[robot][0] if robot in self._finals else None
 
     @property
     def agreed(self) -> Sample | None:
-        """The final map on which all agree, as one of them published it; None where there is
-        none.
-        """
+        """Final map on which all peers agree, as published by one of them."""
         found = {self.of(robot) for robot in self.needed}
         return self._final_with(*found) if len(found) == 1 else None
 
     @property
     def largest(self) -> Sample | None:
-        """The final map that most robots have; of equally many the one with the smaller hash."""
+        """Final map of most robots; among equal counts, the one with the smaller hash."""
         votes = Counter(sha for robot in self.needed if (sha := self.of(robot)) is not None)
         for sha, _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
             if (found := self._final_with(sha)) is not None:
@@ -96,9 +91,7 @@ class Agreement:
 
     @property
     def disagreement(self) -> tuple[str, ...]:
-        """Robots whose final map differs from that of most robots, in words; empty where all agree,
-        and where nobody has one.
-        """
+        """Robots whose final map differs from the majority's, as text."""
         largest = self.largest
         if largest is None:
             return ()
@@ -122,5 +115,5 @@ class Agreement:
 
 
 def as_centre_final(sample: Sample) -> Sample:
-    """A peer's final map under the key of a centre's, for readers that draw or score a map."""
+    """A peer's final map under the centre's key."""
     return msgspec.structs.replace(sample, key=ch.FINAL_MAP.key())

@@ -1,4 +1,4 @@
-"""Compare runs: a row for each figure with a cell for each run, and pictures."""
+"""Compare runs: one row per figure, one cell per run, and pictures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import degrees
@@ -27,13 +27,12 @@ if TYPE_CHECKING:
 
 Row = tuple[str, tuple[str, ...]]
 MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
-"""Colour and marker of the maps in `draw_maps`."""
 
 
 def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
-    """(figure, one cell per run); "–" where a run has none.
+    """Rows (figure, one cell per run), "–" for a missing figure.
 
-    Of a run in an arbitrary frame only the aligned errors have a meaning.
+    A run in an arbitrary frame has aligned errors only.
     """
     every = list(runs.values())
     rows = [(name, tuple(of(run) for run in every)) for name, of in _TEAM]
@@ -53,16 +52,13 @@ def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
 
 
 def compare_figures(runs: Mapping[str, Evaluation]) -> dict[str, Any]:
-    """By run and figure, as `compare_rows` has them, for machines."""
+    """Figures of `compare_rows` by run and name, for JSON."""
     rows = compare_rows(runs)
     return {name: {row[0]: row[1][k] for row in rows} for k, name in enumerate(runs)}
 
 
 def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Map error, map NEES and path errors of every run; False where none has truth.
-
-    A run without true landmarks has its paths' errors only.
-    """
+    """Draw map error, map NEES and path errors of every run; False if none has truth."""
     errors = [None if run.map is None else run.map.errors for run in runs.values()]
     paths = [_aligned_m(each) for run in runs.values() for each in run.robots.values()]
     if not any(errors) and np.isnan(paths).all():
@@ -98,13 +94,13 @@ def _aligned_m(robot: RobotResult | None) -> float:
 
 
 def same_final_map(recorded: Evaluation, changed: Evaluation) -> bool:
-    """Whether both ended with a map, and with the same bytes."""
+    """Whether both runs ended with byte-identical maps."""
     a, b = recorded.map, changed.map
     return a is not None and b is not None and a.payload_sha256 == b.payload_sha256
 
 
 def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
-    """The largest distance between a landmark's two positions; None without a common landmark."""
+    """Largest distance between a landmark's two positions; None without a common landmark."""
     if recorded.map is None or changed.map is None:
         return None
     _, a, b = np.intersect1d(recorded.map.ids, changed.map.ids, return_indices=True)
@@ -113,7 +109,7 @@ def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
 
 
 def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Draw two final maps with 95 % ellipses over the truth; False where there is neither."""
+    """Draw two final maps with 95 % ellipses over the truth; False if there is no map."""
     if all(run.map is None for run in runs.values()):
         return False
     figure, ((axis,),) = new_figure(9.0, 9.0, 1, 1)
@@ -142,13 +138,10 @@ def _draw_map(axis: "Axes", fused: MapResult, colour: str, label: str, marker: s
 
 
 def _of_map(name: str, form: str) -> Callable[[Evaluation], str]:
-    """A figure of the final map."""
     return lambda run: format_figure(None if run.map is None else getattr(run.map, name), form, "")
 
 
 def _of_map_errors(name: str, form: str) -> Callable[[Evaluation], str]:
-    """A figure of the final map's errors."""
-
     def cell(run: Evaluation) -> str:
         errors = None if run.map is None else run.map.errors
         if errors is None or (run.arbitrary_frame and name != "aligned_rmse_m"):
@@ -161,8 +154,6 @@ def _of_map_errors(name: str, form: str) -> Callable[[Evaluation], str]:
 def _of_path(
     kind: str, name: str, form: str, convert: Callable[[float], float] = float
 ) -> Callable[[Evaluation, RobotResult], str]:
-    """A figure of a robot's smoothed or online path, as it lies."""
-
     def cell(run: Evaluation, robot: RobotResult) -> str:
         if kind == "online" and robot.outside:
             return OUTSIDE

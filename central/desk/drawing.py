@@ -1,4 +1,4 @@
-"""One palette, one colour per robot and one ellipse, for the pictures, the page and Foxglove."""
+"""Palette, robot colours and covariance ellipses of the pictures, the page and Foxglove."""
 
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
@@ -14,34 +14,34 @@ if TYPE_CHECKING:
 BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 )  # fmt: skip
-"""Okabe and Ito's colours for methods and kinds of events, distinguishable by the colour-blind."""
+"""Okabe and Ito's colour-blind-safe colours, for methods and event kinds."""
 RED, BLACK, GREY = "#C00000", "#111111", "#7a7a7a"
 MAP_COLOUR, TRUTH_COLOUR, TRUE_LANDMARK_COLOUR = BLACK, GREY, RED
 ROBOT_COLOURS = (
     "#3b9dff", "#ff7a33", "#19c37d", "#e667b3", "#f2c230", "#9a7bff", "#33c7d9", "#ff5d6c",
     "#a3c644", "#c79a6b",
 )  # fmt: skip
-"""Robots' colours in the order of their names, distinguishable on dark and on light ground."""
+"""Robot colours in order of name, distinguishable on dark and light ground."""
 ELLIPSE_SCALE = float(np.sqrt(5.991))
-"""95 % of a Gaussian in the plane lie within this Mahalanobis distance."""
+"""Mahalanobis distance that contains 95 % of a planar Gaussian."""
 BENT_RAD = 0.09
-"""Between two poses whose headings differ by more, a path is drawn as a curve."""
+"""Heading difference above which a path segment is drawn as a curve."""
 
 
 def colour_of(number: int) -> str:
-    """The colour of the robot with this number, as #rrggbb; the eleventh takes the first again."""
+    """Colour of a robot number as #rrggbb; repeats after the palette's end."""
     return ROBOT_COLOURS[number % len(ROBOT_COLOURS)]
 
 
 def robot_colours(names: Iterable[str]) -> dict[str, str]:
-    """The colour of each robot of a team; the same team has the same colours everywhere."""
+    """Colour of each robot, the same in every view of the team."""
     return {name: colour_of(number) for number, name in enumerate(in_order(names))}
 
 
 def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict[str, str]:
-    """The legend entry of each robot: its name; one entry for all of more than `most` robots.
+    """Legend entry of each robot; one common entry for more than `most` robots.
 
-    Matplotlib leaves out a label that begins with an underscore.
+    Matplotlib omits labels that begin with an underscore.
     """
     ordered = in_order(names)
     if len(ordered) <= most:
@@ -52,11 +52,10 @@ def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict
 
 
 def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:
-    """Points of a curve through poses (x [m], y [m], theta [rad]) that has their headings.
+    """Sample a curve through poses (x [m], y [m], theta [rad]) that follows their headings.
 
-    Between two poses whose headings differ it is the cubic that is closest to an arc; where they do
-    not point the same way along the line between them, as of a robot that turns on the spot, it is
-    that line. Backwards is as good as forwards.
+    Between poses with different headings it is the cubic closest to an arc; where the headings
+    oppose along the chord, as in a turn on the spot, it is the chord. Reverse driving is supported.
     """
     if len(poses) < 2:
         return poses[:, :2].copy()
@@ -79,9 +78,9 @@ def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:
 def ellipses(
     blocks: Float[np.ndarray, "L 3"],
 ) -> tuple[Float[np.ndarray, " L"], Float[np.ndarray, " L"], Float[np.ndarray, " L"]]:
-    """95 % ellipses of covariances (xx, xy, yy) [m²].
+    """Compute the 95 % ellipses of covariances (xx, xy, yy) [m²].
 
-    Returns the half axes, major and minor [m], and the direction of the major one [rad].
+    Returns major and minor half axes [m] and the direction of the major axis [rad].
     """
     xx, xy, yy = blocks.T
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
@@ -102,7 +101,7 @@ def draw_ellipses(
     width: float = 1.0,
     zorder: float = 1.0,
 ) -> None:
-    """Draw the 95 % ellipse of each point."""
+    """Draw each point's 95 % ellipse."""
     from matplotlib.patches import Ellipse
 
     major, minor, direction = ellipses(covariances[:, (0, 0, 1), (0, 1, 1)])
@@ -116,7 +115,7 @@ def draw_ellipses(
 
 
 def landmark_blocks(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "L 2 2"]:
-    """The 2 × 2 covariance of each landmark out of the joint one, n = 2 L."""
+    """2 × 2 covariance of each landmark from the joint one, n = 2 L."""
     at = np.arange(0, len(covariance), 2)
     rows = at[:, np.newaxis] + np.arange(2)
     blocks: Float[np.ndarray, "L 2 2"] = covariance[rows[:, :, np.newaxis], rows[:, np.newaxis, :]]

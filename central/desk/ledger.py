@@ -1,10 +1,8 @@
-"""The ledger of a log: the one disposition of every measurement (law 1), and the maps of every
-submap.
+"""Ledger of a log: the disposition of every measurement (law 1), and the maps of every submap.
 
-A submap names its interval of measurements, a map its version vector. Which measurements of an
-interval a robot rejected, and why, is computed by its node, which consumes the recorded
-measurements again. Measurements behind a robot's last submap are open if it had consumed them, else
-lost.
+A submap names its interval of measurements, a map its version vector. Rejections and their reasons
+are recomputed by the robot's node from the recorded measurements. Measurements after the last
+submap are open if consumed, else lost.
 """
 
 from collections import Counter
@@ -24,18 +22,13 @@ IN_SUBMAP = "in a submap"
 OPEN = "open"
 LOST = "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
-"""Limits on the number of missing measurements that are listed: this many, or this many times the
-existing ones.
-"""
+"""Limits on listed missing measurements: an absolute number, or a multiple of the existing ones."""
 SubmapName = tuple[str, int, int]
-"""(robot, incarnation, sequence)."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """The disposition of one measurement; `submap`: the sequence of the submap whose interval
-    holds it.
-    """
+    """Disposition of one measurement; `submap`: sequence of the submap that contains it."""
 
     disposition: str
     submap: int | None
@@ -43,10 +36,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Every measurement's entry by stream and counter, every submap's maps, and the violations.
+    """Every measurement's entry by stream and counter, every submap's maps, and violations.
 
-    maps: the digests of the maps that used a submap, in the order of the log. withdrawn: the robots
-    that the last map leaves out; the measurements in their submaps are in no map any more.
+    maps: digests of the maps that used a submap, in log order. withdrawn: robots that the last map
+    leaves out; their measurements are in no map.
     """
 
     entries: Mapping[Stream, tuple[Entry, ...]]
@@ -60,7 +53,7 @@ class Ledger:
         return sum(len(entries) for entries in self.entries.values())
 
     def totals(self, robot: str | None = None) -> dict[str, int]:
-        """Measurements by disposition, of one robot or of all."""
+        """Measurements by disposition, of one robot or all."""
         counts = Counter(
             entry.disposition
             for (name, _), entries in sorted(self.entries.items())
@@ -70,7 +63,7 @@ class Ledger:
         return dict(sorted(counts.items()))
 
     def statement(self) -> str:
-        """The proof in one sentence."""
+        """Result in one sentence."""
         parts = ", ".join(f"{count:,} {name}" for name, count in self.totals().items())
         sentence = (
             f"each of {self.measurements:,} measurements has exactly one disposition: {parts}"
@@ -82,7 +75,7 @@ class Ledger:
         return f"{sentence}; {gone:,} of those in submaps are withdrawn with {gone_with}"
 
     def to_json(self) -> dict[str, Any]:
-        """Totals, offenders, and of each submap how many measurements and which maps."""
+        """Totals, violations, and measurement count and maps of each submap."""
         counts = Counter(
             (*stream, entry.submap)
             for stream, entries in self.entries.items()
@@ -110,11 +103,13 @@ class Ledger:
 
 
 def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> Ledger:
-    """Compute the ledger of a log. Raises RerunError where a robot's configuration is missing.
+    """Compute the ledger of a log. Raises RerunError without a robot's configuration.
 
-    progress: is called with each robot's name before its measurements are consumed again.
+    progress: receives each robot's name before its measurements are replayed.
     """
-    offenders = [f"{_named(r)} is in the log twice, and not the same" for r in log.contradicted]
+    offenders = [
+        f"{_named(r)} is in the log twice with different contents" for r in log.contradicted
+    ]
     streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
     for stream in streams:
@@ -127,7 +122,6 @@ def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> L
 
 
 def _withdrawn(log: Recorded) -> tuple[str, ...]:
-    """The robots withdrawn in the last map."""
     last = next(iter(reversed((*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)))), None)
     return last.withdrawn if isinstance(last, m.FusedMap) else ()
 
@@ -140,7 +134,7 @@ def _named(measurement: m.Measurement) -> str:
 
 
 def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
-    """The stream's submaps by sequence, each once, and those that contradict one another."""
+    """Submaps of a stream by sequence, and contradicting ones."""
     robot, incarnation = stream
     found: dict[int, m.Submap] = {}
     wrong = []
@@ -149,21 +143,21 @@ def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]
             continue
         if found.setdefault(submap.sequence, submap) != submap:
             name = f"submap {submap.sequence} of {robot}, incarnation {incarnation}"
-            wrong.append(f"{name} is in the log twice, and not the same")
+            wrong.append(f"{name} is in the log twice with different contents")
     return [found[k] for k in sorted(found)], wrong
 
 
 def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
-    """The entry of every measurement that exists or should, and the violations among them."""
+    """Entry of every existing or expected measurement, and violations."""
     robot, incarnation = stream
     measurements: Mapping[int, m.Measurement] = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
     if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):
         raise RerunError(
-            f"{count:,} measurements of {robot}, incarnation {incarnation}, are spoken of, "
-            f"{len(measurements):,} are in the log: not believed"
+            f"{count:,} measurements of {robot}, incarnation {incarnation}, are announced, "
+            f"{len(measurements):,} are in the log: too many are missing to list"
         )
     holder: list[int | None] = [None] * count
     wrong = []
@@ -198,9 +192,9 @@ def _entries(
 
 
 def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -> Iterator[str]:
-    """Where a robot's `Done` differs from the ledger of the log.
+    """Differences between a robot's `Done` and the ledger.
 
-    A resumed robot counts all earlier measurements as in submaps, so only its sum can differ.
+    A resumed robot counts earlier measurements as in submaps, so only its sum is compared.
     """
     for done in log.of(ch.ROBOT_DONE):
         if not isinstance(done, m.Done) or (done.robot, done.incarnation) != stream:
@@ -215,13 +209,13 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
         found = Counter(entry.disposition for entry in entries[: done.measurements])
         if not resumed and dict(found) != announced:
             yield (
-                f"{done.robot}, incarnation {done.incarnation} says {announced}, the log gives "
+                f"{done.robot}, incarnation {done.incarnation} reports {announced}, the log has "
                 f"{dict(found)}"
             )
 
 
 def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
-    """The maps that used each submap, and those that use a missing one, or one twice."""
+    """Maps that used each submap, and maps that use a missing submap or one twice."""
     users: dict[SubmapName, list[str]] = {
         (s.robot, s.incarnation, s.sequence): []
         for s in log.of(ch.SUBMAP)
@@ -239,7 +233,7 @@ def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
             if n > 1
         ]
         wrong += [
-            f"map {digest} uses submaps of {robot}, which it says is withdrawn"
+            f"map {digest} uses submaps of {robot}, which it lists as withdrawn"
             for robot, _ in streams
             if robot in fused.withdrawn
         ]

@@ -1,5 +1,5 @@
-"""An operator's orders to a running team: withdraw a robot, end the team or go on without a lost
-robot, and verdicts on landmarks without names.
+"""Operator orders to a running team: withdraw or give up a robot, end the team, and verdicts on
+unnamed landmarks.
 """
 
 import re
@@ -17,15 +17,14 @@ from team.wire.bus import Bus, Outgoing, sound
 from team.wire.codec import encoded
 
 CENTRE_S = 10.0
-"""Time [s] within which a running centre or robot is noticed."""
+"""Time [s] within which a running centre or robot is detected."""
 LOOK_S = 0.05
 PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
-"""The channels of peers' own folds."""
 _LANDMARK = re.compile(rf"({ROBOT.pattern})/(\d+)/(\d+)/(\d+)")
 
 
 class WithdrawError(RuntimeError):
-    """The order could not be given, or was not followed; the text gives the reason and remedy."""
+    """The order was not given or not followed; the text has reason and remedy."""
 
 
 class NoRobotError(WithdrawError):
@@ -33,7 +32,7 @@ class NoRobotError(WithdrawError):
 
 
 class RunningTeam:
-    """A running team on a bus: the robots with messages, and whether a centre or a peer folds."""
+    """Running team on a bus: robots with messages, and whether a centre or peer folds."""
 
     def __init__(self, bus: Bus, *channels: ch.Channel) -> None:
         self.bus = bus
@@ -45,11 +44,11 @@ class RunningTeam:
 
     @property
     def folds(self) -> bool:
-        """Whether a centre is alive, a peer has announced its own fold, or a map has arrived."""
+        """Whether a centre is alive, a peer announced its own fold, or a map arrived."""
         return self._has_peer or self._has_map or self.bus.is_alive("central")
 
     def messages(self, patience_s: float) -> Iterator[tuple[ch.Channel, m.Message]]:
-        """The sound messages that arrive within a time."""
+        """Valid messages that arrive within a time."""
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
             for channel, name, message in sound(self.bus.receive(LOOK_S)):
@@ -63,16 +62,15 @@ class RunningTeam:
                 yield channel, message
 
     def maps(self, patience_s: float) -> Iterator[m.FusedMap]:
-        """The maps of a centre or of peers that arrive within a time."""
+        """Maps, of a centre or of peers, that arrive within a time."""
         for _, message in self.messages(patience_s):
             if isinstance(message, m.FusedMap):
                 yield message
 
     def await_robot(self, robot: str | None = None) -> None:
-        """Wait until a centre, or a peer, is present, and a message of the robot has arrived.
+        """Wait for a centre or peer, and for a message of the robot.
 
-        Raises WithdrawError where there is neither within CENTRE_S, NoRobotError where there is no
-        such robot.
+        Raises WithdrawError without either within CENTRE_S, NoRobotError without such a robot.
         """
         until = time.monotonic() + CENTRE_S
         while time.monotonic() < until:
@@ -89,7 +87,7 @@ class RunningTeam:
 
 
 def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
-    """Publish an order; with keys its signature after it, for peers that receive it over others."""
+    """Publish an order, followed by its signature if there are keys, since peers relay it."""
     bus.publish(order)
     if signer is not None:
         member = Member(order.key, encoded(order.message), order.message)
@@ -101,10 +99,10 @@ def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
 def withdraw(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
 ) -> m.FusedMap:
-    """Order a robot's withdrawal and return the first map without it, a centre's or a peer's.
+    """Order a robot's withdrawal and return the first map without it.
 
-    signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
-    no peer, no such robot, no rule that can withdraw, or no such map within the time.
+    signer: the operator's. Raises WithdrawError without centre or peer, without such a robot, under
+    a rule that cannot withdraw, or on timeout.
     """
     team = RunningTeam(bus)
     team.await_robot(robot)
@@ -123,10 +121,10 @@ def withdraw(
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
 ) -> None:
-    """Order the team to go on without a lost robot; returns when a centre or a peer confirms it.
+    """Order the team to continue without a lost robot; returns on confirmation.
 
-    signer: the operator's, where there are keys. Raises WithdrawError where there is no centre and
-    no peer, no such robot, or no confirmation within the time.
+    signer: the operator's. Raises WithdrawError without centre or peer, without such a robot, or on
+    timeout.
     """
     team = RunningTeam(bus, ch.STATUS)
     team.await_robot(robot)
@@ -141,14 +139,13 @@ def give_up(
         folds = message.node == "central" or message.node.startswith("robot/")
         if folds and any(text.startswith(f"{robot} is given up") for text in message.warnings):
             return
-    raise WithdrawError(f"nobody has followed within {patience_s:g} s; the order stands")
+    raise WithdrawError(f"no confirmation within {patience_s:g} s; the order stands")
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
-    """Order a live team to end; returns when the centre repeats the order, or a peer follows.
+    """Order a live team to end; returns when the centre repeats the order or a peer follows.
 
-    Raises WithdrawError where there is neither, the team has a world, or no confirmation within the
-    time.
+    Raises WithdrawError without centre or peer, for a team with a world, or on timeout.
     """
     team = RunningTeam(bus, ch.TEAM_END)
     team.await_robot()
@@ -166,7 +163,7 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
 
 
 def local_landmark(text: str) -> m.LocalLandmark:
-    """Parse `r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark; ValueError."""
+    """Parse `r1/1/12/7`: robot, incarnation, submap sequence, local landmark; raises ValueError."""
     found = _LANDMARK.fullmatch(text)
     if found is None:
         raise ValueError(f"{text!r} is no local landmark: robot/incarnation/submap/landmark")
@@ -184,12 +181,10 @@ def judge(
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:
-    """Publish a verdict on two landmarks without names; return the first map, a centre's or a
-    peer's, that takes it into account.
+    """Publish a verdict on two unnamed landmarks; returns the first map that includes it.
 
-    withdrawn: withdraw the verdict, and return a map without it. signer: the operator's, where
-    there are keys. Raises NoRobotError where the team does not have one of the robots,
-    WithdrawError where there is neither centre nor peer, or no such map within the time.
+    withdrawn: withdraw the verdict, and return a map without it. signer: the operator's. Raises
+    NoRobotError for an unknown robot, WithdrawError without centre or peer, or on timeout.
     """
     team = RunningTeam(bus)
     robot = judgement.first.robot

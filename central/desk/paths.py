@@ -1,8 +1,8 @@
-"""Compute smoothed paths at the rate of keyframes, from a log's final map and its measurements.
+"""Compute smoothed paths at keyframe rate from a log's final map and measurements.
 
-The final map has each robot's poses at the ends of its submaps. Between them the robot's windows
-are computed again from the recorded measurements, and each window's path is placed between its two
-ends (`team.estimation.hybrid_slam.window_path`).
+The final map has poses at submap ends. The windows between them are recomputed from the recorded
+measurements, and each window path is fitted between its ends
+(`team.estimation.hybrid_slam.window_path`).
 """
 
 from collections.abc import Callable, Mapping
@@ -24,9 +24,9 @@ from team.wire.arrays import floats
 
 @dataclass(frozen=True)
 class SmoothedPath:
-    """A robot's poses (x [m], y [m], theta [rad]) in the final map, by stamp, with covariances.
+    """Poses (x [m], y [m], theta [rad]) in the final map by stamp, with covariances.
 
-    at_keyframes: between the ends of submaps, too.
+    at_keyframes: includes poses between submap ends.
     """
 
     stamps_ns: Int64[np.ndarray, " K"]
@@ -38,7 +38,7 @@ class SmoothedPath:
 def smoothed_paths(
     found: Recorded, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, SmoothedPath]:
-    """The path of every robot in the final map; `progress` is called with each robot's name."""
+    """Path of every robot in the final map; `progress` receives each robot's name."""
     last: dict[tuple[str, int], m.Trajectory] = {}
     for message in found.of(ch.TRAJECTORY):
         if isinstance(message, m.Trajectory):
@@ -52,7 +52,7 @@ def smoothed_paths(
 
 
 def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:
-    """The windows of an incarnation by the stamp of their end, as far as its measurements reach."""
+    """Windows of an incarnation by end stamp, as far as its measurements reach."""
     try:
         config, _ = found.robot_config(robot)
     except RerunError:
@@ -80,7 +80,7 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
 def _between_ends(
     found: Recorded, message: m.Trajectory, windows: Mapping[int, ClosedWindow]
 ) -> SmoothedPath:
-    """The path of one incarnation: of each submap its keyframes, then its end."""
+    """Path of one incarnation: each submap's keyframes, then its end."""
     stamps, poses = translate.trajectory_of(message)
     covariances = floats(message.covariances, "covariances").reshape(-1, 3, 3)
     if not windows:
@@ -110,7 +110,6 @@ def _between_ends(
 
 
 def _joined(parts: list[SmoothedPath]) -> SmoothedPath:
-    """The paths of a robot's incarnations in sequence."""
     return SmoothedPath(
         np.concatenate([part.stamps_ns for part in parts]),
         np.concatenate([part.poses for part in parts]),

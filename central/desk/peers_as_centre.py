@@ -1,9 +1,8 @@
-"""Present a team without a centre to the desk: peers' messages about the map, as a centre's.
+"""Present peers' map messages as a centre's, for a team without a centre.
 
-The running maps are those of one peer, the first that publishes one; the final map is the one on
-which all peers agree; a prior and a smoothed path are their own robot's. While there is a centre,
-its own messages are used; when it has gone, a peer's. In a team whose robots are no peers, a
-robot's messages about the map are nobody's.
+Running maps come from the first peer that publishes one; the final map is the one on which all
+peers agree; priors and smoothed paths come from their robot. A centre's own messages take
+precedence while it is present. Map messages of robots that are not peers are ignored.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -31,19 +30,16 @@ LISTENS = (
     ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_WITHDRAWAL, ch.WORLD_CONFIG,
     *OF_AGREEMENT,
 )  # fmt: skip
-"""The channels that are presented in this way, or decide how."""
 _FOLD = "fold."
 _LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)
-"""Messages that stand for the team's unless a centre has published them; a centre that comes back
-late may not.
-"""
+"""Used unless a centre has published them; a late centre may not replace them."""
 
 
 class PeersAsCentre:
-    """Renames samples of peers to a centre's keys.
+    """Map peers' samples to a centre's keys.
 
-    robots: the robots that are peers, none where the team has a centre only. None: as the
-    `world/config` among the samples names them; before that, those that announce their own fold.
+    robots: the peers, empty for a team with a centre only. None: as `world/config` names them;
+    before that, robots that announce their own fold.
     """
 
     def __init__(self, robots: Collection[str] | None = None) -> None:
@@ -54,7 +50,7 @@ class PeersAsCentre:
         self.agreement = Agreement(robots)
 
     def of(self, sample: Sample) -> Sample | None:
-        """The sample as a centre would have published it; None where it has no counterpart."""
+        """Sample as a centre would publish it, or None."""
         if sample.key in _CENTRE:
             self._centre = True
             self._concluded = self._concluded or sample.key == ch.FINAL_MAP.key()
@@ -78,7 +74,7 @@ class PeersAsCentre:
         return self._renamed(sample, channel, name)
 
     def _renamed(self, sample: Sample, channel: ch.Channel, name: str) -> Sample | None:
-        """A running message of a peer's fold on the centre's key."""
+        """Running message of a peer's fold under the centre's key."""
         as_channel = _AS.get(channel.name)
         if as_channel is None:
             return None
@@ -92,7 +88,7 @@ class PeersAsCentre:
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
 
     def _learn(self, sample: Sample) -> None:
-        """Take the team's peers from the scenario."""
+        """Read the peers from the scenario."""
         try:
             team = team_config(decoded(sample.payload, m.Configuration).configuration)
         except (WireError, ValueError):
@@ -100,7 +96,6 @@ class PeersAsCentre:
         self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
 
     def _agreed(self) -> Sample | None:
-        """The final map of all peers, once they agree on it."""
         agreed = self.agreement.agreed
         if agreed is None or agreed.payload == self._final:
             return None
@@ -116,7 +111,7 @@ class PeersAsCentre:
         return msgspec.structs.replace(sample, payload=encoded(as_centre))
 
     def _status(self, sample: Sample, node: str) -> Sample | None:
-        """The status of the peer's fold as a centre's status."""
+        """Status of the peer's fold as a centre's status."""
         if self._robot is None or node != ch.robot_node(self._robot):
             return None
         try:
@@ -135,7 +130,6 @@ class PeersAsCentre:
 
 
 def _withdrawn(sample: Sample) -> str | None:
-    """The robot that a peer's fold has withdrawn."""
     try:
         return decoded(sample.payload, m.Withdrawal).robot
     except WireError:
@@ -150,7 +144,7 @@ def _is_alive(token: Sample) -> bool:
 
 
 def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
-    """The samples, each followed by its counterpart in a centre's name."""
+    """Samples, each followed by its counterpart in a centre's name."""
     for sample in samples:
         yield sample
         counterpart = centre.of(sample)

@@ -1,6 +1,4 @@
-"""Observe a running team: its nodes, their progress and rates, their clocks, and which wait for
-which.
-"""
+"""Observe a running team: nodes, progress, rates, clocks, and dependencies between nodes."""
 
 import time
 from dataclasses import dataclass, field
@@ -14,19 +12,19 @@ from team.wire.newer import later_head
 
 LOOK_S = 0.1
 APART_S = 1.0
-"""Clocks that differ by more than this [s] are named: no measurement is on its way for so long."""
+"""Clock difference [s] from which it is reported; longer than any transmission delay."""
 PAST_S = 3600.0
-"""Stamps that are further from the machine's own clock [s] are those of recorded data."""
+"""Stamps further than this [s] from the machine's clock are recorded data."""
 DRIFT = 0.1
-"""A clock that goes faster or slower by this share of the time is no clock: a lag that changes."""
+"""Relative drift above which an offset is a changing lag, not a clock."""
 
 
 @dataclass
 class Member:
-    """One node: its liveliness, its last status, and its counts over time.
+    """One node: liveliness, last status, and counts over time.
 
-    clock_s: its team time less its machine's wall clock; None where it reports no team time.
-    drift: by how much that has changed per second of the observation.
+    clock_s: team time less the machine's wall clock; None without team time. drift: its change per
+    second.
     """
 
     alive: bool = False
@@ -38,7 +36,7 @@ class Member:
     _last: tuple[float, float] | None = field(default=None, repr=False)
 
     def take(self, status: m.Status, wall_ns: int) -> None:
-        """Take a status, published at this time of the node's own wall clock."""
+        """Process a status published at this wall time of the node."""
         self.status = status
         count = status.figures.get("measurements", status.figures.get("submaps", 0.0))
         self._last = 1e-9 * wall_ns, count
@@ -52,7 +50,7 @@ class Member:
 
     @property
     def rate(self) -> float | None:
-        """Measurements (of the centre submaps) per second during the observation."""
+        """Measurements (for the centre: submaps) per second."""
         if self._first is None or self._last is None or self._last[0] <= self._first[0]:
             return None
         return (self._last[1] - self._first[1]) / (self._last[0] - self._first[0])
@@ -60,7 +58,7 @@ class Member:
 
 @dataclass
 class Presence:
-    """A team as observed for a while; members by node."""
+    """Observed team; members by node."""
 
     members: dict[str, Member] = field(default_factory=dict)
     heads: dict[str, m.StreamHead] = field(default_factory=dict)
@@ -100,13 +98,13 @@ class Presence:
 
     @property
     def robots(self) -> list[str]:
-        """The robots that have, or had, a process or a driver."""
+        """Robots that have, or had, a process or driver."""
         named = (node.partition("/") for node in self.members)
         found = {robot for kind, _, robot in named if kind in ("robot", "source")}
         return in_order(found | self.heads.keys())
 
     def clocks(self) -> dict[str, float]:
-        """The offset [s] of each measuring driver's clock from the median clock of the team."""
+        """Offset [s] of each measuring driver's clock from the team's median."""
         found = {
             node: member.clock_s
             for node, member in self.members.items()
@@ -116,7 +114,7 @@ class Presence:
         return {node: clock_s - middle for node, clock_s in found.items()}
 
     def advice(self) -> list[str]:
-        """The nodes that wait for others, with the remedy."""
+        """Nodes that wait for others, with the remedy."""
         advice = []
         if self.has_ended:
             advice.append("the final map is out: the team has ended")
@@ -158,9 +156,9 @@ class Presence:
 
 
 def _remedy(member: Member, *, behind: bool) -> str:
-    """The remedy for a driver whose stamps differ from the others'.
+    """Remedy for a driver whose stamps deviate.
 
-    Recorded data, and a lag that changes, need no setting of a clock.
+    Recorded data and a changing lag need no clock setting.
     """
     if abs(member.clock_s or 0.0) > PAST_S:
         if not behind:

@@ -1,1 +1,1 @@
-"""Models' figures learnt from measurements."""
+"""Model calibration from measurements."""

@@ -1,19 +1,15 @@
-"""Learn the figures of the odometry's and the sensor's models from measurements.
+"""Calibrate odometry and sensor models from measurements.
 
-Where the data have the true poses and landmarks, every figure is a maximum-likelihood estimate
-against them. Constants of the sensor are learnt for each robot separately where robots differ
-significantly (`own`).
+With truth, every figure is a maximum-likelihood estimate. Sensor constants are per robot where
+robots differ significantly (`own`).
 
-Without truth the reference is the joined map and the paths in it, alternating between joining and
-learning (expectation and maximisation). The joining trusts the odometry less, so that the scale
-comes from the ranges. Then only what ranges and bearings determine is learnt: the odometry's
-scales, drag and veer. The sensor's own figures stay, since a team can not observe the scale of its
-own range measurements.
+Without truth the reference is the joined map and its paths, in alternation (expectation and
+maximisation). The join trusts odometry less, so that ranges set the scale. Only odometry scales,
+drag and veer are calibrated: a team cannot observe the scale of its own ranges.
 
-Of detections without identities clutter and misses are learnt (`detections`), without labels.
-
-How consistent the submaps' covariances are (`covariance_factor`, and the monitor's `normal_scale`
-with it) is learnt without the truth in both cases, from the maps of single robots (`consistency`).
+Detections without identities give clutter and miss rates (`detections`). Submap consistency
+(`covariance_factor`, the monitor's `normal_scale`) is calibrated without truth in both cases, from
+maps of single robots (`consistency`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,19 +43,15 @@ from team.config import MotionModel, MotionNoise
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
 MISTRUST = 4.0
-"""Factor on the odometry's noise densities where there is no truth."""
+"""Factor on odometry noise densities without truth."""
 ROUNDS = 2
 SYSTEMATIC = 0.02
-"""Standard deviation of the forward scale, relative, that a scale learnt from the joined
-map has.
-"""
+"""Relative standard deviation of a forward scale from the joined map."""
 TYPICAL_M = 3.0
 BETTER = 0.8
-"""A depth model of the ranges that leaves less than this share of their σ at TYPICAL_M is
-reported.
-"""
+"""A range model is reported if it reduces σ at TYPICAL_M below this share."""
 ALARM = 0.015
-"""A scale that differs by more than this from the scenario's does not fit the data."""
+"""Relative scale difference that does not fit the scenario."""
 
 
 Progress = Callable[[str], None]
@@ -67,13 +59,10 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Calibration:
-    """The learnt figures by the part of a robot's configuration that they belong to, and notes for
-    the user.
+    """Calibrated figures by part of a robot's configuration, and notes.
 
-    robots: figures of single robots' sensors, where robots differ. detections: what is clutter and
-    what is missed, where there are detections without identities. clocks: `clock_offset_s` of
-    every robot that has enough measurements, where the odometry of one has another clock than its
-    detections. team: the robots of the data.
+    clocks: `clock_offset_s` of every robot with enough measurements, if the two clocks of one
+    differ.
     """
 
     motion: tuple[Figure, ...]
@@ -90,10 +79,9 @@ class Calibration:
 def calibrate_models(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
-    """Learn from all worlds together, starting from the scenario's models (one for all robots).
+    """Calibrate from all worlds (label, streams) together, starting from the scenario's models.
 
-    worlds: of each its label and its streams. Raises CalibrationError where the measurements do not
-    suffice.
+    Raises CalibrationError for insufficient measurements.
     """
     if all(world.landmarks is not None and true_paths(world.streams) for _, world in worlds):
         found = _by_truth(worlds, scenario, progress)
@@ -142,7 +130,7 @@ def _by_truth(
     learnt = with_figures(scenario, of_motion, of_sensor, own.robots)
     folds = []
     for label, world in worlds:
-        progress(f"joined map of {label} with what was learnt")
+        progress(f"joined map of {label} with the calibrated models")
         team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
         folds.append(team.fold)
     marker = marker_spread(data, depth=depth)
@@ -167,7 +155,7 @@ def _by_truth(
 def against_truth(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario
 ) -> tuple[list[Reference], list[str]]:
-    """The references by the truth, and notes on the robots that have none."""
+    """References by the truth, and notes on robots without one."""
     data: list[Reference] = []
     notes: list[str] = []
     for label, world in worlds:
@@ -180,9 +168,7 @@ def against_truth(
 
 
 def _other_model(data: Sequence[Reference], depth: bool) -> tuple[str, ...]:
-    """A note where the other range model (depth or distance) explains the ranges better than the
-    scenario's.
-    """
+    """Note if the other range model (depth or distance) fits significantly better."""
     taken, other = (
         hypot(found["range_sigma"], TYPICAL_M * found["range_sigma_per_m"])
         for found in (sensor.fit_sensor(data, depth=each) for each in (depth, not depth))
@@ -216,7 +202,7 @@ def _by_the_map(
         learnt = with_figures(scenario, figures, ())
     teams = []
     for label, world in worlds:
-        progress(f"joined map of {label} with what was learnt")
+        progress(f"joined map of {label} with the calibrated models")
         teams.append(joined_team(world, learnt))
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
@@ -229,8 +215,8 @@ def _by_the_map(
 
 
 def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tuple[Figure, ...]:
-    """The covariance factor of fewer robots than can be compared, whose landmarks have no
-    identities: association depends on it.
+    """Covariance factor for too few robots to compare, whose unnamed landmarks depend on it through
+    association.
     """
     if not any(len(each.local.unnamed.counts) for each in team.contributions):
         return ()
@@ -248,7 +234,7 @@ def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:
 def _left_out(
     label: str, world: WorldStreams, paths: Mapping[str, Path], pathless: str
 ) -> list[str]:
-    """The robots of which nothing can be learnt, each with the reason."""
+    """Robots without usable data, with the reason."""
     return [
         f"{label} {stream.robot}: {reason}: nothing is learnt from it"
         for stream in world.streams
@@ -299,8 +285,6 @@ def _alarms(figures: Sequence[Figure], scenario: Scenario) -> tuple[str, ...]:
 
 
 def _mistrusting(scenario: Scenario) -> Scenario:
-    """The scenario with the densities of odometry noise multiplied by MISTRUST."""
-
     def wider(noise: MotionNoise) -> MotionNoise:
         fields = msgspec.structs.asdict(noise)
         return MotionNoise(**{name: MISTRUST * value for name, value in fields.items()})

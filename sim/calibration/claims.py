@@ -1,10 +1,9 @@
-"""Compare the covariances that measurements carry, and the sensor's mount, with the truth.
+"""Compare measurement covariances and the sensor mount with the truth.
 
-Covariances of odometry or of landmark measurements are taken to be right up to a factor: the median
-of the squared Mahalanobis errors over the median of chi-square. Errors of odometry are taken over
-spans of time, since those of single intervals are dominated by the reference's own. A mount's
-heading and `bearing_offset` have the same effect on bearings, so only their sum is known; the
-mount's position can be estimated unless landmarks are seen in one direction only.
+Covariances are calibrated up to a factor: median squared Mahalanobis error over the median of
+chi-square. Odometry errors are taken over time spans, since the reference's own error dominates
+single intervals. Mount heading and `bearing_offset` affect bearings alike, so only their sum is
+observable; mount position is, unless all landmarks lie in one direction.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,21 +21,19 @@ from team.estimation.models import Increment, corrected
 
 SPAN_NS = 10_000_000_000
 LEAST = 30
-"""Least number of spans or measurements from which a factor is learnt."""
+"""Least number of spans or measurements for a factor."""
 CERTAIN_M = 0.02
-"""A mount is not reported where three standard deviations of its position exceed this [m]."""
+"""Largest 3σ position uncertainty [m] of a reported mount."""
 NEGLIGIBLE_M = 0.005
-"""A mount that is nearer than this [m] to the scenario's is not reported."""
+"""Smallest reported mount deviation [m]."""
 DISTANT = 3.0
-"""Number of standard deviations from which a mount differs from the scenario's."""
+"""Standard deviations from which a mount deviation is significant."""
 
 UNITS = {"covariance_factor": ""}
 
 
 def odometry_factor(data: Sequence[Reference]) -> Mapping[str, float]:
-    """`motion.covariance_factor` of increments that come with covariances; empty where there are
-    too few.
-    """
+    """`motion.covariance_factor` of increments with covariances; empty if too few."""
     squared = [value for each in data for value in _spans(each)]
     return _factor(np.array(squared), 3)
 
@@ -62,9 +59,7 @@ def _spans(data: Reference) -> list[float]:
 
 
 def landmark_factor(data: Sequence[Reference], sensor: Sensor) -> Mapping[str, float]:
-    """`sensor.covariance_factor` of landmark measurements that come with covariances; empty where
-    there are too few.
-    """
+    """`sensor.covariance_factor` of landmark measurements with covariances; empty if too few."""
     parts = [np.empty(0)]
     for each in data:
         claims = each.seen.covariances
@@ -87,7 +82,7 @@ def _factor(squared: Float[np.ndarray, " n"], dof: int) -> Mapping[str, float]:
 
 
 class _Rows(NamedTuple):
-    """Measurements of known landmarks and their true values, relative to the sensor."""
+    """Measurements of known landmarks and true values, in the sensor frame."""
 
     taken: np.ndarray
     ranges: Float[np.ndarray, " n"]
@@ -118,8 +113,8 @@ def _rows(data: Reference, sensor: Sensor) -> _Rows:
 def measured_and_true(
     data: Reference, sensor: Sensor
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
-    """Of all detections: which are of known landmarks from known poses, the points that they
-    measure, and the true ones, relative to the sensor.
+    """Mask of detections of known landmarks from known poses, with measured and true points in the
+    sensor frame.
     """
     rows = _rows(data, sensor)
     points, true = (np.full((len(rows.taken), 2), np.nan) for _ in range(2))
@@ -128,15 +123,13 @@ def measured_and_true(
 
 
 def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
-    """The sensor's mount estimated by the truth, as a note, where it differs from the
-    scenario's.
-    """
+    """Note on a sensor mount that deviates from the scenario's, by the truth."""
     rows = [_rows(each, sensor) for each in data]
     points = np.concatenate([np.empty((0, 2)), *(each.points for each in rows)])
     true = np.concatenate([np.empty((0, 2)), *(each.true_points for each in rows)])
     if len(points) < LEAST:
         return ()
-    # The true points relative to the assumed mount are those seen, moved by the mount's error.
+    # True points relative to the assumed mount are the measured ones, moved by the mount error.
     ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-3)
     rays = points / ranges[:, np.newaxis]
     sigma = np.hypot(sensor.range_sigma, sensor.bearing_sigma * ranges)

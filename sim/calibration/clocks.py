@@ -1,16 +1,15 @@
-"""Estimate by how much a robot's detections and its odometry are stamped late, against its path.
+"""Estimate stamp delays of a robot's detections and odometry against its path.
 
-A detection stamped t was made at t − τ: it is compared with the true pose of that time. Where a
-robot drives straight on, an offset looks like a mount moved forward by v τ, so the mount's pose and
-an offset of the range are estimated with it; turns and other speeds tell them apart. An interval of
-odometry that is stamped late is compared with the path's turn likewise, its scale being free.
+A detection stamped t was made at t − τ and is compared with the true pose of that time. In straight
+motion τ looks like a mount moved forward by v τ, so mount pose and range offset are estimated
+jointly; turns and speed changes separate them. Odometry is compared with the path's turn, with free
+scale.
 
-`central.desk.evaluation.clocks` estimates the offset without a truth, from pairs of measurements.
-Its σ is about three times as large (11 ms against 4 ms over four minutes of two robots), so a
-calibration does not use it.
+`central.desk.evaluation.clocks` needs no truth, but its σ is about three times larger (11 ms
+against 4 ms over four minutes of two robots).
 
-`RobotConfig.clock_offset_s` moves the odometry to the detections' clock: τ of the detections less
-that of the odometry.
+`RobotConfig.clock_offset_s` moves odometry to the detections' clock: τ of the detections less that
+of the odometry.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,16 +26,15 @@ from sim.world.streams import RobotStream, WorldStreams
 from team.config import Sensor
 
 LEAST = 200
-"""Least number of detections, and of turns of the odometry, from which an offset is learnt."""
+"""Least number of detections, and of odometry turns."""
 ROUNDS = 6
 STEP_NS = 10_000_000
-"""Step of the derivative by time."""
 LARGEST_S = 2.0
-"""An offset beyond this is not a clock's."""
+"""Largest plausible clock offset."""
 BEYOND_DOUBT = 4.0
-"""Number of standard deviations from which an offset is applied."""
+"""Standard deviations from which an offset is applied."""
 LEAST_S = 0.01
-"""A smaller offset [s] is not applied."""
+"""Smallest applied offset [s]."""
 SETTLED_S = 1e-4
 
 UNITS = {"detections": "s", "odometry": "s", "clock_offset_s": "s"}
@@ -44,7 +42,7 @@ UNITS = {"detections": "s", "odometry": "s", "clock_offset_s": "s"}
 
 @dataclass(frozen=True)
 class Clock:
-    """The times by which a robot's detections and odometry are stamped late, and the difference."""
+    """Delays of a robot's detections and odometry, and their difference."""
 
     detections: Figure
     odometry: Figure
@@ -52,15 +50,15 @@ class Clock:
 
     @property
     def is_off(self) -> bool:
-        """Whether the two clocks differ beyond doubt."""
+        """Whether the two clocks differ significantly."""
         found = self.clock_offset_s
         return abs(found.value) > max(LEAST_S, BEYOND_DOUBT * found.sigma)
 
 
 def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
-    """The clocks of each robot that has enough measurements along a known path.
+    """Clocks of each robot with enough measurements on a known path.
 
-    Robots that turn on the spot before they drive have no speeds to tell a time by.
+    A robot that turns on the spot before driving has no speeds to observe τ from.
     """
     robots: dict[str, list[Reference]] = {}
     for each in data:
@@ -75,7 +73,7 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
 
 
 def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
-    """The clocks that are off, in words."""
+    """Offset clocks as text."""
     return tuple(
         f"{robot}: its detections are stamped {1e3 * clock.clock_offset_s.value:.0f} ± "
         f"{1e3 * clock.clock_offset_s.sigma:.0f} ms {late} its odometry: clock_offset_s = "
@@ -87,8 +85,8 @@ def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
 
 
 def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStreams:
-    """The world with odometry and detections on the clock of the true path, for each robot whose
-    two clocks differ: the paths of teammates stay comparable.
+    """Move odometry and detections to the true path's clock for each robot with an offset, so that
+    teammates' paths stay comparable.
     """
     streams = tuple(
         _moved(each, clocks[each.robot])
@@ -127,15 +125,14 @@ def _fit_of(sensor: Sensor) -> Callable[[Sequence[Reference]], Mapping[str, floa
 
 
 def _at(data: Reference, late_ns: int) -> Reference:
-    """The reference with a path that is later by so much."""
     return replace(data, path=Path(data.path.stamps_ns + late_ns, data.path.poses))
 
 
 def _settled(step_at: Callable[[int], float | None]) -> float | None:
-    """Add steps to a time [s] until one is below SETTLED_S; None where a step is not determined or
-    the time is beyond LARGEST_S.
+    """Add steps to a time [s] until one is below SETTLED_S; None if undetermined or beyond
+    LARGEST_S.
 
-    step_at: the further time [s] at a time [ns].
+    step_at: further time [s] at a time [ns].
     """
     late = 0.0
     for _ in range(ROUNDS):
@@ -149,9 +146,9 @@ def _settled(step_at: Callable[[int], float | None]) -> float | None:
 
 
 def _detections_late(data: Sequence[Reference], sensor: Sensor) -> float | None:
-    """The time [s] by which detections are stamped late; None where it is not determined.
+    """Delay of the detections [s], or None.
 
-    Iterations of the linearised fit of (mount x, y, θ, range offset, τ) under Huber's loss.
+    Iterated linear fit of (mount x, y, θ, range offset, τ) under Huber's loss.
     """
 
     def step_at(late_ns: int) -> float | None:
@@ -180,9 +177,9 @@ def _step(
     rate: Float[np.ndarray, "n 2"],
     sensor: Sensor,
 ) -> float:
-    """The further time by which the detections are late, with a mount and an offset of the range.
+    """Further delay of the detections, with free mount and range offset.
 
-    rate: ∂true/∂τ [m/s], of the true points relative to the sensor.
+    rate: ∂true/∂τ [m/s] of the true points in the sensor frame.
     """
     ranges = np.maximum(np.hypot(*points.T), 1e-3)
     x, y = points.T
@@ -203,7 +200,7 @@ def _step(
 def _affine(
     gap: Float[np.ndarray, " n"], J: Float[np.ndarray, "n p"]
 ) -> Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " n"]]:
-    """The residual gap + J p as a function of p."""
+    """Residual gap + J p as a function of p."""
 
     def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
         return np.asarray(gap + J @ p)
@@ -212,9 +209,7 @@ def _affine(
 
 
 def _odometry_late(data: Sequence[Reference]) -> float | None:
-    """The time [s] by which intervals of odometry are stamped late, by the turns of the path; None
-    where it is not determined.
-    """
+    """Delay of odometry intervals [s] from the path's turns, or None."""
 
     def step_at(late_ns: int) -> float | None:
         parts = [_turns(each, late_ns) for each in data]
@@ -233,7 +228,7 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
 def _turns(
     data: Reference, late_ns: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The logged turn of each interval, that of the path moved by late_ns, and its derivative by
+    """Logged turn of each interval, the turn of the path moved by late_ns, and its derivative by
     that time [rad, rad, rad/s].
     """
     intervals = data.intervals

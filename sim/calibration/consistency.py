@@ -1,16 +1,13 @@
-"""Learn how consistent submaps are from the maps of single robots, without the truth.
+"""Calibrate submap consistency from maps of single robots, without truth.
 
-A robot's own map a and the map b of the others share no measurement. If the covariances are right,
+A robot's own map a and the others' map b share no measurement. If the covariances are right,
 
     D = min over rigid motions of (a − b)ᵀ (P_a + P_b − P_ab − P_ba)⁻¹ (a − b)
 
-has the mean 2n − 3 for the n landmarks of both. `covariance_factor` is the factor under which ΣD
-over all robots of all worlds has its expected value. It accounts for errors that last longer than
-a window, and for a robust loss, which down-weights inliers, too. Errors that all robots have alike
-do not show in D, but in the distance between the joined map and the true landmarks, where these are
-known (`landmark_sigma`). a and b share the states of the biases that the team has in common
-(`central.common_bias_sigma`), hence P_ab: a marker that reads too far does so for both, from where
-each sees it.
+has mean 2n − 3 for the n common landmarks. `covariance_factor` gives ΣD over all robots and worlds
+its expected value. It covers errors longer than a window, and a robust loss, which down-weights
+inliers. Errors common to all robots show only against the true landmarks (`landmark_sigma`). a and
+b share the states of team-wide biases (`central.common_bias_sigma`), hence P_ab.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,14 +35,14 @@ from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extende
 LEAST_LANDMARKS = 3
 """Two landmarks have one invariant only, their distance."""
 LEAST_ROBOTS = 3
-"""Least number of robots in all worlds together from which a factor is learnt."""
+"""Least number of robots in all worlds together."""
 FARTHEST_M = 1.0
-"""No landmark is measured farther from its place than this."""
+"""Largest distance of a measured landmark from its place."""
 SETTLED = 0.02
-"""The iteration ends when the factor changes by a smaller share than this."""
+"""Relative factor change that ends the iteration."""
 MOST_ROUNDS = 8
 APART = 2**40
-"""The landmarks of the single robot are numbered from here on; no landmark has such a number."""
+"""Offset of the single robot's landmark numbers, above all others."""
 
 
 class Disagreement(NamedTuple):
@@ -62,8 +59,8 @@ def central_figures(
     progress: Callable[[str], None],
     true_landmarks: Sequence[Mapping[int, Float[np.ndarray, "2"]]] = (),
 ) -> tuple[Figure, ...]:
-    """The standard deviations of robots' own biases, the covariance factor that remains with them,
-    the monitor's normal scale, and by the true landmarks of each world the landmarks' own sigma.
+    """Standard deviations of robots' own biases, remaining covariance factor, monitor's normal
+    scale, and landmark sigma from the true landmarks of each world.
     """
     progress("maps of single robots against the rest of their team")
     fields = nest_figures(msgspec.to_builtins(scenario.central), strays, CentralConfig)
@@ -83,10 +80,9 @@ def central_figures(
 
 
 def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """The factor, at least 1, under which ΣD of the single robots' maps has its expected value.
+    """Factor, at least 1, that gives ΣD of single robots' maps its expected value.
 
-    Its standard deviation is from the scatter over the robots. None where fewer than LEAST_ROBOTS
-    robots have a map to compare.
+    Its standard deviation is the scatter over robots. None below LEAST_ROBOTS.
     """
     settings = join_settings(central)
     factor = settings.covariance_factor
@@ -107,11 +103,10 @@ def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure |
 def factor_by_cost(
     refold: Callable[[CentralConfig], Fold], central: CentralConfig
 ) -> Figure | None:
-    """The factor, at least 1, under which the joint cost of the map is its degrees of freedom.
+    """Factor, at least 1, that makes the map's joint cost equal its degrees of freedom.
 
-    For too few robots to compare their maps: it knows only of errors that differ from window to
-    window. The landmarks are associated anew under each factor, as more of them fit where it is
-    larger. Its standard deviation is that of χ². None without degrees of freedom.
+    For too few robots: covers only errors that differ between windows. Landmarks are associated
+    anew under each factor. Standard deviation from χ². None without degrees of freedom.
     """
     factor = central.covariance_factor
     for _ in range(MOST_ROUNDS):
@@ -128,13 +123,11 @@ def factor_by_cost(
 def landmark_sigma(
     teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
 ) -> Figure | None:
-    """The σ [m] under which the shapes of the joined maps are as far from the true landmarks as
-    their covariances P + σ² I predict: Σ χ²(σ) = Σ dof.
+    """σ [m] that explains the joined maps' shape errors: Σ χ²(σ) = Σ dof with covariances P + σ² I.
 
-    Where the robots' maps agree among themselves, the remaining difference between map and truth is
-    common to all robots: they measure another point than the surveyed one. teams: the fold of each
-    world with its true landmarks. The standard deviation is half of what Σ χ² = Σ dof ± √(2 Σ dof)
-    leaves. None where no map has a shape; 0 where the covariances alone are wide enough.
+    Robots whose maps agree share the remaining error: they measure another point than the surveyed
+    one. teams: fold and true landmarks of each world. Standard deviation: half the range of Σ χ² =
+    Σ dof ± √(2 Σ dof). None without a shape; 0 if P suffices.
     """
     settings = replace(join_settings(central), landmark_sigma=0.0)
     maps = []
@@ -168,17 +161,16 @@ def landmark_sigma(
 def _shape_chi2(
     means: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "m m"], truth: np.ndarray
 ) -> float:
-    """χ² of a map's shape, with 2n − 3 degrees of freedom."""
+    """χ² of a map's shape, 2n − 3 degrees of freedom."""
     shape = map_errors(means, covariance, truth).shape
     return 0.0 if shape is None else 0.5 * (2 * len(means) - 3) * shape.nees_per_landmark
 
 
 def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """The covariance scale that the monitor computes under these settings where everything is
-    consistent.
+    """Monitor's covariance scale under these settings for consistent data.
 
-    The geometric mean over the worlds, with the standard deviation from their scatter (of one
-    world: the monitor's own). None where there are too few submaps.
+    Geometric mean over the worlds, standard deviation from their scatter (for one world: the
+    monitor's). None for too few submaps.
     """
     settings = join_settings(central)
     scales, sigmas = [], []
@@ -202,9 +194,7 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
-    """D of each robot of the main island that has at least three landmarks in common with the
-    others.
-    """
+    """D of each main-island robot with at least three landmarks in common with the others."""
     island = fold.main
     robots = sorted({robot for robot, _ in island.graph.streams})
     found = []
@@ -220,10 +210,10 @@ def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
 def _apart(
     island: Island, robot: str, starts: Mapping[Stream, InitialPoseFactor], settings: JoinSettings
 ) -> tuple[Graph, Island]:
-    """The graph of one robot's map beside that of the others, each from its own submaps, solved
-    from the joined map's state; the robot's landmarks are numbered from APART on.
+    """Graph of one robot's map beside the others', from the joined solution, with the robot's
+    landmarks numbered from APART.
 
-    The two maps share the states of the biases that the whole team has in common.
+    The maps share the states of team-wide biases.
     """
     submaps = island.graph.submaps
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
@@ -254,7 +244,7 @@ def _apart(
 
 
 def _between(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> Disagreement:
-    """D of two maps of n landmarks, from their stacked means and their joint covariance."""
+    """D of two maps of n landmarks, from stacked means and joint covariance."""
     a, b = mean.reshape(2, -1, 2)
     a_from_b = rigid_alignment(a, b)
     if a_from_b is None:

@@ -1,4 +1,4 @@
-"""The data of a calibration: a robot's measurements with the reference poses and landmarks."""
+"""Calibration data: a robot's measurements, with reference poses and landmarks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,17 +21,16 @@ from team.estimation.scans import Scan, point_scan, polar_scan
 
 LARGEST_TURN_RAD = 0.35
 FASTEST_TURN_RAD_S = 3.0
-"""A faster turn between two poses of a path is an interpolation fault near a heading of ±π."""
+"""Turn rate above which a path has an interpolation fault near heading ±π."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """One robot's odometry and landmark measurements, and the poses and landmarks of reference.
+    """One robot's odometry and landmark measurements, with reference poses and landmarks.
 
-    name: the world's label, then the robot's id. gap_ns: `path` is interpolated between poses that
-    are at most this far apart. landmarks: position of each id in the path's frame. teammates: the
-    paths of the others. mount: the sensor's pose on the robot's base. turns_first: between two
-    poses the robot turns, then drives straight on (else: an arc).
+    name: world label and robot id. gap_ns: longest interpolated gap of `path`. landmarks: in the
+    path's frame. mount: sensor pose on the base. turns_first: between poses the robot turns, then
+    drives straight (else an arc).
     """
 
     name: str
@@ -48,11 +47,11 @@ class Reference:
 
     @property
     def robot(self) -> str:
-        """The robot's id, the last part of the name."""
+        """Robot id from the name."""
         return self.name.rpartition(" ")[2]
 
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
-        """The same with only the odometry and the measurements of [begin_ns, end_ns)."""
+        """Restrict odometry and measurements to [begin_ns, end_ns)."""
         chosen = (self.intervals.end_ns >= begin_ns) & (self.intervals.end_ns < end_ns)
         seen, sighted = (_between(each, begin_ns, end_ns) for each in (self.seen, self.sighted))
         return replace(self, intervals=self.intervals.where(chosen), seen=seen, sighted=sighted)
@@ -66,7 +65,7 @@ def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
 def sensor_poses(
     data: Reference, stamps_ns: Int64[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """The poses of the sensor at these times, and which of them are known."""
+    """Sensor poses at these times, and a mask of known ones."""
     poses, known = poses_at(data.path, stamps_ns, data.gap_ns, turns_first=data.turns_first)
     if not any(data.mount):
         return poses, known
@@ -77,7 +76,7 @@ def sensor_poses(
 
 
 def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
-    """Odometry of any form as mean speeds; increments give the speeds of their arc."""
+    """Convert odometry of any form to mean speeds; increments as arcs."""
     speeds = np.column_stack([intervals.forward, intervals.yaw_rate])
     if intervals.steered:
         speeds = np.array([steered(motion, *pair) for pair in speeds.tolist()]).reshape(-1, 2)
@@ -90,8 +89,8 @@ def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
 
 
 def scan_of(seen: ObservationMeasurement) -> Scan:
-    """The scan as a robot's front end receives it: detections without identities have the numbers
-    of their rows, and never those of their labels.
+    """Scan as received by the front end: detections without identities carry row numbers, not
+    labels.
     """
     ids = seen.ids
     if seen.hidden:
@@ -102,7 +101,7 @@ def scan_of(seen: ObservationMeasurement) -> Scan:
 
 
 def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> OdometryInterval:
-    """The interval of odometry as a robot's front end receives it."""
+    """Odometry interval as received by the front end."""
     if measurement.increment is not None:
         motions = moved(measurement.increment, measurement.covariance)
         rates = motions.twist / (measurement.duration_ns * 1e-9)
@@ -117,12 +116,14 @@ def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> Odomet
 def poses_at(
     path: Path, stamps_ns: Int64[np.ndarray, " n"], gap_ns: int, *, turns_first: bool = False
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """The poses of a path at these times, and which of them are known.
+    """Path poses at these times, and a mask of known ones.
 
-    Between two poses the path is the arc that joins them: at a share s of it from (p, θ), the pose
-    is (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ). With turns_first it is the
-    chord, with the heading of its end. Unknown are poses outside the path, in a gap longer than
-    gap_ns, and beside a jump of the heading.
+    Between two poses the path is their arc; at a share s from (p, θ) the pose is
+
+        (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ).
+
+    With turns_first it is the chord with the final heading. Unknown: outside the path, in a gap
+    longer than gap_ns, or beside a heading jump.
     """
     if len(path.stamps_ns) < 2:
         return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)
@@ -147,7 +148,7 @@ def poses_at(
 
 
 def sinc(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """sin(angle)/angle, 1 at 0: the chord of an arc over its length, by half the turn."""
+    """sin(angle)/angle, 1 at 0: chord over arc length, by half the turn."""
     return np.asarray(np.sinc(angle / np.pi))
 
 
@@ -160,10 +161,10 @@ def references(
     turning_first: frozenset[str] = frozenset(),
     models: RobotConfig | None = None,
 ) -> list[Reference]:
-    """The references of the robots that have a path and odometry.
+    """References of the robots with a path and odometry.
 
-    turning_first: the robots that turn before they drive straight on. models: the robots' models,
-    which convert odometry to motion.
+    turning_first: robots that turn, then drive straight. models: robots' models, which convert
+    odometry to motion.
     """
     robot = models or RobotConfig("any")
     return [
@@ -186,7 +187,7 @@ def references(
 
 
 def true_paths(streams: Sequence[RobotStream]) -> dict[str, Path]:
-    """The true paths of the robots that have one."""
+    """True paths of the robots that have one."""
     return {
         stream.robot: Path(stream.truth_ns, stream.truth)
         for stream in streams

@@ -1,17 +1,14 @@
-"""Learn from detections without identities how many are clutter and how many are missed.
+"""Calibrate clutter and miss rates from detections without identities.
 
-Each window is associated anew, without any identity (`team.estimation.association`). After the scan
-that found a landmark first, every scan that looks at its place is a trial: with n of them, v
-detections are binomial with the detection probability p. A scan looks at a place if the place lies
-between the nearest and the farthest, and between the outermost bearings, of the other landmarks
-that the scan detected; whether it detected the landmark itself is left out of that, else p would be
-too large.
-Clutter is seen again by chance alone, with probability g in each. The share of clutter among the
-landmarks that were found, p and g are those of the greatest likelihood (expectation and
-maximisation). Landmarks that are seen as rarely as clutter count as clutter.
+Each window is associated anew without identities (`team.estimation.association`). After a
+landmark's first detection, each scan that covers its place is a trial: of n trials, v detections
+are binomial with detection probability p. A scan covers a place within the range and bearing span
+of the other landmarks it detected; including the landmark itself would bias p upward. Clutter
+recurs by chance with probability g. The clutter share of found landmarks, p and g maximise the
+likelihood (expectation and maximisation). Landmarks seen as rarely as clutter count as clutter.
 
-What the detections' covariances claim is compared with the cost of the smoothed windows, which has
-the mean of one for each degree of freedom where the claims of detections and odometry are right.
+Claimed covariances are compared with the smoothed windows' cost, whose mean is one per degree of
+freedom if detection and odometry covariances are right.
 """
 
 from collections.abc import Sequence
@@ -32,18 +29,18 @@ from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 
 LEAST_TRIALS = 50
-"""Least number of trials from which the rates are learnt."""
 LEAST_SEEN = 3
-"""A landmark of so many detections is no clutter. Only such landmarks say what a scan looked at:
-clutter may lie farther off than any landmark can be seen."""
+"""Detections that exclude clutter. Only such landmarks define a scan's coverage, since clutter may
+lie beyond the visible range.
+"""
 GROUPS = 5
-"""Number of stretches of all windows that are left out in turn."""
+"""Number of stretches of windows left out in turn."""
 ROUNDS = 200
 SETTLED = 1e-6
 DIFFERENT = 1.3
-"""A claim does not hold where the errors are more than this factor larger, or smaller."""
+"""Error ratio from which a claimed covariance is wrong."""
 UNLIKE = 0.1
-"""A detection probability that differs by more than this from the scenario's is noted."""
+"""Reported difference in detection probability."""
 
 UNITS = {
     "detection_probability": "",
@@ -54,11 +51,10 @@ UNITS = {
 
 
 class WindowLooks(NamedTuple):
-    """The repeated detections in the scans of one window.
+    """Repeated detections in the scans of one window.
 
-    trials, again: for each landmark, the number of scans that looked at its place after its first
-    detection, and of those of them that detected it. further: number of its other detections.
-    area [m²]: of the view, times the number of scans. cost, dof: of the smoothed window.
+    trials, again: for each landmark, scans that cover its place after its first detection, and
+    detections among them. area [m²]: view area times scans. cost, dof: of the smoothed window.
     """
 
     trials: Int64[np.ndarray, " L"]
@@ -71,9 +67,7 @@ class WindowLooks(NamedTuple):
 
 
 def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
-    """The windows of a robot that have detections without identities; one without a solution is
-    left out.
-    """
+    """A robot's solvable windows with detections without identities."""
     if stream.landmark_detections.hidden is None:
         return []
     front = config.front_end
@@ -109,7 +103,7 @@ def _looks(scans: Scans, settings: AssociationSettings) -> list[WindowLooks]:
 
 
 def looks_of(found: Clusters) -> WindowLooks:
-    """The trials of each landmark of a window, and which of them found it."""
+    """Trials and detections of each landmark of a window."""
     scans, landmarks = found.scans, found.window.landmarks
     unnamed = found.names == UNASSIGNED
     trials = np.zeros(len(landmarks), np.int64)
@@ -151,9 +145,8 @@ def looks_of(found: Clusters) -> WindowLooks:
 
 
 class Rates(NamedTuple):
-    """detected: probability that a landmark in view is detected. share: of the detections, what is
-    clutter. density: clutter per scan and square metre of its view. claimed: squared errors inside
-    windows in units of what is claimed.
+    """detected: detection probability of a landmark in view. share: clutter share of detections.
+    density: clutter per scan and square metre of view. claimed: squared window errors over claims.
     """
 
     detected: float
@@ -163,7 +156,7 @@ class Rates(NamedTuple):
 
 
 def rates(windows: Sequence[WindowLooks]) -> Rates | None:
-    """The rates of the greatest likelihood; None where there are fewer than LEAST_TRIALS trials."""
+    """Maximum-likelihood rates; None below LEAST_TRIALS."""
     n, v, more = (
         np.concatenate([np.zeros(0, np.int64), *(getattr(each, name) for each in windows)])
         for name in ("trials", "again", "further")
@@ -182,7 +175,7 @@ def rates(windows: Sequence[WindowLooks]) -> Rates | None:
             break
     clutter, seen = _clutter(v, n, p, g, share), 1 + v + more
     few, judged = seen < LEAST_SEEN, n > 0
-    if (few & judged).any():  # where no scan looked again, as many are clutter as elsewhere
+    if (few & judged).any():  # without repeated scans, assume the same clutter share
         clutter[~judged] = clutter[few & judged].mean()
     false = float((clutter * seen)[few].sum())
     cost, dof = (sum(getattr(each, name) for each in windows) for name in ("cost", "dof"))
@@ -197,9 +190,9 @@ def rates(windows: Sequence[WindowLooks]) -> Rates | None:
 def _clutter(
     v: Int64[np.ndarray, " L"], n: Int64[np.ndarray, " L"], p: float, g: float, share: float
 ) -> Float[np.ndarray, " L"]:
-    """The probability of each landmark that was found to be clutter.
+    """Probability that each found landmark is clutter.
 
-    The binomial coefficient of both hypotheses is the same.
+    The binomial coefficients of both hypotheses cancel.
     """
     real = v * np.log(p) + (n - v) * np.log1p(-p) + np.log1p(-min(share, 1.0 - 1e-9))
     false = v * np.log(g) + (n - v) * np.log1p(-g) + np.log(max(share, 1e-9))
@@ -208,7 +201,7 @@ def _clutter(
 
 
 def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
-    """The rates of all windows, with their uncertainty from leaving out stretches of them."""
+    """Rates of all windows, with uncertainty from leaving out stretches."""
     if len(windows) < GROUPS:
         return ()
     edges = np.linspace(0, len(windows), GROUPS + 1).astype(int)
@@ -224,7 +217,7 @@ def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
 def claim_notes(
     figures: Sequence[Figure], central: Sequence[Figure], settings: AssociationSettings
 ) -> tuple[str, ...]:
-    """Warnings where claimed covariances do not hold, in words."""
+    """Warnings about wrong claimed covariances."""
     value = {each.name: each.value for each in (*figures, *central)}
     notes = []
     inside, between = value.get("errors_over_claims", 1.0), value.get("covariance_factor", 1.0)
@@ -241,7 +234,7 @@ def claim_notes(
     detected = value.get("detection_probability")
     if detected is not None and abs(detected - settings.detection_probability) > UNLIKE:
         notes.append(
-            f"{detected:.0%} of the landmarks in view are detected, the scenario says "
+            f"{detected:.0%} of the landmarks in view are detected, the scenario has "
             f"{settings.detection_probability:.0%}"
         )
     return tuple(notes)

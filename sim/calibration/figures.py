@@ -1,4 +1,4 @@
-"""Learnt figures with their uncertainty by the jackknife, and models with these figures in them."""
+"""Calibrated figures with jackknife uncertainty, and models that contain them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +16,9 @@ from sim.scenarios.scenario import Scenario
 from team.config import MotionModel, Sensor
 
 GROUPS = 5
-"""Least number of parts that are left out in turn; fewer robots are cut into equal stretches of
-time.
-"""
+"""Least number of parts left out in turn; fewer robots are cut into equal time stretches."""
 
 HUBER = 2.0
-"""The loss is linear beyond this number of standard deviations."""
 
 T = TypeVar("T")
 Fit = Callable[[Sequence[T]], Mapping[str, float]]
@@ -33,9 +30,7 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class Figure:
-    """One learnt number: its place in a scenario, its value, its standard deviation and its
-    unit.
-    """
+    """Calibrated number: place in a scenario, value, standard deviation, unit."""
 
     name: str
     value: float
@@ -48,7 +43,7 @@ def huber(
     sigma: Float[np.ndarray, " n"],
     start: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """The parameters that minimise Huber's loss of residual/sigma, linear beyond HUBER."""
+    """Minimise Huber's loss of residual/sigma, linear beyond HUBER."""
 
     def weighted(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
         return np.asarray(residual(p) / sigma)
@@ -58,9 +53,7 @@ def huber(
 
 
 def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
-    """Groups that are as independent as possible: the robots of each data set, or stretches of time
-    of each.
-    """
+    """Most independent groups: robots of each data set, or time stretches of each."""
     pieces = -(-GROUPS // len(data))
     if pieces == 1:
         return [[each] for each in data]
@@ -75,18 +68,18 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
 def jackknife(
     fit: Fit[Reference], data: Sequence[Reference], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """The fit of all data, with the uncertainty of `left_out` over robots or stretches of time."""
+    """Fit all data, with the uncertainty of `left_out` over robots or time stretches."""
     return left_out(fit, groups_of(data), units)
 
 
 def left_out(
     fit: Fit[T], groups: Sequence[Sequence[T]], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """The fit of all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)²; Efron and
-    Stein 1981.
+    """Fit all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)²; Efron and Stein
+    1981.
 
-    Errors may be correlated within a group; between groups they are independent. A figure that the
-    data without one group do not determine is left out.
+    Errors may be correlated within a group, not between groups. A figure that leaving out a group
+    makes undetermined is omitted.
     """
     values = fit([part for group in groups for part in group])
     rest = [
@@ -113,9 +106,7 @@ def with_figures(
     of_sensor: Sequence[Figure],
     of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
 ) -> Scenario:
-    """The scenario with the learnt figures in every robot's models; a robot's own figures take
-    precedence.
-    """
+    """Scenario with the figures in every robot's models; a robot's own take precedence."""
     robots = tuple(
         msgspec.structs.replace(
             robot,
@@ -139,10 +130,10 @@ def with_figures(
 def nest_figures(
     below: Mapping[str, object], figures: Sequence[Figure], declared: type[msgspec.Struct]
 ) -> dict[str, object]:
-    """The fields of a model overlaid with figures: `forward.per_m` is a field of `forward`.
+    """Overlay a model's fields with figures: `forward.per_m` is a field of `forward`.
 
-    A learnt density replaces all three densities of its noise. A figure that is no field of the
-    model (a share of outliers) is left out.
+    A density replaces all three densities of its noise. A figure that is no field of the model (an
+    outlier share) is omitted.
     """
     names = {field.name for field in msgspec.structs.fields(declared)}
     fields = dict(below)

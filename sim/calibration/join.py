@@ -1,4 +1,4 @@
-"""The team's map and paths from its own measurements: the reference where there is no truth."""
+"""Team map and paths from its own measurements: the reference without truth."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,12 +39,12 @@ from team.estimation.map_joining.joining import (
 )
 
 LONGEST_NS = 250_000_000
-"""Intervals of an arc are merged up to this length: a window closes at the end of an interval."""
+"""Longest merged arc interval, since windows close at interval ends."""
 
 
 @dataclass(frozen=True)
 class _Track:
-    """One closed window: its submap, and the mean path of its particles in the submap's frame."""
+    """Closed window: submap, and mean particle path in its frame."""
 
     closed: ClosedWindow
     stamps_ns: Int64[np.ndarray, " K"]
@@ -53,7 +53,7 @@ class _Track:
 
 @dataclass(frozen=True)
 class JoinedTeam:
-    """The landmarks by id and each robot's path in the frame of the joined map, and the fold."""
+    """Landmarks by id and robot paths in the joined map's frame, and the fold."""
 
     landmarks: Mapping[int, Float[np.ndarray, "2"]]
     paths: Mapping[str, Path]
@@ -64,12 +64,10 @@ class JoinedTeam:
 def joined_team(
     world: WorldStreams, scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> JoinedTeam:
-    """The joined map of every robot's windows under the scenario's models; robots of the main
-    island only.
+    """Join every robot's windows under the scenario's models; main island only.
 
-    Between two window ends a path is the particles' mean, moved so that it ends at the joined pose.
-    progress: called with the name of each robot whose windows are done. Raises CalibrationError
-    where there is no submap.
+    Between window ends a path is the particle mean, moved to end at the joined pose. progress:
+    receives each finished robot. Raises CalibrationError without submaps.
     """
     tracks = {}
     for each in world.streams:
@@ -109,7 +107,7 @@ def fold_of(
     starts: Iterable[InitialPoseFactor],
     central: CentralConfig,
 ) -> Fold:
-    """The solved fold of these submaps; landmarks without identities are associated."""
+    """Solved fold of these submaps, with unnamed landmarks associated."""
     fold: Fold = EMPTY_FOLD
     for start in starts:
         fold = started(fold, start)
@@ -128,9 +126,7 @@ def fold_of(
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:
-    """The robot's configuration; a robot that the scenario does not have gets the first robot's
-    models.
-    """
+    """Configuration of the robot, or the first robot's models for an unknown one."""
     configs = {each.id: each for each in scenario.robots}
     return configs.get(robot) or msgspec.structs.replace(scenario.robots[0], id=robot)
 
@@ -160,11 +156,11 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
 def _merged(
     stream: RobotStream, longest_ns: int
 ) -> Iterator[ObservationMeasurement | OdometryMeasurement]:
-    """The stream's scans and odometry, with intervals of one command between two scans merged.
+    """A stream's scans and odometry, with intervals of one command between scans merged.
 
-    No interval becomes longer than longest_ns. A command that is logged ten times is one arc, and
-    motion noise is a density: the estimate stays the same, up to the correlation of the noises
-    within an interval and to where a window closes.
+    Merged intervals are at most longest_ns. A command logged ten times is one arc, and motion noise
+    is a density: the estimate is unchanged, up to noise correlation within an interval and window
+    closing times.
     """
     pending: OdometryMeasurement | None = None
     for counter in range(1, len(stream)):
@@ -186,9 +182,7 @@ def _merged(
 
 
 def _goes_on(one: OdometryMeasurement, then: OdometryMeasurement, longest_ns: int) -> bool:
-    """Whether the second interval follows without a gap and by the same command, and both are
-    short.
-    """
+    """Whether the second interval continues the first by the same command, both being short."""
     return (
         then.stamp_ns - then.duration_ns == one.stamp_ns
         and one.increment is None

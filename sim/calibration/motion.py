@@ -1,4 +1,4 @@
-"""Maximum likelihood of the odometry's model: scales, drag, veer and densities of noise."""
+"""Maximum-likelihood odometry model: scales, drag, veer and noise densities."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from sim.calibration.figures import CalibrationError, huber
 from sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S
 
 STEPS = 40
-"""Number of steps of a span, each an arc (or a rotation and a chord) of the true path."""
+"""Steps of a span, each an arc (or rotation and chord) of the true path."""
 STEP_S = SPAN_S / STEPS
 ROUNDS = 4
 STANDING_M_S = 1e-3
 """Speeds below this [m/s] count as standing."""
 FLOOR_VARIANCE = 1e-6
-"""Variance of a span without motion: a millimetre, a milliradian of the reference itself."""
+"""Variance of a motionless span: a millimetre, a milliradian of the reference."""
 
 UNITS = {
     "forward_scale": "",
@@ -35,7 +35,7 @@ UNITS = {
 }
 
 LEAST_SLOW_S = 20.0
-"""Least time [s] at low speed from which the scale of low speeds is learnt."""
+"""Least time [s] at low speed for its scale."""
 
 Numbers = Float[np.ndarray, " p"]
 Pair = Float[np.ndarray, "2"]
@@ -45,9 +45,7 @@ Values = Float[np.ndarray, " spans"]
 
 @dataclass(frozen=True)
 class _Spans:
-    """The steps of each span: logged mean speed and yaw rate, and true forward and lateral
-    translation and rotation.
-    """
+    """Steps of each span: logged mean speed and yaw rate; true forward, lateral and rotation."""
 
     speed: Grid
     yaw_rate: Grid
@@ -57,17 +55,17 @@ class _Spans:
 
     @property
     def way(self) -> Values:
-        """The length of the true path [m]."""
+        """True path length [m]."""
         return np.asarray(np.abs(self.forward).sum(axis=1))
 
     @property
     def driven(self) -> Values:
-        """The true forward translation [m]."""
+        """True forward translation [m]."""
         return np.asarray(self.forward.sum(axis=1))
 
     @property
     def turned(self) -> Values:
-        """The true rotation [rad]."""
+        """True rotation [rad]."""
         return np.asarray(self.turn.sum(axis=1))
 
     def rates(self, yaw_scale: float, limit: float) -> Grid:
@@ -75,21 +73,19 @@ class _Spans:
         return np.asarray(np.clip(yaw_scale * self.yaw_rate, -limit, limit))
 
     def slow(self, below: float) -> Grid:
-        """1 where the robot drives at a logged speed below this [m/s] and does not stand;
-        else 0.
-        """
+        """1 for a moving step below this logged speed [m/s], else 0."""
         speed = np.abs(self.speed)
         return np.asarray(((speed < below) & (speed > STANDING_M_S)).astype(np.float64))
 
     def forward_of(self, p: Numbers, yaw_scale: float, limit: float, below: float) -> Values:
-        """The model's translation for p = (forward_scale, turn_drag, slow_scale or nothing) [m]."""
+        """Modelled translation for p = (forward_scale, turn_drag, slow_scale or nothing) [m]."""
         lost = p[1] * np.abs(self.rates(yaw_scale, limit))
         scale = p[0] + (p[2] - p[0]) * self.slow(below) if len(p) > 2 else p[0]
         speed = np.maximum(scale * np.abs(self.speed) - lost, 0.0)
         return np.asarray((np.sign(self.speed) * speed).sum(axis=1) * STEP_S)
 
     def turn_of(self, p: Pair, limit: float) -> Values:
-        """The model's rotation for p = (yaw_scale, veer) on the true path [rad]."""
+        """Modelled rotation for p = (yaw_scale, veer) on the true path [rad]."""
         return np.asarray(self.rates(p[0], limit).sum(axis=1) * STEP_S + p[1] * self.driven)
 
 
@@ -128,19 +124,19 @@ def _steps_of(data: Reference) -> Float[np.ndarray, "spans steps 5"]:
 
 
 def creep(data: Sequence[Reference], slow_below: float) -> bool:
-    """Whether the robots drove at low speed for long enough to learn its scale."""
+    """Whether low speeds last long enough for their scale."""
     return bool(_spans(data).slow(slow_below).sum() * STEP_S >= LEAST_SLOW_S)
 
 
 def fit_motion(
     data: Sequence[Reference], yaw_rate_limit: float | None, slow_below: float = 0.0
 ) -> Mapping[str, float]:
-    """The model of `increment_of` whose errors over SPAN_S are most likely.
+    """Fit the model of `increment_of` with the likeliest errors over SPAN_S.
 
-    With slow_below [m/s] the scale below that speed is learnt, too; ask `creep` first. Alternates
-    weighted least squares of the scales under Huber's loss with the likelihood of the densities σ²
-    = per_m² |d| + per_rad² |φ| of the residuals (each maximises the likelihood given the other).
-    Raises CalibrationError where there is too little motion.
+    With slow_below [m/s], the scale below that speed is fitted, too; check `creep` first.
+    Alternates weighted least squares of the scales under Huber's loss with the likelihood of the
+    residuals' densities σ² = per_m² |d| + per_rad² |φ|. Raises CalibrationError for too little
+    motion.
     """
     spans = _spans(data)
     moving = np.abs(spans.speed).mean(axis=1) * SPAN_S > LEAST_WAY_M

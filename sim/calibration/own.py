@@ -1,15 +1,15 @@
-"""Learn which constants single robots' sensors have, and how they vary from world to world.
+"""Calibrate single robots' sensor constants and their variation between worlds.
 
-A constant of robot r in world w is v = m + a_r + e_rw. Each robot's value is its mean over the
-worlds, shrunk towards the mean of all robots by the uncertainty that the spread s of e leaves:
+A constant of robot r in world w is v = m + a_r + e_rw. Each robot's value is its mean over worlds,
+shrunk towards the mean of all robots by the spread s of e:
 
     m + (v̄_r − m) τ²/(τ² + s²/n_r),    τ² = var(v̄_r) − mean(s²/n_r).
 
-Where τ² is not significant for any constant (F test) all robots have the same. s is a robust
-estimate, so that one camera that was moved between two worlds does not count.
+Robots are alike unless τ² is significant for some constant (F test). s is a robust estimate, so one
+moved camera does not count.
 
-Landmarks have an error of their own, too: a marker that hangs higher or is larger than the others
-reads too far by a share of the range, for every robot (`marker_spread`).
+Landmarks, too, have range-proportional errors common to all robots, such as a marker that hangs
+higher or is larger (`marker_spread`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,26 +24,22 @@ from sim.calibration.figures import CalibrationError, Figure, groups_of
 from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
 
 LEAST_ROBOTS = 3
-"""Least number of robots from which their variation is learnt."""
 LEAST_LANDMARKS = 4
-"""Least number of landmarks from which their variation is learnt."""
 BEYOND_DOUBT = 0.99
 COMMON_DOF = 2
-"""The prior of the common range scale counts as this number of further worlds, with a robot's own
-spread.
-"""
+"""Prior of the common range scale, as a number of further worlds with a robot's own spread."""
 BIAS_OF = {
     "bearing_offset": "bearing",
     "range_offset": "range_offset",
     "range_scale": "range_scale",
 }
-"""The bias that the centre estimates for each constant, where there is one."""
+"""Bias that the centre estimates for each constant."""
 
 
 class Own(NamedTuple):
-    """robots: figures of each robot's sensor, empty where all are alike. strays: of each bias, how
-    far a robot's constant in a further world is from that figure, √(s² + variance of the figure);
-    and σ of the range scale that all have in common.
+    """robots: sensor figures of each robot, empty if alike. strays: per bias, expected deviation of
+    a robot's constant in a further world, √(s² + variance of the figure), and σ of the common range
+    scale.
     """
 
     robots: Mapping[str, tuple[Figure, ...]]
@@ -54,9 +50,7 @@ NOTHING_OF_ITS_OWN = Own({}, ())
 
 
 def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
-    """Each robot's own constants over the worlds (or over stretches of time where there are few
-    worlds).
-    """
+    """Each robot's constants over the worlds (or time stretches, for few worlds)."""
     found: dict[str, list[Mapping[str, float]]] = {}
     worlds: dict[str, list[str]] = {}
     for group in groups_of(data):
@@ -97,7 +91,7 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
 
 
 def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
-    """The spread of a robot's values about their mean, by the median of |v − v̄| √(n/(n − 1))."""
+    """Spread of a robot's values, from the median of |v − v̄| √(n/(n − 1))."""
     off = [np.abs(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in parts]
     return MAD_TO_SIGMA * float(np.median(np.concatenate(off)))
 
@@ -105,8 +99,7 @@ def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
 def _in_common(
     parts: Sequence[Float[np.ndarray, " n"]], worlds: Sequence[Sequence[str]], stray: float
 ) -> Figure:
-    """The standard deviation, from world to world, of the range scale that all robots have in
-    common.
+    """Standard deviation between worlds of the robots' common range scale.
 
     parts: each robot's values, in the worlds of these names.
     """
@@ -124,12 +117,11 @@ def _in_common(
 
 
 def marker_spread(data: Sequence[Reference], *, depth: bool) -> Figure | None:
-    """The standard deviation of single landmarks' range scales, relative, for all robots of a
-    world.
+    """Relative standard deviation of single landmarks' range scales.
 
-    The share e_rl by which robot r sees landmark l too far, given r's own constants, is m_l + ε_rl:
-    var(m) = var(ē_l) − var(ε) mean(1/n_l) of the n_l robots that see it. None where that is not
-    significant (F test): where no two robots of a world see one landmark, or few landmarks.
+    The share e_rl by which robot r sees landmark l too far, given r's constants, is m_l + ε_rl:
+    var(m) = var(ē_l) − var(ε) mean(1/n_l) of the n_l robots that see it. None if not significant (F
+    test), for few landmarks, or if no two robots share one.
     """
     by_world: dict[str, dict[int, list[float]]] = {}
     for each in data:

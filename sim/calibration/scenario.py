@@ -1,4 +1,4 @@
-"""A calibration as a scenario in TOML that a user can read, with each figure's uncertainty."""
+"""A calibration as a readable TOML scenario with uncertainties."""
 
 import os
 from collections.abc import Collection, Sequence
@@ -21,9 +21,7 @@ Fields = dict[str, Any]
 
 
 def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
-    """A TOML document whose `base` is the scenario's name if it is built in, else its data
-    set's.
-    """
+    """TOML document whose `base` is the built-in scenario's name, or the data set's."""
     world = scenario.world
     otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
     base = scenario.name if scenario.name in builtin_names() else otherwise
@@ -47,12 +45,11 @@ def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequenc
 
 
 def within(own: str, calibration: Calibration, sources: Sequence[str], output: Path) -> str:
-    """The user's scenario in the file `own` with the learnt figures in it, as the text of the file
-    `output`.
+    """Text of `output`: the user's scenario `own` with the calibrated figures.
 
-    What was learnt is every robot's, so no robot has another value of it except one learnt for that
-    robot. All other fields stay. A scenario that names one robot names all of the team: where the
-    user's names none and one robot has a figure of its own, all robots of the data are named.
+    Common figures replace all robots' values, except figures of single robots. Other fields stay. A
+    scenario must name all robots or none, so all are named if it names none and a robot has figures
+    of its own.
     """
     document = own_document(own)
     world = document.get("world", {})
@@ -100,7 +97,7 @@ def _rounded(figure: Figure) -> Figure:
 
 
 def _without(table: Fields, path: Sequence[str], keys: Collection[str]) -> Fields:
-    """The table without these keys in its inner table at a path; that goes where it is empty."""
+    """Remove keys from the inner table at a path, and the table if empty."""
     if not path:
         return {key: value for key, value in table.items() if key not in keys}
     if path[0] not in table:
@@ -122,7 +119,6 @@ def _head(calibration: Calibration, sources: Sequence[str]) -> list[str]:
 def _parts(
     calibration: Calibration,
 ) -> tuple[tuple[str, Sequence[Figure], type[msgspec.Struct]], ...]:
-    """The figures by their place in a scenario."""
     return (
         ("defaults.motion", calibration.motion, MotionModel),
         ("defaults.sensor", calibration.sensor, Sensor),
@@ -132,7 +128,7 @@ def _parts(
 
 
 def _inline(value: object) -> str:
-    """A number, or a table of numbers and tables, on one line."""
+    """Number, or table of numbers and tables, on one line."""
     if not isinstance(value, dict):
         return f"{value:.5g}"
     return "{ " + ", ".join(f"{key} = {_inline(each)}" for key, each in value.items()) + " }"

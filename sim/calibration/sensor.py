@@ -1,10 +1,8 @@
-"""Maximum likelihood of the range-bearing sensor's model: affine range, noise and its correlation
-time.
+"""Maximum-likelihood range-bearing model: affine range, noise and correlation time.
 
-Where the range is a depth along the optical axis, range = scale · distance · cos(b − axis) + offset
-with the raw bearing b. The noise is fitted with each robot's own constants (scale, offset, axis,
-bearing offset) and is the same for all; the constants of all together serve a robot that is not in
-the data.
+For a depth along the optical axis, range = scale · distance · cos(b − axis) + offset with raw
+bearing b. The common noise is fitted with each robot's constants (scale, offset, axis, bearing
+offset); the constants of all together serve unknown robots.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,14 +22,12 @@ from team.estimation.models import corrected
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4
 OUTLIER = 4.0
-"""Measurements beyond this number of standard deviations are left out of spreads and
-correlations.
-"""
+"""Standard deviations beyond which measurements are left out of spreads and correlations."""
 MAD_TO_SIGMA = 1.4826
 LAGS_S = np.geomspace(0.1, 30.0, 9)
-"""Edges of the lags [s] at which the errors of one landmark are correlated."""
+"""Lag edges [s] of the error correlation of one landmark."""
 NEIGHBOURS = 64
-"""Pairs of measurements of one landmark are formed up to this number of measurements apart."""
+"""Largest index distance of paired measurements of a landmark."""
 
 UNITS = {
     "range_offset": "m",
@@ -55,9 +51,9 @@ UNITS = {
 
 @dataclass(frozen=True)
 class _Rows:
-    """Measurements with their true values: distances [m] and bearings [rad].
+    """Measurements with true distances [m] and bearings [rad].
 
-    series: equal for measurements of one landmark by one robot; the rows ascend by (series, time).
+    series: equal for one landmark and robot; rows ascend by (series, time).
     """
 
     series: Int64[np.ndarray, " n"]
@@ -96,11 +92,9 @@ def _rows(data: Sequence[Reference]) -> _Rows:
 
 
 class Constants(NamedTuple):
-    """The constants of one camera: range = scale · d · cos(b − axis) + offset [m], bearing +
-    offset.
+    """Camera constants: range = scale · d · cos(b − axis) + offset [m], bearing + offset.
 
-    axis: None where the range is the distance itself. lens: the coefficients of b, b² and b³ by
-    which a camera's bearings are too large in addition.
+    axis: None if the range is the distance. lens: coefficients of b, b² and b³ of excess bearing.
     """
 
     range_scale: float
@@ -111,7 +105,7 @@ class Constants(NamedTuple):
 
     @property
     def figures(self) -> dict[str, float]:
-        """The constants by the names of the fields of `Sensor`."""
+        """Constants by the fields of `Sensor`."""
         named = {
             "range_offset": self.range_offset,
             "range_scale": self.range_scale,
@@ -126,7 +120,7 @@ class Constants(NamedTuple):
     def distances(
         self, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
-        """The distances [m] of raw ranges at these bearings; NaN far from the axis."""
+        """Distances [m] of raw ranges at these bearings; NaN far from the axis."""
         sensor = Sensor(
             range_offset=self.range_offset,
             range_scale=self.range_scale,
@@ -137,10 +131,10 @@ class Constants(NamedTuple):
 
 
 def constants(data: Sequence[Reference], *, depth: bool) -> Constants:
-    """The constants of all measurements together, as of one camera.
+    """Fit the constants of all measurements as one camera.
 
-    Ranges are fitted under Huber's loss in units of their noise, bearings by their median, since
-    outliers come in bursts. Raises CalibrationError where there are too few measurements.
+    Ranges under Huber's loss in units of noise, bearings by the median, since outliers come in
+    bursts. Raises CalibrationError for too few measurements.
     """
     return _constants(_enough(_rows(data)), depth)
 
@@ -174,7 +168,7 @@ def _constants(rows: _Rows, depth: bool) -> Constants:
 
 
 def _lens(rows: _Rows, offset: float) -> list[float]:
-    """The bearings' offset and lens: a cubic of the raw bearing under Huber's loss."""
+    """Fit bearing offset and lens: a cubic of the raw bearing under Huber's loss."""
     error = on_circle(rows.bearing_errors - offset)
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(error)))
     powers = rows.bearings[:, np.newaxis] ** np.arange(4)
@@ -188,12 +182,12 @@ def _lens(rows: _Rows, offset: float) -> list[float]:
 
 
 def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str, float]:
-    """The model of `Sensor` under which the measurements are most likely.
+    """Fit the likeliest `Sensor` model.
 
-    The constants are those of all robots together. The noise is that of the residuals under each
-    robot's own constants: σ² = σ₀² + (σ₁ d)² by likelihood, of bearings the median absolute
-    deviation. The shares are those of ρ(τ) = (1 − white) exp(−τ/T), fitted to the correlation of
-    one landmark's errors. Raises CalibrationError where there are too few measurements.
+    Constants are those of all robots together. Noise is that of residuals under each robot's
+    constants: σ² = σ₀² + (σ₁ d)² by likelihood, for bearings the median absolute deviation. Shares
+    are those of ρ(τ) = (1 − white) exp(−τ/T), fitted to one landmark's error correlation. Raises
+    CalibrationError for too few measurements.
     """
     common = constants(data, depth=depth)
     parts = []
@@ -231,11 +225,9 @@ def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str
 
 
 def shares_by_landmark(data: Reference, *, depth: bool) -> dict[int, float]:
-    """The share of its range by which each landmark is seen too far, given the robot's own
-    constants.
+    """Relative excess range of each landmark, given the robot's constants.
 
-    Medians less their mean, of landmarks with at least LEAST_MEASUREMENTS; empty where there are
-    too few.
+    Medians less their mean, of landmarks with at least LEAST_MEASUREMENTS; empty if too few.
     """
     rows = _rows([data])
     if len(rows.series) < LEAST_MEASUREMENTS:
@@ -263,7 +255,7 @@ def _range_noise(
     distance: Float[np.ndarray, " n"],
     sigma: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "2"]:
-    """(σ₀, σ₁) of the errors within OUTLIER of the last σ, by maximum likelihood."""
+    """(σ₀, σ₁) of errors within OUTLIER of the last σ, by maximum likelihood."""
     inside = np.abs(error) < OUTLIER * sigma
     error, distance = error[inside], distance[inside]
 
@@ -280,16 +272,16 @@ def _persistence(
     seconds: Float[np.ndarray, " n"],
     relative: Float[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """(white share, correlation time [s]) of errors in units of σ; (1, 0) where no correlation
-    lasts to a landmark's next measurement.
+    """(white share, correlation time [s]) of errors in units of σ; (1, 0) if no correlation lasts
+    to the next measurement.
     """
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
     counts, sums, times = (np.zeros(len(LAGS_S) - 1) for _ in range(3))
-    for apart in range(1, min(NEIGHBOURS, len(relative))):
-        pair = (series[apart:] == series[:-apart]) & inside[apart:] & inside[:-apart]
-        lag = (seconds[apart:] - seconds[:-apart])[pair]
-        product = (relative[apart:] * relative[:-apart])[pair]
+    for step in range(1, min(NEIGHBOURS, len(relative))):
+        pair = (series[step:] == series[:-step]) & inside[step:] & inside[:-step]
+        lag = (seconds[step:] - seconds[:-step])[pair]
+        product = (relative[step:] * relative[:-step])[pair]
         at = np.searchsorted(LAGS_S, lag) - 1
         counted = (at >= 0) & (at < len(counts))
         counts += np.bincount(at[counted], minlength=len(counts))
@@ -307,15 +299,13 @@ def _persistence(
     bounds = ([0.0, np.log(0.05)], [0.99, np.log(1e3)])
     found = least_squares(misfit, [0.5, np.log(5.0)], bounds=bounds)
     share, time_s = float(found.x[0]), float(np.exp(found.x[1]))
-    if time_s < lags[0]:  # gone by the next measurement, so any share at all fits as well
+    if time_s < lags[0]:  # shorter than the measurement interval, so any share fits
         return 1.0, 0.0
     return 1.0 - share, time_s
 
 
 def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[str, float]:
-    """The distance [m] by which teammates are seen too far, the median of the nearer half; empty
-    where there are few.
-    """
+    """Excess distance [m] of teammates, the median of the nearer half; empty if few."""
     errors, distances = [np.zeros(0)], [np.zeros(0)]
     for each in data:
         seen, own = each.sighted, owns.get(each.robot)
@@ -326,9 +316,9 @@ def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[st
         measured = own.distances(seen.ranges, seen.bearings)
         for index, name in enumerate(each.names):
             if name in each.teammates:
-                there, there_known = poses_at(each.teammates[name], stamps, each.gap_ns)
-                chosen = known & there_known & (seen.ids == index) & np.isfinite(measured)
-                distance = np.hypot(*(there - here)[chosen, :2].T)
+                teammate_poses, teammate_known = poses_at(each.teammates[name], stamps, each.gap_ns)
+                chosen = known & teammate_known & (seen.ids == index) & np.isfinite(measured)
+                distance = np.hypot(*(teammate_poses - here)[chosen, :2].T)
                 errors.append(measured[chosen] - distance)
                 distances.append(distance)
     error, distance = np.concatenate(errors), np.concatenate(distances)

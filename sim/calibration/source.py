@@ -1,4 +1,4 @@
-"""Read the measurements of a calibration: a data set's, or those of a log."""
+"""Read calibration measurements from a data set or a log."""
 
 from pathlib import Path
 
@@ -14,10 +14,10 @@ from sim.world.streams import WorldStreams
 
 
 def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
-    """The measurements of a log (`.mcap`) with its scenario, or of a data set with its own.
+    """Measurements of a log (`.mcap`) or data set, with its scenario.
 
-    Of a log the first incarnation of each robot is used; of a data set all robots that have files
-    in it. Raises DatasetError, LogError or ScenarioError.
+    From a log the first incarnation of each robot; from a data set all robots with files. Raises
+    DatasetError, LogError or ScenarioError.
     """
     if path.suffix != ".mcap":
         scenario = _with_its_robots(path)
@@ -26,13 +26,13 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
 
 
 def own_scenario(path: Path) -> str | None:
-    """The name of the scenario that a data set brings with it; a log brings none."""
+    """Scenario name of a data set; None for a log."""
     own = None if path.suffix == ".mcap" else scenario_beside(path)
     return own if own not in builtin_names() else None
 
 
 def _with_its_robots(path: Path) -> Scenario:
-    """The data set's own scenario with the robots that have files in it, however many."""
+    """Data set's scenario with all robots that have files."""
     own = scenario_beside(path)
     if own != "utias":
         return with_present_robots(with_options(load(own), dataset=path))[0]

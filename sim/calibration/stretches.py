@@ -1,4 +1,4 @@
-"""How much motion a calibration needs, and how much there is."""
+"""Amount of motion that a calibration needs and has."""
 
 from collections.abc import Iterable
 
@@ -7,19 +7,17 @@ import numpy as np
 from sim.world.streams import RobotStream
 
 SPAN_S = 10.0
-"""Length [s] of the stretches over which errors are taken: errors of one command are correlated for
-seconds.
-"""
+"""Stretch length [s] for errors: errors of one command are correlated for seconds."""
 LEAST_SPANS = 30
-"""Least number of stretches with motion, of all robots together."""
+"""Least number of moving stretches of all robots together."""
 LEAST_WAY_M = 0.05
-"""A stretch with a shorter logged path [m] has no motion."""
+"""Least logged path [m] of a moving stretch."""
 
 
 def moving_stretches(streams: Iterable[RobotStream]) -> int:
-    """The number of whole stretches of SPAN_S in which the odometry of a robot moves.
+    """Number of whole stretches of SPAN_S in which a robot's odometry moves.
 
-    A calibration has at most so many: it leaves out those where the path of reference is not known.
+    An upper bound: a calibration omits stretches with an unknown reference path.
     """
     return sum(map(_moving, streams))
 

@@ -1,1 +1,1 @@
-"""The command line: a module for each group of commands, and their common options."""
+"""Command line: one module per group of commands, and common options."""

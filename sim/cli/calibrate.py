@@ -1,4 +1,4 @@
-"""The command `teamslam calibrate`: learns the parameters of the models from measurements."""
+"""Command `teamslam calibrate`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,8 @@ def calibrate(
         ),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write a scenario with what was learnt.")
+        Path | None,
+        typer.Option("--output", "-o", help="Write a scenario with the learnt figures."),
     ] = None,
     truth: Annotated[bool, typer.Option(help="Use the ground truth where it is there.")] = True,
     scenario: Annotated[

@@ -1,4 +1,4 @@
-"""`teamslam compare`: runs side by side."""
+"""Command `teamslam compare`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -55,7 +55,7 @@ def compare(
 
 
 def _check_picture(path: Path) -> None:
-    """End the command where the name is not that of a picture, or its folder is not there."""
+    """Exit unless the path names a picture in an existing folder."""
     forms = [form.value for form in Form]
     if path.suffix.removeprefix(".") not in forms:
         names = ", ".join(f".{form}" for form in forms)

@@ -1,4 +1,4 @@
-"""The command `teamslam driver`: a ROS 2 robot's topics become its stream."""
+"""Command `teamslam driver`, which converts a ROS 2 robot's topics to its stream."""
 
 import logging
 import time
@@ -18,7 +18,7 @@ app = typer.Typer()
 
 
 class Back(StrEnum):
-    """What a driver publishes back to ROS 2."""
+    """Topics that a driver publishes back to ROS 2."""
 
     ALL = "all"
     TOPICS = "topics"
@@ -28,15 +28,15 @@ class Back(StrEnum):
 _LOG = logging.getLogger("teamslam")
 WAIT_S = 0.2
 LAST_S = 0.2
-"""At the end, messages on their way arrive within this time [s]."""
+"""Time [s] for messages in transit at the end."""
 AT_ONCE = 500
-"""Measurements handed over before the next check of what has arrived."""
+"""Measurements processed between checks for new messages."""
 
 
 @app.command()
 def driver(
     robot: Annotated[str, typer.Argument(help="The robot's name, as r1.")],
-    ros2: Annotated[Path, typer.Option(help="TOML file: which topics are what.", metavar="FILE")],
+    ros2: Annotated[Path, typer.Option(help="TOML file that assigns topics.", metavar="FILE")],
     team: Annotated[str, typer.Option(help="The team's name: its scenario's.")],
     connect: Connect = LOOPBACK,
     ros2_connect: Annotated[
@@ -87,7 +87,7 @@ def driver(
     from team.wire.zenoh.foreign import ForeignKeys
 
     logging.captureWarnings(True)
-    # A detector names its tags in any order, and the measurements stay with their names.
+    # A detector lists its tags in any order; measurements stay with their names.
     warnings.filterwarnings("ignore", message=".*ids are not ascending", category=DriverWarning)
     try:
         topics = load_topics(ros2)
@@ -138,7 +138,7 @@ def driver(
                     if translated.refusal:
                         fail(f"{ros2}: {translated.refusal}", WRONG_USE)
                 until = time.monotonic() + LAST_S
-                while time.monotonic() < until:  # messages on their way; the topic may go on
+                while time.monotonic() < until:  # messages in transit; the topic may continue
                     for sample in foreign.receive(LAST_S):
                         translated.put(sample)
                 translated.deliver()
@@ -154,7 +154,7 @@ def driver(
 
 
 def _log_totals(translated: "Ros2Driver") -> None:
-    """Log the totals of messages taken and dropped, and the remaining warnings."""
+    """Log the totals of used and dropped messages, and remaining warnings."""
     for topic, count in translated.taken.items():
         _LOG.info("%s: %d messages", topic, count)
     for reason, count in translated.dropped.items():

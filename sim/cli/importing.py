@@ -1,4 +1,4 @@
-"""The command `teamslam import`."""
+"""Command `teamslam import`."""
 
 import shutil
 import time
@@ -15,7 +15,7 @@ app = typer.Typer()
 ROS2_PROFILE = b"ros2"
 BAG_FILES = (".mcap", ".db3")
 HEAD = 64
-"""Bytes in which an MCAP file names its profile."""
+"""Bytes that contain an MCAP file's profile."""
 
 
 @app.command(name="import")
@@ -39,10 +39,10 @@ def import_(
         ),
     ] = None,
     columns: Annotated[
-        Path | None, typer.Option(help="TOML file: which columns are what.", metavar="FILE")
+        Path | None, typer.Option(help="TOML file that maps columns.", metavar="FILE")
     ] = None,
     ros2: Annotated[
-        Path | None, typer.Option(help="TOML file: which topics are what.", metavar="FILE")
+        Path | None, typer.Option(help="TOML file that assigns topics.", metavar="FILE")
     ] = None,
     truth: Annotated[
         Path | None,
@@ -74,7 +74,7 @@ def import_(
         report = import_data(request, output)
         elapsed_s = time.monotonic() - began
         notes = dict.fromkeys([*report.notes, *_as_read(output)])  # each once
-    except BaseException:  # half a data set is none, and the next attempt may have its folder
+    except BaseException:  # remove a partial data set, whose folder the next attempt may use
         shutil.rmtree(output, ignore_errors=True)
         raise
     for note in notes:
@@ -86,12 +86,11 @@ def import_(
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a data set must be imported before a team can run on it: a ROS 2 bag or a log."""
+    """Whether a data set must be imported first: a ROS 2 bag or a log."""
     return path.suffix in BAG_FILES or _is_bag_folder(path)
 
 
 def _is_bag_folder(path: Path) -> bool:
-    """Whether it has a bag's metadata.yaml, or nothing but a bag's files."""
     if (path / "metadata.yaml").is_file():
         return True
     inside = {each.suffix for each in path.iterdir()} if path.is_dir() else set()
@@ -99,7 +98,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 
 def imported_into(path: Path, folder: Path) -> Path:
-    """Import a bag or a log; returns the folder, and prints what was imported."""
+    """Import a bag or log and print a summary; returns the folder."""
     from sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
@@ -112,9 +111,7 @@ def imported_into(path: Path, folder: Path) -> Path:
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """Import a ROS 2 bag into a temporary data set and return that; anything else is returned as
-    it is.
-    """
+    """Import a ROS 2 bag into a temporary data set; other paths are returned unchanged."""
     from tempfile import TemporaryDirectory
 
     from team.recording.reader import log_file
@@ -134,7 +131,6 @@ def readable(path: Path) -> Iterator[Path]:
 
 
 def _is_ros2_mcap(path: Path) -> bool:
-    """Whether it is an MCAP file written by ROS 2."""
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:
@@ -142,7 +138,7 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 
 def _as_read(folder: Path) -> list[str]:
-    """The measurements of each robot, and the notes on unusable rows of its tables."""
+    """Measurements of each robot, and notes on unusable rows."""
     from central.desk.evaluation.clocks import separate_times_warning
     from sim.datasets.tables import DatasetError
     from sim.scenarios.scenario import load, with_options

@@ -1,4 +1,4 @@
-"""`teamslam keys`: the certificates of a team."""
+"""Command `teamslam keys`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +35,7 @@ def keys(
     ] = None,
     revoke: Annotated[
         list[str] | None,
-        typer.Option(help="The router is to forget this node.", metavar="NODE"),
+        typer.Option(help="Revoke this node's certificate.", metavar="NODE"),
     ] = None,
     replay: Annotated[
         bool,

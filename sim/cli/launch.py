@@ -1,4 +1,4 @@
-"""`teamslam launch`."""
+"""Command `teamslam launch`."""
 
 import json
 import time
@@ -51,9 +51,9 @@ if TYPE_CHECKING:
     from sim.world.streams import WorldStreams
 
 INTERRUPTED = 130
-"""The exit status of a command that Ctrl-C has ended, as a shell has it."""
+"""Exit status after Ctrl-C, by the shell's convention."""
 COMPILING_S = 3.0
-"""Time [s] between two lines about kernels that are being compiled."""
+"""Time [s] between lines on kernel compilation."""
 app = typer.Typer()
 
 
@@ -150,7 +150,7 @@ def launch(
     if name == ASSUMED_NAME and dataset is not None and streams is not None:
         typer.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == ANY_PORT:
-        listen = LOOPBACK  # drivers have to find it
+        listen = LOOPBACK  # must be reachable by drivers
     warnings = [
         *scenario_warnings(resolved),
         *([missing] if missing else []),
@@ -197,7 +197,9 @@ def launch(
 
 
 def _launched(plan: "Plan") -> "Outcome":
-    """Name the kernels to the template first: it loads them while this process imports modules."""
+    """Send the kernels' names to the template first: it loads them during this process's
+    imports.
+    """
     from sim.launch.processes import Starter
 
     scenario = plan.scenario
@@ -222,16 +224,16 @@ def _launched(plan: "Plan") -> "Outcome":
 
 
 def _keep_showing(url: str, log: Path) -> None:
-    """Keep the page until the user ends the command."""
+    """Serve the page until the user ends the command."""
     from team.shell import process
 
-    with process("launch", endless=True) as stop:  # the line names Ctrl-C, which may follow at once
+    with process("launch", endless=True) as stop:  # Ctrl-C may follow the line at once
         typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
         stop.wait()
 
 
 def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
-    """The scenario with the robots that its data set has, a note on the others, and the streams.
+    """Scenario with the robots of its data set, a note on the others, and the streams.
 
     A data set is read before any process starts; a simulated world is not.
     """
@@ -246,7 +248,6 @@ def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStre
 
 
 def _time_warnings(streams: "WorldStreams | None") -> list[str]:
-    """Warnings about robots whose times are probably not in seconds, or of different clocks."""
     if streams is None:
         return []
     from central.desk.evaluation.clocks import separate_times_warning
@@ -259,7 +260,7 @@ def _time_warnings(streams: "WorldStreams | None") -> list[str]:
 
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
-    """How the robots' own models come into a data set that has none."""
+    """Advice on calibrating models for a data set without any."""
     from sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
 
     found = moving_stretches(streams.streams)
@@ -281,15 +282,15 @@ def _check_writable(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         is_new = not path.exists()
         path.open("a").close()
-        if is_new:  # a reader that waits for the file must find it whole
+        if is_new:  # a waiting reader must find the file complete
             path.unlink()
     except OSError as error:
         fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Write a file that is there whole or not at all."""
-    if path.exists() and not path.is_file():  # as /dev/stdout
+    """Write a file atomically."""
+    if path.exists() and not path.is_file():  # such as /dev/stdout
         path.write_text(text)
         return
     part = path.with_name(f".{path.name}.part")
@@ -308,7 +309,7 @@ def _new_folder(name: str) -> Path:
 
 
 def _keep_earlier(log: Path) -> None:
-    """Rename an earlier log of the same name, so that none is overwritten."""
+    """Rename an earlier log of the same name."""
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
@@ -321,13 +322,13 @@ def _keep_earlier(log: Path) -> None:
 
 
 KERNELS_TO_ESTIMATE = 5
-"""The first kernels take longer than most, so no time is estimated from them."""
+"""Number of first kernels, slower than most, before a time is estimated."""
 
 
 class _Compiling:
-    """Reports the compilation of kernels, which happens once per installation.
+    """Report the compilation of kernels, once per installation.
 
-    took_s: the time since the first report [s].
+    took_s: time since the first report [s].
     """
 
     def __init__(self) -> None:
@@ -336,9 +337,7 @@ class _Compiling:
         self._first: tuple[int, float] | None = None
 
     def tell(self, done: int, of: int) -> None:
-        """Print now and then how many kernels of about how many are compiled, and how long it
-        takes.
-        """
+        """Print the number of compiled kernels, the estimated total and time, periodically."""
         now = time.monotonic()
         self._first = self._first or (done, now)
         self.took_s = now - self._first[1]
@@ -354,9 +353,7 @@ class _Compiling:
 
 
 def _compile(scenario: Scenario) -> None:
-    """Compile the kernels here where no template does: otherwise every process would compile the
-    same.
-    """
+    """Compile the kernels here without a template; otherwise every process would."""
     from sim.launch.warm_up import FORMS, warm_up
     from team.estimation.compiling import compilations
 
@@ -367,7 +364,7 @@ def _compile(scenario: Scenario) -> None:
 def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
-    """Write the report and print its files; an error, as of a full disk, fails the run."""
+    """Write the report and print its files; an error, such as a full disk, fails the run."""
     from central.desk.report.page import write_report
 
     try:
@@ -382,7 +379,7 @@ def _write_report(
 def _conclude(
     scenario: Scenario, outcome: "Outcome", json_file: Path | None, *, report: bool
 ) -> None:
-    """Evaluate the log, print the result and write the report; ends with 1 if anything failed."""
+    """Evaluate the log, print the result and write the report; exits with 1 on failure."""
     from rich.console import Console
 
     from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
@@ -393,7 +390,7 @@ def _conclude(
     from team.recording.reader import LogError, open_log
 
     console = Console()
-    join(outcome.log)  # here, since nobody ends this process for taking long
+    join(outcome.log)  # joined here, where it may take long
     typer.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
     steps = Steps()
     steps.begin("scoring the run")

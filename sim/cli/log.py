@@ -1,4 +1,4 @@
-"""`teamslam log`: inspect a log, check it, repair it, cut it, merge logs, export them."""
+"""Commands `teamslam log`: inspect, check, repair, cut, merge and export."""
 
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -43,7 +43,7 @@ app.command()(repair)
 
 
 class Format(StrEnum):
-    """The format that a log is exported in."""
+    """Export format of a log."""
 
     CSV = "csv"
     PARQUET = "parquet"
@@ -213,7 +213,7 @@ def export(
 
 
 def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
-    """The exporter of tables; ends the command where it is not installed."""
+    """Table exporter; exits if it is not installed."""
     from team.recording.csv_tables import export_csv
     from team.recording.parquet_tables import export_parquet
 
@@ -225,7 +225,6 @@ def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Expo
 
 
 def _channels(names: str | None) -> "list[Channel] | None":
-    """The channels by name; ends the command at an unknown name."""
     if names is None:
         return None
     from team.wire.channels import CHANNELS
@@ -241,8 +240,8 @@ def _channels(names: str | None) -> "list[Channel] | None":
 def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> "Table":
     """Messages, bytes, rate of one key, first and last time [s after start_ns], by key or channel.
 
-    The rate of a channel is the mean of those of its keys; a key that begins before start_ns, as
-    a configuration at team time zero, has none.
+    A channel's rate is the mean over its keys; a key that begins before start_ns, such as a
+    configuration, has none.
     """
     from rich.table import Table
     from rich.text import Text

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-# Before NumPy: one BLAS thread per process, for the same bits everywhere and no fight for cores.
+# Before NumPy: one BLAS thread per process, for equal bits everywhere and no contention.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -65,7 +65,7 @@ def command() -> Callable[[], None]:
 
 
 def _convert_plainly(command: Any) -> None:
-    """Let values of a command and of its parts that need no check be converted without Pydantic."""
+    """Convert a command's unchecked values without Pydantic."""
     for parameter in command.get_params(typer.Context(command)):
         parameter._runtime_param = _Plain()
     for part in getattr(command, "commands", {}).values():
@@ -73,14 +73,14 @@ def _convert_plainly(command: Any) -> None:
 
 
 class _Plain:
-    """Converts the value of a parameter: none, a text or a path by itself, any other as Typer does.
+    """Convert a parameter: none, text or path directly, others like Typer.
 
-    Typer imports Pydantic to convert even these, which takes 12 MB and 0.1 s of each process of a
-    team. A version of Typer that knows no `_runtime_param` converts all by itself.
+    Typer imports Pydantic even for these, at 12 MB and 0.1 s per process. A Typer version without
+    `_runtime_param` converts all itself.
     """
 
     def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
-        """The value with which the command's function is called."""
+        """Value passed to the command's function."""
         kind, checks = param.type_descriptor.annotation, param.type_descriptor.parameter_info
         is_single = param.nargs == 1 and not param.multiple and checks.parser is None
         if is_single and (value is None or kind is str):
@@ -94,7 +94,6 @@ class _Plain:
 
 
 def _is_checked(path: Any, checks: Any) -> bool:
-    """Whether Typer would do more with a path than to take it."""
     restricted = checks.exists or checks.writable or not (checks.file_okay and checks.dir_okay)
     return (
         restricted or checks.resolve_path or (os.path.exists(path) and not os.access(path, os.R_OK))
@@ -102,7 +101,7 @@ def _is_checked(path: Any, checks: Any) -> bool:
 
 
 def main() -> None:
-    """Run a command; wrong use ends with 2, a failed run with 1, both without a traceback."""
+    """Run a command; wrong use exits with 2, a failed run with 1, without a traceback."""
     try:
         command()()
     except Exception as error:
@@ -117,9 +116,9 @@ def main() -> None:
 
 
 def _advice(error: Exception) -> tuple[int, str] | None:
-    """The exit status and the text for an expected error; None for any other.
+    """Exit status and text for an expected error, or None.
 
-    Modules of exceptions are imported only where they were raised: a router needs no SciPy.
+    Exception modules are imported only if raised there: a router needs no SciPy.
     """
     from sim.datasets.tables import DatasetError
     from sim.scenarios.checks import ScenarioError

@@ -76,7 +76,7 @@ def router(
     at = over_tls(listen) if keys else listen
     with process("router", endless=True) as stop, zenoh_router(at, own) as endpoint:
         if own is not None and own[1].revoked:
-            _LOG.info("revoked, and not let in: %s", ", ".join(sorted(own[1].revoked)))
+            _LOG.info("revoked and refused: %s", ", ".join(sorted(own[1].revoked)))
         typer.echo(f"listening at {endpoint}")
         while not stop.wait(1.0):
             if own is not None and time.time() > own[0].ends.timestamp():
@@ -346,11 +346,11 @@ def record(
         "seed": str(resolved.seed),
         "scenario": dumps(resolved),
     }
-    again = output.exists()
-    if again and not output.is_file():
+    exists = output.exists()
+    if exists and not output.is_file():
         refuse_existing(output)
     try:
-        is_over = again and not check_continues(output, resolved.team, metadata, same_run=resume)
+        is_over = exists and not check_continues(output, resolved.team, metadata, same_run=resume)
     except LogError as error:
         fail(str(error), WRONG_USE)
     if is_over:
@@ -361,7 +361,7 @@ def record(
     expected += ["central"] if resolved.centre else []
     expected += [] if resolved.is_live else ["world"]
     configurations = []
-    if resolved.is_live:  # other teams' recorders save its 105 MB
+    if resolved.is_live:  # saves other teams' recorders its 105 MB
         from team.wire.digest import configured
 
         configurations = [configured("world", 0, 0, resolved)]
@@ -371,7 +371,7 @@ def record(
     ):
         recorder, inventory = next_part(output, resolved.team, metadata)
         _connected(resolved, connect)
-        if again:
+        if exists:
             _LOG.info("%s goes on in %s", output, recorder.path.name)
         try:
             written = record_until_end(
@@ -391,7 +391,7 @@ def record(
 
 
 def _joined(log: Path) -> list[Path]:
-    """Join the parts of a log; name those that remain, with the remedy."""
+    """Join the parts of a log; name remaining parts, with the remedy."""
     from team.recording.parts import join
 
     parts = join(log)
@@ -408,13 +408,12 @@ def _joined(log: Path) -> list[Path]:
 
 
 def _fail_if_provisional(parts: Sequence[Path]) -> None:
-    """End with 1 where the final map lacks robots."""
     if lacks := _lacking_in(parts):
         fail(lacks, FAILED)
 
 
 def _lacking_in(parts: Sequence[Path]) -> str:
-    """The robots that are missing in the final map of a log, in words; empty: none."""
+    """Robots missing in the final map of a log, as text."""
     from team.recording.reader import LogError, open_log
     from team.shell import lacking
     from team.wire.channels import FINAL_MAP, TEAM_FINAL

@@ -1,4 +1,4 @@
-"""The options that commands share, their parsing, and errors with their exit status."""
+"""Common options of commands, their parsing, and errors with exit status."""
 
 import json
 import logging
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from team.wire.zenoh.bus import ZenohBus
 
 MOST_HOLES = 5
-"""Most findings about gaps of a log that a command prints; `teamslam log check` prints all."""
+"""Most log gaps that a command prints; `teamslam log check` prints all."""
 WRONG_USE = 2
 FAILED = 1
 
 
 def _either(names: object) -> str:
-    """The values of a Literal as text: `a, b or c.`"""
+    """Values of a Literal as text: `a, b or c.`"""
     *first, last = get_args(names)
     return f"{', '.join(first)} or {last}."
 
@@ -55,12 +55,11 @@ Keys = Annotated[
     ),
 ]
 ASSUMED_NAME = "recorded"
-"""The built-in scenario for recorded data of robots that nobody has calibrated yet."""
+"""Built-in scenario for uncalibrated robots' recorded data."""
 ASSUMED = (
     "the built-in one `recorded` is taken. It assumes odometry that is off by 5 cm and 2° after a "
     "metre and by 6° after a radian, ranges by 5 cm and 2 %, bearings by 1.7°"
 )
-"""What that scenario assumes."""
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
 TeamOption = Annotated[
@@ -76,8 +75,8 @@ Peers = Annotated[
 Pieces = Annotated[
     int | None,
     typer.Option(
-        help="Cut the log of a data set of one robot into so many robots, which do not know where "
-        "they begin.",
+        help="Cut the log of a data set of one robot into this many robots with unknown "
+        "initial poses.",
         min=1,
         max=100,
         metavar="N",
@@ -107,7 +106,7 @@ SpeedText = Annotated[
 
 
 def check_pieces(scenario: Scenario) -> None:
-    """Check that only the log of a data set of one robot is cut into several."""
+    """Check that only a one-robot data set's log is cut."""
     if not isinstance(scenario.world, UnlabelledWorld):
         fail(
             "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
@@ -125,7 +124,7 @@ def connect_bus(
 ) -> "ZenohBus":
     """Connect to the router's endpoint; with keys by TLS, with the node's certificate.
 
-    stop: of a process of the team, which waits for a silent router until it is set.
+    stop: ends the wait of a team process for a silent router.
     """
     from team.wire.zenoh.bus import ZenohBus
 
@@ -134,7 +133,7 @@ def connect_bus(
 
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
-    """The node's certificate and key, checked; warns of a certificate that will soon expire."""
+    """Checked certificate and key of the node; warns of near expiry."""
     from team.keys.credentials import credentials_of
 
     own = credentials_of(folder, node, team)
@@ -144,12 +143,12 @@ def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
 
 
 def over_tls(endpoint: str) -> str:
-    """The same endpoint by TLS, unless the user has chosen one."""
+    """The default endpoint over TLS; a chosen one stays."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint in (LOOPBACK, ANY_PORT) else endpoint
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint can be reached from this machine only, judged by its address."""
+    """Whether an endpoint is local by its address."""
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith("unix"):
         return True
@@ -161,7 +160,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
-    """End with an error where strangers could reach a router that admits everyone."""
+    """Exit if strangers could reach a router that admits everyone."""
     if "/" not in listen:
         fail(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT", WRONG_USE)
     if not (keys or insecure or is_loopback(listen)):
@@ -173,25 +172,25 @@ def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
 
 
 def fail(message: str, status: int) -> NoReturn:
-    """Print an error and end with its status."""
+    """Print an error and exit with this status."""
     typer.secho(f"error: {lines(message)}", fg="red", err=True)
     raise typer.Exit(status)
 
 
 def write_json(path: Path | None, figures: object) -> None:
-    """Write the figures of a command to its --json file, if one is given."""
+    """Write a command's figures to its --json file, if given."""
     if path is not None:
         path.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
 
 
 def refuse_existing(path: Path) -> None:
-    """End with an error where the file or folder exists already."""
+    """Exit if the file or folder exists."""
     if path.exists():
         fail(f"{path} exists: choose another name or remove it", WRONG_USE)
 
 
 def warn_of_holes(log: "Log") -> None:
-    """Warn on stderr of the messages that a log lacks, since results computed from it lack them."""
+    """Warn on stderr of missing messages, which results lack."""
     from team.recording.check import holes
 
     tell_holes(log.path, holes(log))
@@ -207,9 +206,7 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
 
 
 def set_aside(file: Path) -> Path:
-    """Rename a file that is to be written anew, with the first number that is free; its new
-    path.
-    """
+    """Rename a file to the first free number; returns its new path."""
     number = 1
     while (aside := file.with_name(f"{file.name}.{number}")).exists():
         number += 1
@@ -219,12 +216,12 @@ def set_aside(file: Path) -> Path:
 
 
 def count_noun(count: int, what: str) -> str:
-    """A count with its noun: `1 robot`, `3 robots`."""
+    """Count with noun: `1 robot`, `3 robots`."""
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def parsed_speed(text: str) -> float:
-    """A positive multiple of real time; infinite for `max`."""
+    """Parse a positive multiple of real time; infinite for `max`."""
     if text == "max":
         return math.inf
     try:
@@ -237,7 +234,7 @@ def parsed_speed(text: str) -> float:
 
 
 def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
-    """`[ROBOT:]x,y,theta[,sigma,sigma]`: the robot, empty if it is not named, and the numbers."""
+    """Parse `[ROBOT:]x,y,theta[,sigma,sigma]`: robot (may be empty) and numbers."""
     robot, colon, numbers = text.rpartition(":")
     try:
         pose = tuple(float(part) for part in numbers.split(","))
@@ -251,7 +248,7 @@ def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def scenario_for(dataset: Path) -> str:
-    """The scenario for a data set without one; prints which it is."""
+    """Scenario for a data set without one; prints its name."""
     from sim.scenarios.source import scenario_beside
 
     name = scenario_beside(dataset)
@@ -263,7 +260,7 @@ def scenario_for(dataset: Path) -> str:
 
 
 def scenario_of(name: str) -> Scenario:
-    """The scenario by name, from a TOML file, or from the JSON that launch gives its processes."""
+    """Scenario by name, from a TOML file, or from launch's JSON."""
     path = Path(name)
     if path.suffix == ".json" and path.is_file():
         try:
@@ -274,7 +271,7 @@ def scenario_of(name: str) -> Scenario:
 
 
 def check_names(team: str, robot: str | None = None) -> None:
-    """End the command where the name of the robot or of the team can not be one."""
+    """Exit if a robot's or team's name is invalid."""
     from team.keys.roster import ROBOT, TEAM
 
     if robot is not None and not ROBOT.fullmatch(robot):
@@ -284,7 +281,7 @@ def check_names(team: str, robot: str | None = None) -> None:
 
 
 def signer_of(keys: Path | None, node: str, team: str) -> "Signer | None":
-    """The signer of a node's messages; None without keys."""
+    """Signer of a node's messages; None without keys."""
     from team.keys.signing import Signer
 
     return None if keys is None else Signer(own_keys(keys, node, team))

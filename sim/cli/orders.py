@@ -1,4 +1,4 @@
-"""Commands by which an operator asks or orders a running team: map, withdraw, verdict, end."""
+"""Commands that ask or order a running team: map, withdraw, verdict, end."""
 
 from typing import Annotated
 
@@ -141,7 +141,7 @@ def verdict(
             fail(f"{contradiction}, which is what holds; {remedy}", FAILED)
         typer.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
     landmarks = len(ids(fused.ids, "ids"))
-    are = "have no verdict any more that they are" if withdraw else "are"
+    are = "no longer have the verdict that they are" if withdraw else "are"
     typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
 
 
@@ -175,4 +175,4 @@ def end(
                 give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
         except WithdrawError as error:
             fail(str(error), FAILED)
-    typer.echo(f"nobody waits for {without} any more" if without else "the team ends")
+    typer.echo(f"the team no longer waits for {without}" if without else "the team ends")

@@ -151,7 +151,6 @@ def report(
 
 
 def _width(text: str | None, look: Look | None) -> float | None:
-    """The width of pictures for a paper [inches]."""
     if text is None:
         return None
     if look is not Look.PAPER:
@@ -163,7 +162,7 @@ def _width(text: str | None, look: Look | None) -> float | None:
 
 
 def _check_folder(path: Path) -> None:
-    """Check before the work that the folder can be made."""
+    """Check before the work that the folder can be created."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Commands that compute a log again: rerun and verify-ledger."""
+"""Commands that recompute a log: rerun and verify-ledger."""
 
 import math
 import time
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 OFFENDERS = 20
-"""Most violations that are printed; the JSON file has all."""
+"""Most printed violations; the JSON file has all."""
 
 
 @app.command()
@@ -228,7 +228,6 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 def _print_warnings(
     recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
 ) -> None:
-    """Print the warnings and notes of the computed run, as `launch` does."""
     from central.desk.report.run import nis_line
 
     lines = [f"warning: {warning}" for warning in changed.warnings]
@@ -284,7 +283,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
         note = f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"
         console.print(note, highlight=False, markup=False)
     if result.unsound:
-        console.print(f"{result.unsound} samples are no sound messages: left out", highlight=False)
+        console.print(f"{result.unsound} invalid samples were left out", highlight=False)
     different = sum(row.different for row in result.channels)
     lacking = sum(row.lacking for row in result.channels)
     whole = "all" if not lacking else "all others"
@@ -292,7 +291,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     if not different and any(row.close for row in result.channels):
         verdict = f"{whole} equal within the tolerance"
     if lacking:
-        verdict += f", {lacking} can not be judged, since the log lacks what they were made of"
+        verdict += f", {lacking} can not be judged, since the log lacks their inputs"
     console.print(
         f"{result.messages:,} messages from {result.measurements:,} measurements: {verdict}; "
         f"{elapsed_s:.1f} s for {result.span_s:.0f} s of team time, "
@@ -325,10 +324,10 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     used = sum(1 for maps in found.maps.values() if maps)
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
     if not opened.complete:
-        typer.echo(f"{log} is cut: what came after the cut counts as lost", err=True)
+        typer.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
     write_json(json_file, found.to_json())
     for offender in found.offenders[:OFFENDERS]:
         typer.secho(offender, fg="red", err=True)
     if found.offenders:
-        fail(f"{len(found.offenders)} offenders against the ledger", FAILED)
+        fail(f"{len(found.offenders)} violations of the ledger", FAILED)
     console.print(found.statement(), highlight=False, soft_wrap=True)

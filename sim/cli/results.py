@@ -1,4 +1,4 @@
-"""Steps of the commands that show a run's result: read it, print it, name its files."""
+"""Common steps of result commands: read, print, name files."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":
-    """Read the contents of a report from a log; proves_ledger: prove its ledger, too."""
+    """Read a report's contents from a log; proves_ledger: also prove its ledger."""
     from central.desk.evaluation.history import history
     from central.desk.export.take_home import take_home
     from central.desk.ledger import ledger
     from central.desk.report.run import Run
     from central.desk.verification.recorded import RerunError, recorded
 
-    steps.begin("reading what the robots received")
+    steps.begin("reading the robots' inputs")
     messages = recorded(log)
     found, why = None, Run.no_ledger
     if proves_ledger:
@@ -38,7 +38,7 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
 
 
 def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
-    """Print the tables and the notes of a run."""
+    """Print a run's tables and notes."""
     from central.desk.report.tables import summary_tables
 
     for table in summary_tables(evaluation):
@@ -48,7 +48,7 @@ def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
 
 
 def print_nis(run: "Run", console: "Console") -> None:
-    """Print the NIS per degree of freedom of every robot, where something was predicted."""
+    """Print the NIS per degree of freedom of every robot, if any."""
     from central.desk.report.run import nis_line
 
     if (line := nis_line(run.history)) is not None:
@@ -56,6 +56,6 @@ def print_nis(run: "Run", console: "Console") -> None:
 
 
 def print_written(paths: Iterable[Path], console: "Console") -> None:
-    """Print the names of files that were written."""
+    """Print the names of written files."""
     for path in paths:
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)

@@ -65,7 +65,7 @@ def simulate(
     streams = streams_of(resolved)
     tables = bool(beyond_utias(streams))
     (write_folder if tables else write_utias)(streams, output)
-    beside = output / "scenario.toml"
+    scenario_file = output / "scenario.toml"
     text = folder_scenario(resolved) if tables else data_set_scenario(resolved)
-    beside.write_text(text, encoding="utf-8")
-    typer.echo(f"wrote {output}; `teamslam launch {beside}` runs the team on it")
+    scenario_file.write_text(text, encoding="utf-8")
+    typer.echo(f"wrote {output}; `teamslam launch {scenario_file}` runs the team on it")

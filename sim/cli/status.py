@@ -1,4 +1,4 @@
-"""`teamslam status`: the nodes of a running team."""
+"""Command `teamslam status`."""
 
 from typing import Annotated, Any
 
@@ -44,7 +44,7 @@ def status(
         others = [] if presence.members else bus.other_teams()
     if not presence.members:
         but = f", but of {', '.join(others)}" if others else ""
-        fail(f"nobody of the team {team} is at {connect}{but}: see --team, --connect", FAILED)
+        fail(f"no node of the team {team} is at {connect}{but}: see --team, --connect", FAILED)
     rows = _rows(presence)
     table = Table("node", "there", "state", "measured", "per s", "taken", "clock [s]")
     for row in rows:

@@ -1,4 +1,4 @@
-"""The commands of `sim/studies`, which an installation may lack; they are found by name."""
+"""Commands of `sim/studies`, which an installation may lack; looked up by name."""
 
 from importlib import import_module
 
@@ -8,13 +8,10 @@ from sim.cli.options import WRONG_USE, fail
 
 STUDIES = "sim.studies"
 COMMANDS = ("experiment", "batch-reference", "limit")
-"""What `sim.studies.commands` registers."""
 
 
 def add_studies(app: typer.Typer) -> None:
-    """Register the commands of the studies; where these are missing, each command reports it
-    and exits with 2.
-    """
+    """Register the studies' commands; if missing, each reports it and exits with 2."""
     try:
         studies = import_module(f"{STUDIES}.commands")
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""`teamslam viewer`, a node that publishes views, and `teamslam view`, a log or a run on a page."""
+"""Commands `teamslam viewer`, a node that publishes views, and `teamslam view`, a page."""
 
 import logging
 import os
@@ -113,7 +113,7 @@ def view(
 def shown_on_page(
     log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
 ) -> Iterator["Shown"]:
-    """Serve a log, print where, and open the page if that is requested or there is a display."""
+    """Serve a log, print the address, and open the page on request or on a display."""
     from central.desk.view.server import session
 
     with session(log, host, port, foxglove_port, growing=growing) as shown:
@@ -127,9 +127,7 @@ def shown_on_page(
 
 
 def _has_display() -> bool:
-    """Whether a browser would be visible; without a display, text browsers would take the
-    terminal.
-    """
+    """Whether a browser is visible; text browsers would occupy the terminal."""
     windows = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     return bool(windows) and sys.stdout.isatty()
 

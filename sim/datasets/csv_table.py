@@ -1,6 +1,4 @@
-"""Comma-separated tables with named columns; numbers are exact to the last bit, errors name the
-cell.
-"""
+"""Comma-separated tables with named columns, bit-exact numbers, and errors that name the cell."""
 
 import csv
 import re
@@ -18,21 +16,21 @@ from sim.datasets.tables import LARGEST, DatasetError, File
 T = TypeVar("T")
 NANO = Decimal(10**9)
 SHOWN = 60
-"""Letters of a faulty cell or line that an error shows."""
+"""Letters of a faulty cell or line in an error."""
 LARGEST_NAME = 2**31 - 1
-"""Landmarks with names have numbers up to this; the numbers beyond it are of those without."""
+"""Largest number of a named landmark."""
 
 
 POINT, COMMA = (re.compile(rf"[+-]?[0-9]*{mark}[0-9]+([eE][+-]?[0-9]+)?") for mark in (r"\.", ","))
 NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
-"""A landmark's name as a text that ends in its number."""
+"""Landmark name: a text with a final number."""
 
 
 @dataclass(frozen=True)
 class CsvTable:
-    """The cells of a table by column, as text; lines: each row's line in the file, from 1.
+    """Text cells of a table by column; lines: file line of each row, from 1.
 
-    name: of the file, for errors.
+    name: file name for errors.
     """
 
     name: str
@@ -40,20 +38,20 @@ class CsvTable:
     lines: list[int]
 
     def __len__(self) -> int:
-        """The number of rows."""
+        """Number of rows."""
         return len(self.lines)
 
     def has(self, *columns: str) -> bool:
-        """Whether all these columns are there."""
+        """Whether all these columns exist."""
         return all(column in self.columns for column in columns)
 
     def numbers(self, *columns: str) -> Float[np.ndarray, "rows columns"]:
-        """The columns' finite numbers; raises DatasetError."""
+        """Finite numbers of the columns; raises DatasetError."""
         taken = [np.array(self._parsed(column, _number)) for column in columns]
         return np.column_stack(taken).astype(np.float64) if taken else np.zeros((len(self), 0))
 
     def known_numbers(self, *columns: str) -> Float[np.ndarray, "rows columns"]:
-        """The columns' finite numbers, NaN in empty cells; raises DatasetError."""
+        """Finite numbers of the columns, NaN in empty cells; raises DatasetError."""
         taken = [
             np.array(self._parsed(column, lambda text: _number(text) if text else nan))
             for column in columns
@@ -61,14 +59,14 @@ class CsvTable:
         return np.column_stack(taken).astype(np.float64)
 
     def stamps(self, column: str, unit_s: Decimal = Decimal(1)) -> Int64[np.ndarray, " rows"]:
-        """Times in nanoseconds, exactly as in the text; raises DatasetError."""
+        """Exact times in nanoseconds; raises DatasetError."""
         scale = unit_s * NANO
         parsed = self._parsed(column, lambda text: _stamp_ns(text, scale))
         return np.array(parsed, dtype=np.int64)
 
     def names(self, column: str) -> UInt32[np.ndarray, " rows"]:
-        """Landmarks' numbers; of texts with one beginning, as tag36h11:5, the numbers at their
-        ends. Raises DatasetError.
+        """Landmark numbers, or final numbers of texts with one prefix, such as tag36h11:5. Raises
+        DatasetError.
         """
         ends = [NAMED.fullmatch(cell) for cell in self.columns[column]]
         named = [end for end in ends if end is not None]
@@ -86,16 +84,16 @@ class CsvTable:
         return np.array(bare._parsed(column, _landmark), dtype=np.uint32)
 
     def rows(self, chosen: Iterable[bool]) -> "CsvTable":
-        """The chosen rows."""
+        """Chosen rows."""
         rows = [i for i, each in enumerate(chosen) if each]
         columns = {name: [cells[i] for i in rows] for name, cells in self.columns.items()}
         return CsvTable(self.name, columns, [self.lines[i] for i in rows])
 
     def filled(self, needed: Sequence[str]) -> "CsvTable":
-        """The table without columns that are empty in every row; needed columns stay.
+        """Table without entirely empty columns, except needed ones.
 
-        All columns stay where no row has more than its first needed column: a time alone is a
-        message without measurements.
+        All columns stay if no row has more than the first needed one: a time alone is an empty
+        message.
         """
         empty = {name for name, cells in self.columns.items() if not any(cells)}
         if not set(self.columns) - empty - {*needed[:1]}:
@@ -104,11 +102,11 @@ class CsvTable:
         return CsvTable(self.name, columns, self.lines)
 
     def error(self, row: int, column: str, problem: str) -> DatasetError:
-        """The error for one cell."""
+        """Error for one cell."""
         return DatasetError(f"{self.name}, line {self.lines[row]}, column {column}: {problem}")
 
     def fault(self, problem: str) -> DatasetError:
-        """The error for the table's columns."""
+        """Error for the table's columns."""
         return DatasetError(f"{self.name}, line 1: {problem}")
 
     def _parsed(self, column: str, parse: Callable[[str], T]) -> list[T]:
@@ -127,11 +125,11 @@ class CsvTable:
 
 
 def read_table(file: File, name: str, known: Sequence[str] | None = None) -> CsvTable:
-    """A table whose first line names its columns; empty lines and lines with `#` are left out.
+    """Read a table with a header line; skips empty lines and lines with `#`.
 
-    known: the columns that may be there, in letters of either case; None: any. Columns may be
-    parted by ; or tabs, and decimals then by commas. A first column without a name that counts the
-    rows is left out. Raises DatasetError.
+    known: allowed columns, in either case; None: any. Columns may be separated by ; or tabs,
+    decimals then by commas. An unnamed first column that counts rows is omitted. Raises
+    DatasetError.
     """
     try:
         text = file.read_bytes().decode("utf-8-sig")
@@ -171,7 +169,7 @@ def read_table(file: File, name: str, known: Sequence[str] | None = None) -> Csv
 
 
 def cells_of(numbers: Float[np.ndarray, "R C"]) -> Sequence[Sequence[object]]:
-    """The rows; NaN is an empty cell."""
+    """Rows with empty cells for NaN."""
     rows: list[list[object]] = numbers.tolist()
     if not np.isnan(numbers).any():
         return rows
@@ -179,13 +177,13 @@ def cells_of(numbers: Float[np.ndarray, "R C"]) -> Sequence[Sequence[object]]:
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """The delimiter of the columns in the first line that names them: a comma, else ; or a tab."""
+    """Column delimiter of the header: comma, else ; or tab."""
     first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
     return next((mark for mark in (",", ";", "\t") if mark in first), ",")
 
 
 def _with_points(cells: list[list[str]]) -> list[list[str]]:
-    """Decimal commas as points, unless there are decimal points, too."""
+    """Convert decimal commas to points, unless points occur."""
     if any(POINT.fullmatch(cell) for row in cells for cell in row):
         return cells
     return [[c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row] for row in cells]
@@ -228,7 +226,7 @@ def _number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        comma = "; decimals have a point, thousands nothing" if "," in text else ""
+        comma = "; use a decimal point and no thousands separator" if "," in text else ""
         raise ValueError(f"{text[:SHOWN]!r} is not a number{comma}") from None
     if not isfinite(value):
         raise ValueError(f"{text[:SHOWN]!r} is not finite")
@@ -254,7 +252,7 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
 
 
 def _unit_of(seconds: Decimal) -> str:
-    """The probable unit of a Unix time that was read as seconds, and the remedy."""
+    """Probable unit of a Unix time read as seconds, and the remedy."""
     unit, scale = "nanoseconds", "1e-9"
     for each, by in (("microseconds", "1e-6"), ("milliseconds", "1e-3")):
         if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:

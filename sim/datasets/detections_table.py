@@ -26,9 +26,9 @@ FILES = ("detections.csv", "labels.csv")
 
 
 def detections_of(place: File, robot: str) -> Detections | None:
-    """A robot's detections without identities; None where it has none. Raises DatasetError.
+    """A robot's detections without identities, or None. Raises DatasetError.
 
-    Rows of one time are one scan; the ids are the labels, NO_LABEL where there is no label.
+    Rows of one time are a scan; ids are labels, or NO_LABEL.
     """
     table = _read(place, FILES[0], robot, COLUMNS)
     if table is None or not len(table):
@@ -57,9 +57,7 @@ def scans_of(
     covariances: Float[np.ndarray, "R 3"] | None,
     signatures: Float[np.ndarray, " R"] | None,
 ) -> Detections:
-    """Scans without identities: one for each stamp, its rows in the order of the table. Raises
-    DatasetError.
-    """
+    """Scans without identities, one per stamp, rows in table order. Raises DatasetError."""
     if (np.diff(stamps_ns) < 0).any():
         raise table.fault("its rows are not in order of time")
     for row in np.flatnonzero(ranges < 0.0)[:1].tolist():
@@ -78,7 +76,7 @@ def scans_of(
 
 
 def together(named: Detections, unnamed: Detections | None) -> Detections:
-    """Scans with and without names, by time."""
+    """Merge named and unnamed scans by time."""
     if unnamed is None:
         return named
     labelled = replace(named, hidden=np.zeros(len(named.stamps_ns), np.bool_))
@@ -103,14 +101,13 @@ def rows_of(
 
 
 def split(seen: Detections) -> tuple[Detections, Detections | None]:
-    """The scans with names, and those without (None: there are none)."""
+    """Separate named scans from unnamed ones (or None)."""
     if seen.hidden is None or not seen.hidden.any():
         return seen, None
     return _where(seen, ~seen.hidden), _where(seen, seen.hidden)
 
 
 def _where(seen: Detections, chosen: np.ndarray) -> Detections:
-    """The chosen messages."""
     rows = np.repeat(chosen, np.diff(seen.offsets))
     counts = np.diff(seen.offsets)[chosen]
     return Detections(
@@ -127,7 +124,6 @@ def _where(seen: Detections, chosen: np.ndarray) -> Detections:
 
 
 def _any(values: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
-    """The chosen rows; None where all of them are NaN."""
     return None if values is None or np.isnan(values[rows]).all() else values[rows]
 
 
@@ -139,7 +135,7 @@ def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTabl
 
 
 def labels_of(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:
-    """The label of each row of detections.csv, NO_LABEL where there is none."""
+    """Label of each row of detections.csv, or NO_LABEL."""
     if table is None:
         return np.full(rows, NO_LABEL, np.uint32)
     if not table.has(*LABELS):

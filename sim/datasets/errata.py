@@ -1,4 +1,4 @@
-"""Known faults of distributed data sets, recognised by content and repaired by name."""
+"""Known faults of distributed data sets, identified by content and repaired."""
 
 import hashlib
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class Erratum:
-    """A fault of one data set: measurements of subject k are of subject subjects[k]."""
+    """A data set's fault: measurements of subject k are of subject subjects[k]."""
 
     name: str
     subjects: Mapping[int, int]
@@ -18,7 +18,7 @@ class Erratum:
 
 
 def content_digest(barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarray, "L 5"]) -> str:
-    """SHA-256 of the numbers of the two tables: line ends, spaces and comments do not matter."""
+    """SHA-256 of the numbers of two tables, independent of line ends, spaces and comments."""
     numbers = barcodes.astype("<f8").tobytes() + landmarks.astype("<f8").tobytes()
     return hashlib.sha256(numbers).hexdigest()
 
@@ -34,11 +34,10 @@ ERRATA: Mapping[str, Erratum] = {
         ),
     ),
 }
-"""The errata by content digest."""
 
 
 def erratum_of(
     barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarray, "L 5"]
 ) -> Erratum | None:
-    """The erratum of the data set with these two tables, if one is known."""
+    """Known erratum of the data set with these tables, or None."""
     return ERRATA.get(content_digest(barcodes, landmarks))

@@ -54,7 +54,6 @@ TABLES = {
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
 }  # fmt: skip
-"""The columns that a table may have."""
 REQUIRED = {
     "odometry": ("t_s",),
     "observations": ("t_s", "landmark"),
@@ -66,9 +65,9 @@ REQUIRED = {
 
 
 def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
-    """The measurements of these robots; raises DatasetError.
+    """Read these robots' measurements; raises DatasetError.
 
-    Odometry's stamps are moved by the robot's clock_offset_s, which the robot corrects itself.
+    Odometry stamps are shifted by the robot's clock_offset_s, which the robot corrects.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
@@ -109,9 +108,9 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
 
 @dataclass(frozen=True)
 class RobotRows:
-    """One robot's tables in order of time.
+    """One robot's tables by time.
 
-    empty_ns: times of scans without a measurement. unnamed: its detections without identities.
+    empty_ns: times of empty scans. unnamed: detections without identities.
     """
 
     robot: str
@@ -127,7 +126,7 @@ class RobotRows:
 
     @property
     def start_ns(self) -> int:
-        """The time at which the first measurement begins."""
+        """Start of the first measurement."""
         intervals = self.intervals
         first = (
             intervals.end_ns[:1] - intervals.duration_ns[:1],
@@ -139,7 +138,7 @@ class RobotRows:
         return int(np.concatenate(first).min())
 
     def until(self, end_ns: int) -> "RobotRows":
-        """The tables up to the last odometry interval that ends at end_ns or before."""
+        """Tables up to the last odometry interval that ends by end_ns."""
         intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
         last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
         samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
@@ -165,7 +164,7 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
     if len(intervals.end_ns):
         driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
     else:
-        notes.append("no odometry: only what it saw is given")
+        notes.append("no odometry: only its observations are used")
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
     unnamed = _within(detections_of(place, robot), driven)
@@ -193,7 +192,6 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
 
 
 def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detections | None:
-    """The scans from the first of these times to the last."""
     if seen is None or driven is None:
         return seen
     first, last = np.searchsorted(seen.stamps_ns, [driven[0], driven[1] + 1])
@@ -201,7 +199,7 @@ def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detectio
 
 
 def _table(place: File, kind: str, robot: str) -> CsvTable | None:
-    """A table with the columns that it needs; None where it is missing or has no row."""
+    """Table with its required columns; None if missing or empty."""
     file = place / f"{kind}.csv"
     if not file.is_file():
         return None
@@ -230,7 +228,6 @@ def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> R
 
 
 def _with_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:
-    """The messages with further, empty ones at these times."""
     empty_ns = np.setdiff1d(empty_ns, seen.stamps_ns)
     stamps = np.concatenate([seen.stamps_ns, empty_ns])
     counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(empty_ns), np.int64)])

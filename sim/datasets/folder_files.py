@@ -1,4 +1,4 @@
-"""Where the tables of a data set's robots lie: in a folder or a zip, a folder for each robot."""
+"""Locate robots' tables in a folder or zip with one folder per robot."""
 
 import re
 import zipfile
@@ -11,9 +11,9 @@ from team.keys.roster import ROBOT
 
 ROBOT_NAME = ROBOT.pattern
 STREAM_FILES = ("odometry.csv", "observations.csv")
-"""A folder with one of these is a robot's."""
+"""Files that mark a robot's folder."""
 ONE_ROBOT = "r1"
-"""The name of a robot whose tables lie in the data set's folder itself."""
+"""Name of a robot with tables in the data set's own folder."""
 SCENARIO = "scenario.toml"
 EXPECTED = (
     "expected a folder with a sub-folder for each robot, named as in r1, with odometry.csv and "
@@ -22,12 +22,12 @@ EXPECTED = (
 
 
 class NoTablesError(DatasetError):
-    """There is no robot's table: it may be another kind of data set."""
+    """No robot's table; possibly another kind of data set."""
 
 
 @contextmanager
 def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
-    """The data set's folder, and each robot's by name; raises DatasetError."""
+    """Open the data set's folder and each robot's by name; raises DatasetError."""
     place = Path(path)
     if not place.exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
@@ -43,13 +43,13 @@ def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
 
 
 def _root(archive: zipfile.Path) -> zipfile.Path:
-    """The folder that alone is in an archive, or the archive."""
+    """Single folder of an archive, or the archive."""
     entries = list(archive.iterdir())
     return entries[0] if len(entries) == 1 and entries[0].is_dir() else archive
 
 
 def scenario_in(path: str | Path) -> File | None:
-    """The scenario that lies beside the files of a data set, in a folder or in a zip."""
+    """Scenario beside a data set's files, in a folder or zip."""
     place: File = Path(path)
     if not place.is_dir():
         place = _root(zipfile.Path(path))
@@ -58,7 +58,7 @@ def scenario_in(path: str | Path) -> File | None:
 
 
 def has_tables(path: str | Path) -> bool:
-    """Whether tables of robots lie there, whatever the folders are called; raises DatasetError."""
+    """Whether robots' tables exist, under any folder names; raises DatasetError."""
     if not Path(path).exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}; or a UTIAS set, or a bag")
     try:
@@ -73,7 +73,7 @@ def has_tables(path: str | Path) -> bool:
 
 
 def robots_of(path: str) -> tuple[str, ...]:
-    """The names of a folder's robots: r2 before r10; raises DatasetError."""
+    """Robot names of a folder, r2 before r10; raises DatasetError."""
     with open_folder(path) as (_, robots):
         return tuple(robots)
 
@@ -103,12 +103,12 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def name_table(place: File, file: File, robot: str) -> str:
-    """A table as errors name it: with its robot's folder, where it lies in one."""
+    """Table name for errors, with the robot's folder if any."""
     return f"{robot}/{file.name}" if place.name == robot else file.name
 
 
 def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
-    """Notes on CSV files without a table's name, and on folders with tables but none of a robot."""
+    """Notes on CSV files that are no table, and on folders with tables of no robot."""
     known = {*tables, "detections", "labels"}
     notes = []
     for place in dict.fromkeys([root, *folders.values()]):

@@ -1,4 +1,4 @@
-"""A robot's odometry.csv in any of its forms → intervals in order of time."""
+"""Convert a robot's odometry.csv of any form to ordered intervals."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -22,28 +22,28 @@ FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)
 MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))
 LONG_GAP_NS = 2_000_000_000
 JUMP_NS = 86_400 * 10**9
-"""A longer step between two rows is a jump of the clock."""
+"""Longest step between rows without a clock jump."""
 PACE = "most rows of its odometry are"
-"""How the note on times in other units begins."""
+"""Prefix of the note on times in other units."""
 WHIRLING_RAD_S = 2.0 * np.pi
-"""A median yaw rate above this [rad/s] is probably not in radians."""
+"""Median yaw rate [rad/s] above which radians are improbable."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0
-"""A median odometry interval outside these is probably not in seconds."""
+"""Plausible median odometry interval in seconds."""
 OFF_NS = 1_000_000
-"""A duration differs from the time since the row before if it does so by more than this, and by a
+"""A duration deviates if it differs from the time since the previous row by more than this and by a
 hundredth.
 """
 
 
 def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, list[str]]:
-    """Odometry in any of its forms; stamps are moved by offset_ns, the offset of its clock.
+    """Convert odometry of any form; stamps are shifted by the clock offset offset_ns.
 
-    Speeds hold from t_s to the next row's, and the last row only ends the last interval; with a
-    column duration_s they are the means over the time that ends at t_s. Poses are of t_s; an
-    increment ends at t_s and begins at the row before. A car's wheel speed and steering hold as
-    speeds do. A covariance is of the motion in its row (a pose's: of the motion since the
-    row before), of an error in the frame of its end; speeds that have one become increments. With a
-    column duration_s, rows of speeds and rows of increments may be in one table.
+    Speeds hold from t_s to the next row, and the last row only ends the last interval; with a
+    column duration_s they are means over the time that ends at t_s. Poses are at t_s; an increment
+    spans from the previous row to t_s. A car's wheel speed and steering hold like speeds. A
+    covariance is of the row's motion (a pose's: the motion since the previous row), for an error in
+    the frame of its end; speeds with one become increments. With duration_s, speed and increment
+    rows may be mixed.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -53,7 +53,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     form = forms[0]
     rows.drop(
         np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
-        "another row has the same time, so it lasts no time",
+        "another row has the same time",
     )
     _drop_other_clocks(rows)
     stamps = rows.stamps_ns + offset_ns
@@ -95,7 +95,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
 
 def pace_notes(duration_ns: Int64[np.ndarray, " I"]) -> list[str]:
-    """A note on odometry whose usual interval indicates times that are not in seconds."""
+    """Note on odometry whose usual interval is implausible in seconds."""
     usual_s = 1e-9 * float(np.median(duration_ns)) if len(duration_ns) else SHORTEST_S
     if SHORTEST_S <= usual_s <= LONGEST_S:
         return []
@@ -107,7 +107,7 @@ def pace_notes(duration_ns: Int64[np.ndarray, " I"]) -> list[str]:
 
 
 def _drop_other_clocks(rows: Rows) -> None:
-    """Keep the longest stretch of rows between jumps of the clock, as where it is first set."""
+    """Keep the longest stretch between clock jumps, as when a clock is first set."""
     jumps = np.flatnonzero(np.diff(rows.stamps_ns) > JUMP_NS) + 1
     if not len(jumps):
         return
@@ -129,10 +129,10 @@ def _without_resets(
     steps: Float[np.ndarray, "M 3"],
     duration: Int64[np.ndarray, " M"],
 ) -> Float[np.ndarray, "M 3"]:
-    """The motions; where the odometry was reset, or a row is wrong, the motion before goes on.
+    """Motions; across an odometry reset or a wrong row, the previous motion continues.
 
-    A step of RESET_M or more is a reset if it leads to the very first pose again, faster than any
-    usual step, or if it is RESET_TIMES as fast as nine steps of ten.
+    A step of RESET_M or more is a reset if it returns to the first pose faster than any usual step,
+    or is RESET_TIMES as fast as nine steps of ten.
     """
     lengths, seconds = np.hypot(*steps[:, :2].T), duration * 1e-9
     if len(steps) < LEAST_STEPS:
@@ -148,13 +148,13 @@ def _without_resets(
     rows.note(
         np.append(False, reset),
         f"at which its pose jumps, by {lengths[reset].max():.1f} m at most: its odometry was reset "
-        "there, or the row is wrong; it is taken to have moved on as before",
+        "there, or the row is wrong; the previous motion is assumed",
     )
     return np.where(reset[:, np.newaxis], rates * seconds[:, np.newaxis], steps)
 
 
 def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray, "N 3 3"] | None:
-    """The covariances of the motions in these rows; None where the table has none."""
+    """Motion covariances of these rows, or None."""
     table = rows.table
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return None
@@ -178,15 +178,14 @@ def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray
 
 
 def _filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, " rows"]:
-    """Which rows have these columns filled."""
     if not table.has(*columns):
         return np.zeros(len(table), np.bool_)
     return np.asarray(~np.isnan(table.known_numbers(*columns)).any(axis=1))
 
 
 def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
-    """Check the column duration_s: raises DatasetError for a value that is not positive; notes
-    where it is not the time between rows.
+    """Check duration_s: raises DatasetError for non-positive values; notes deviations from row
+    times.
     """
     if not rows.table.has("duration_s"):
         return
@@ -205,8 +204,8 @@ def _judge_speeds(
     steps: Float[np.ndarray, "N _"],
     duration: Int64[np.ndarray, " N"],
 ) -> None:
-    """Note motions beyond a robot's bounds, which robots refuse; raises DatasetError where the
-    usual turn is one of degrees.
+    """Note implausible motions, which robots refuse; raises DatasetError for a usual turn in
+    degrees.
     """
     if form == STEERED or not len(steps):
         return
@@ -234,17 +233,17 @@ def _judge_speeds(
 
 
 def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
-    """The form of its rows; speeds, and increments in other rows, where it has both."""
+    """Form of the rows, or speeds and increments for a mixed table."""
     found = tuple(form for form in FORMS if table.has(*form))
     if len(found) == 1 or (found in MIXED and table.has("duration_s")):
         return found
     forms = " or ".join(",".join(form) for form in FORMS)
-    what = "more than one form of odometry" if found else "no odometry"
-    raise table.fault(f"{what} in its columns; give t_s with one of {forms}")
+    problem = "more than one form of odometry" if found else "no odometry"
+    raise table.fault(f"{problem} in its columns; give t_s with one of {forms}")
 
 
 def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:
-    """The length of the first row's interval; the second's where no column gives it."""
+    """Length of the first interval: the second's, unless a column gives it."""
     if rows.table.has("duration_s") and len(rows.table):
         return rows.table.rows([True]).stamps("duration_s")
     rows.notes.append("the first increment is taken to last as long as the second")
@@ -254,14 +253,14 @@ def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.nda
 def arcs(
     speeds: Float[np.ndarray, "N 2"], duration_ns: Int64[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
-    """The motion (forward, left, turn) at constant speed and yaw rate: the chord of the arc."""
+    """Motion (forward, left, turn) at constant speed and yaw rate: the chord of the arc."""
     ahead, turn = (speeds * (duration_ns * 1e-9)[:, np.newaxis]).T
     chord = ahead * np.sinc(0.5 * turn / np.pi)
     return np.column_stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn])
 
 
 def between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
-    """Each pose but the first in the frame of the pose before: (forward, left, turn)."""
+    """Each pose in the frame of the previous one: (forward, left, turn)."""
     dx, dy, turn = np.diff(poses, axis=0).T if len(poses) > 1 else np.zeros((3, 0))
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, on_circle(turn)])

@@ -1,6 +1,6 @@
-"""The tables of one robot in a data set's folder → its measurements in order of time.
+"""Convert one robot's tables in a data set's folder to ordered measurements.
 
-Rows that are not used are dropped, and a note counts them with the reason and the first line.
+Unused rows are counted in notes, with reason and first line.
 """
 
 from collections.abc import Sequence
@@ -33,15 +33,15 @@ NOT_A_COVARIANCE = (
 EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
 EARLY_NS = 2_000_000_000
-"""Longest time by which measurements may precede the odometry, while the robot stands."""
+"""Longest time by which measurements may precede odometry, at standstill."""
 FAR_M = 1_000.0
-"""A median range above this [m] is probably not in metres."""
+"""Median range [m] above which metres are improbable."""
 MOST_RAD = 2.0 * np.pi + 1e-3
-"""The largest absolute bearing; larger values are not in radians."""
+"""Largest bearing that can be in radians."""
 
 
 class Rows:
-    """A table's rows in order of time, and the notes about those that are left out."""
+    """Ordered rows of a table, and notes on omitted ones."""
 
     def __init__(self, table: CsvTable, thing: str) -> None:
         self.thing = thing
@@ -58,7 +58,7 @@ class Rows:
         self.stamps_ns = stamps[list(order)]
 
     def drop(self, dropped: Bool[np.ndarray, " rows"], reason: str) -> None:
-        """Leave these rows out."""
+        """Remove these rows with a note."""
         if not dropped.any():
             return
         first = int(np.flatnonzero(dropped)[0])
@@ -75,7 +75,7 @@ class Rows:
         return stamps
 
     def equal(self, column: str, names: Sequence[str]) -> Bool[np.ndarray, " rows"]:
-        """Whether each row has one of these names in a column."""
+        """Mask of rows with one of these names in a column."""
         among = set(names)
         return np.array([cell in among for cell in self.table.columns[column]], dtype=np.bool_)
 
@@ -97,10 +97,10 @@ def measurements_of(
     team: tuple[str, Sequence[str]] | None,
     driven: tuple[int, int] | None,
 ) -> tuple[Scans, Int64[np.ndarray, " E"], list[str]]:
-    """Measurements of landmarks, or of teammates as indices into the team's names (team: the robot
-    itself, and all of them); and the times of rows without a measurement, where nothing was seen.
+    """Measurements of landmarks, or of teammates by index (team: own name and all names), and the
+    times of empty rows.
 
-    driven: the begin and end of its odometry; None: it has none. Raises DatasetError.
+    driven: begin and end of the odometry, or None. Raises DatasetError.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -148,7 +148,7 @@ def measurements_of(
 
 
 def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
-    """Check that a row lies in the time of the odometry; raises DatasetError."""
+    """Check that a row lies within the odometry's time; raises DatasetError."""
     first_ns, last_ns = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
     begin_ns, end_ns = driven
     if first_ns > end_ns or last_ns < begin_ns - EARLY_NS:
@@ -162,13 +162,13 @@ def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
 
 
 def _cells(table: CsvTable) -> list[tuple[str, ...]]:
-    """Row by row, the time first."""
+    """Cells by row, time first."""
     columns = [table.columns["t_s"], *(c for name, c in table.columns.items() if name != "t_s")]
     return list(zip(*columns, strict=True))
 
 
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
-    """Ranges and bearings or points, with the detector's covariances if they are allowed."""
+    """Ranges and bearings or points, with covariances if allowed."""
     table = rows.table
     forms = [form for form in (POLAR, POINTS) if table.has(*form)]
     if not forms:
@@ -195,12 +195,12 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
 def _own(
     rows: Rows, forms: Sequence[tuple[str, ...]], as_points: Bool[np.ndarray, " R"]
 ) -> Float[np.ndarray, "R 3"] | None:
-    """The covariances of ranges and bearings and of points, NaN in rows that have none."""
+    """Covariances of ranges and bearings and of points, NaN where absent."""
     table, claimed = rows.table, np.full((len(rows.table), 3), np.nan)
     allowed = [POLAR_COVARIANCE if form == POLAR else POINT_COVARIANCE for form in forms]
-    there = {c for c in (*POLAR_COVARIANCE, *POINT_COVARIANCE) if table.has(c)}
+    present = {c for c in (*POLAR_COVARIANCE, *POINT_COVARIANCE) if table.has(c)}
     whole = [columns for columns in allowed if table.has(*columns)]
-    if there != {column for columns in whole for column in columns}:
+    if present != {column for columns in whole for column in columns}:
         names = " or ".join(",".join(columns) for columns in allowed)
         raise table.fault(f"a covariance here has the columns {names}, all three")
     if not whole:
@@ -219,7 +219,7 @@ def _own(
 def truth_of(
     table: CsvTable | None, driven: tuple[int, int] | None
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], list[str]]:
-    """True poses in order of time; driven: when the odometry begins and ends, if there is one."""
+    """True poses by time; driven: begin and end of the odometry, or None."""
     if table is None:
         return np.empty(0, np.int64), np.zeros((0, 3)), []
     rows = Rows(table, "true pose")
@@ -229,7 +229,7 @@ def truth_of(
 
 
 def start_of(table: CsvTable) -> StartPose | None:
-    """The initial pose of a table with one row; None of one without a row."""
+    """Initial pose of a one-row table; None without rows."""
     if not len(table):
         return None
     if len(table) > 1:
@@ -253,7 +253,9 @@ def landmarks_of(
     """True landmarks, ascending."""
     ids, positions = table.names("landmark"), table.numbers(*POINTS)
     order = np.argsort(ids, kind="stable")
-    again = np.flatnonzero(np.diff(ids[order]) == 0)
-    if len(again):
-        raise table.error(int(order[again[0] + 1]), "landmark", "a second position of one landmark")
+    repeated = np.flatnonzero(np.diff(ids[order]) == 0)
+    if len(repeated):
+        raise table.error(
+            int(order[repeated[0] + 1]), "landmark", "a second position of one landmark"
+        )
     return ids[order], positions[order]

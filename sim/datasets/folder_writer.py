@@ -1,4 +1,4 @@
-"""Write streams as a data set of CSV tables, which `sim.datasets.folder` reads: every bit stays."""
+"""Write streams bit-exactly as a data set of CSV tables for `sim.datasets.folder`."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -24,9 +24,7 @@ Row = Sequence[object]
 
 
 def write_folder(streams: WorldStreams, directory: Path | str) -> None:
-    """One folder for each robot; times to the nanosecond, all other numbers as their shortest text
-    that reads back the same.
-    """
+    """Write one folder per robot; times in nanoseconds, other numbers as shortest exact text."""
     place = Path(directory)
     place.mkdir(parents=True, exist_ok=True)
     for stream in streams.streams:
@@ -67,8 +65,8 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
 
 
 def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
-    """Columns and rows, by the odometry's own clock: a row at the beginning of each interval and
-    one at the end of the last; of increments, or of both, one at the end of each.
+    """Columns and rows on the odometry's clock: a row at each interval's start and one at the end
+    of the last; for increments or mixed forms, one at each end.
     """
     intervals = stream.intervals
     ends_ns = intervals.end_ns - stream.clock_offset_ns
@@ -97,7 +95,7 @@ def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
 def _measured(
     seen: Detections, name: str, names: Sequence[object]
 ) -> tuple[Sequence[str], Iterable[Row]]:
-    """Columns and rows, message by message; an empty message is a time alone."""
+    """Columns and rows by message; an empty message is a time alone."""
     columns, parts = ["t_s", name], []
     polar = np.column_stack((seen.ranges, seen.bearings))
     points = np.full_like(polar, np.nan) if seen.points is None else seen.points
@@ -123,7 +121,7 @@ def _measured_rows(
     numbers: Sequence[Sequence[object]],
     width: int,
 ) -> Iterable[Row]:
-    """The rows of each message; width: of the cells behind the time."""
+    """Rows of each message; width: cells after the time."""
     offsets = seen.offsets.tolist()
     for message, stamp_ns in enumerate(seen.stamps_ns.tolist()):
         time = seconds(stamp_ns)
@@ -135,7 +133,7 @@ def _measured_rows(
 
 
 def seconds(stamp_ns: int) -> str:
-    """Nanoseconds as seconds, exact."""
+    """Exact seconds of a stamp."""
     sign, stamp_ns = ("-", -stamp_ns) if stamp_ns < 0 else ("", stamp_ns)
     whole, part = divmod(stamp_ns, 10**9)
     return f"{sign}{whole}.{part:09d}".rstrip("0").removesuffix(".")

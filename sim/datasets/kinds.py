@@ -1,4 +1,4 @@
-"""Decide which kind of data set lies at a path."""
+"""Determine the kind of data set at a path."""
 
 from pathlib import Path
 from typing import Literal
@@ -11,9 +11,7 @@ UTIAS_MARKER = "Barcodes.dat"
 
 
 def kind_of(path: str | Path) -> Kind:
-    """UTIAS files, CSV tables by robot or of detections; raises DatasetError where there is
-    none.
-    """
+    """UTIAS files, CSV tables by robot, or detections; raises DatasetError for others."""
     if unlabelled.is_unlabelled(path):
         return "unlabelled"
     if folder_files.has_tables(path):
@@ -43,7 +41,6 @@ def kind_of(path: str | Path) -> Kind:
 
 
 def _other_tables(place: Path) -> list[str]:
-    """The CSV files of a folder and of the folders in it."""
     if not place.is_dir():
         return []
     found = [*sorted(place.glob("*.csv")), *sorted(place.glob("*/*.csv"))]
@@ -51,7 +48,7 @@ def _other_tables(place: Path) -> list[str]:
 
 
 def _with_tables_within(place: Path) -> Path | None:
-    """The first folder within that is a data set of tables."""
+    """First inner folder that is a data set of tables."""
     if not place.is_dir():
         return None
     inner = (each for each in sorted(place.iterdir()) if each.is_dir())

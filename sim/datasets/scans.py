@@ -1,4 +1,4 @@
-"""A robot's measurements row by row, as every data set's tables have them."""
+"""A robot's measurements by row, for all data sets' tables."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,7 @@ from sim.world.streams import Detections, grouped
 
 @dataclass(frozen=True)
 class Scans:
-    """Measurements of one robot in order of time; ids: landmarks, teammates by index, or subjects
-    of UTIAS (both).
-    """
+    """A robot's measurements by time; ids: landmarks, teammate indices, or UTIAS subjects."""
 
     stamps_ns: Int64[np.ndarray, " R"]
     ids: UInt32[np.ndarray, " R"]
@@ -22,7 +20,7 @@ class Scans:
     covariances: Float[np.ndarray, "R 3"] | None = None
 
     def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
-        """The chosen rows."""
+        """Chosen rows."""
         return Scans(
             self.stamps_ns[chosen],
             self.ids[chosen],
@@ -44,22 +42,22 @@ def first_of_each(
     ids: UInt32[np.ndarray, " R"],
     usable: Bool[np.ndarray, " R"],
 ) -> Bool[np.ndarray, " R"]:
-    """Among the usable measurements, the first of each (stamp, id)."""
+    """Mask of the first usable measurement of each (stamp, id)."""
     rows = np.flatnonzero(usable)
     order = rows[np.lexsort((ids[rows], stamps_ns[rows]))]
-    again = (np.diff(stamps_ns[order]) == 0) & (np.diff(ids[order].astype(np.int64)) == 0)
+    repeated = (np.diff(stamps_ns[order]) == 0) & (np.diff(ids[order].astype(np.int64)) == 0)
     single = usable.copy()
-    single[order[1:][again]] = False
+    single[order[1:][repeated]] = False
     return single
 
 
 def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-    """The angles in (−π, π]; those that are in it already keep their bits."""
+    """Wrap angles to (−π, π], leaving the bits of those inside."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     turned = np.where(turned == -np.pi, np.pi, turned)
     return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
 
 
 def count_note(count: int, thing: str, what: str) -> str:
-    """A note such as "2 measurements dropped: unknown barcode"; empty for none."""
+    """Note such as "2 measurements dropped: unknown barcode"; empty for none."""
     return f"{count} {thing}{'s' if count != 1 else ''} {what}" if count else ""

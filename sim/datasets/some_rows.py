@@ -1,4 +1,4 @@
-"""Columns of a table that only some rows have: forms of measurements, and covariances."""
+"""Columns that only some rows have: measurement forms, covariances."""
 
 from collections.abc import Sequence
 
@@ -18,9 +18,9 @@ def matrices(packed: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 3 3"]:
 def numbers_in(
     table: CsvTable, form: tuple[str, ...], forms: Sequence[tuple[str, ...]]
 ) -> Float[np.ndarray, "R _"]:
-    """The numbers of one form of the table's, NaN in the rows that are of another.
+    """Numbers of one of the table's forms, NaN in rows of another.
 
-    Raises DatasetError for a row that is not of exactly one form.
+    Raises DatasetError for a row without exactly one form.
     """
     if form not in forms:
         return np.full((len(table), len(form)), np.nan)
@@ -29,9 +29,11 @@ def numbers_in(
     cells = {each: zip(*(table.columns[c] for c in each), strict=True) for each in forms}
     filled = np.array([[any(row) for row in cells[each]] for each in forms]).reshape(len(forms), -1)
     for row in np.flatnonzero(filled.sum(axis=0) != 1)[:1].tolist():
-        what = "in two forms" if filled[:, row].any() else "in no form"
+        defect = "in two forms" if filled[:, row].any() else "in no form"
         names = " or ".join(",".join(each) for each in forms)
-        raise table.error(row, forms[0][0], f"{what}; a row has {names}, its other cells are empty")
+        raise table.error(
+            row, forms[0][0], f"{defect}; a row has {names}, its other cells are empty"
+        )
     numbers = table.known_numbers(*form)
     mine = filled[list(forms).index(form)]
     for row in np.flatnonzero(mine & np.isnan(numbers).any(axis=1))[:1].tolist():
@@ -41,9 +43,7 @@ def numbers_in(
 
 
 def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray, "R _"]:
-    """Each row's packed covariance, NaN in a row that has none; raises DatasetError where a row
-    has a part of one.
-    """
+    """Packed covariance of each row, NaN if absent; raises DatasetError for an incomplete one."""
     numbers = table.known_numbers(*columns)
     empty = np.isnan(numbers)
     for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1].tolist():
@@ -56,9 +56,7 @@ def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray,
 
 
 def pose_covariances(table: CsvTable) -> Float[np.ndarray, "N 3 3"]:
-    """The covariances of a table with all of their columns; raises DatasetError where some are
-    missing.
-    """
+    """Covariances of a table with all their columns; raises DatasetError if some are missing."""
     missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
     if missing:
         raise table.fault(

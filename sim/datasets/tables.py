@@ -1,4 +1,4 @@
-"""Text tables in a folder or a zip: fast to read, with exact errors."""
+"""Text tables in a folder or zip: fast reading, exact errors."""
 
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -9,22 +9,22 @@ import numpy as np
 from jaxtyping import Float
 
 LARGEST = 4e9
-"""No number of a data set is beyond this (the time of the year 2096); so stamps fit in int64 ns."""
+"""Largest number of a data set (the time of the year 2096); stamps fit in int64 ns."""
 
 File = Path | zipfile.Path
 
 
 class DatasetError(ValueError):
-    """A data set that can not be read; the text names the file, the place and the remedy."""
+    """Unreadable data set; the text names file, place and remedy."""
 
 
 class MarkerError(DatasetError):
-    """No folder of it holds the file by which its kind of data set is known."""
+    """No folder has the marker file of its kind of data set."""
 
 
 @contextmanager
 def open_data_set(path: str, marker: str) -> Iterator[Mapping[str, File]]:
-    """The files by name of the one folder, in `path` (a folder or zip), that holds `marker`."""
+    """Files by name in the one folder, within `path` (folder or zip), that holds `marker`."""
     place = Path(path)
     if not place.exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
@@ -45,9 +45,9 @@ EXPECTED = (
 
 
 def table(file: File, columns: tuple[str, ...]) -> Float[np.ndarray, "rows columns"]:
-    """The numbers of a white-space table with `#` comments; no row at all gives 0 rows.
+    """Numbers of a white-space table with `#` comments; may have 0 rows.
 
-    Raises DatasetError that names file, line and text of a line without so many finite numbers.
+    Raises DatasetError with file, line and text of a line without as many finite numbers.
     """
     lines = file.read_bytes().decode("utf-8", errors="replace").splitlines()
     rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
@@ -66,12 +66,11 @@ def table(file: File, columns: tuple[str, ...]) -> Float[np.ndarray, "rows colum
 def optional_table(
     files: Mapping[str, File], name: str, columns: tuple[str, ...]
 ) -> Float[np.ndarray, "rows columns"]:
-    """The numbers of a table that may be missing: no rows then."""
+    """Numbers of an optional table; no rows if missing."""
     return table(files[name], columns) if name in files else np.zeros((0, len(columns)))
 
 
 def _damage(name: str, lines: list[str], columns: tuple[str, ...], otherwise: str) -> DatasetError:
-    """The error of the first bad line."""
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].split()
         problem = _problem(words, columns) if words else None

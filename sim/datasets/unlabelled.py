@@ -40,7 +40,7 @@ EXPECTED = "expected a folder with odometry.csv and detections.csv"
 
 
 def is_unlabelled(path: str | Path) -> bool:
-    """Whether a folder has the tables of such a set, or its odometry.csv alone."""
+    """Whether a folder has such tables, or odometry.csv alone."""
     root = Path(path)
     if not (root / FILES[0]).is_file() or (root / "observations.csv").is_file():
         return False
@@ -54,15 +54,15 @@ def is_unlabelled(path: str | Path) -> bool:
 
 
 def is_car(path: str | Path) -> bool:
-    """Whether its odometry is that of a car; raises DatasetError."""
+    """Whether the odometry is a car's; raises DatasetError."""
     file = Path(path) / FILES[0]
     return file.is_file() and _form(_table(Path(path), FILES[0]))[0] == CAR
 
 
 def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
-    """The streams of a data set, cut into as many pieces as there are robots.
+    """Streams of a data set, cut into one piece per robot.
 
-    The pieces follow each other in the log, and begin at one time here. Raises DatasetError.
+    Pieces are consecutive in the log and begin at one time here. Raises DatasetError.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset FOLDER; {EXPECTED}")
@@ -94,7 +94,7 @@ def _table(root: Path, name: str, *needed: str) -> CsvTable:
 
 
 def _form(odometry: CsvTable) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The columns of odometry.csv and detections.csv, by those that are special to the former."""
+    """Columns of odometry.csv and detections.csv, determined by the former."""
     own = {CAR: CAR[1:], STEPS + COVARIANCE: STEPS}
     form = max(own, key=lambda each: sum(odometry.has(column) for column in own[each]))
     if not any(odometry.has(column) for column in own[form]):
@@ -148,7 +148,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
 def _of_car(
     odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
 ) -> tuple[Intervals, Detections]:
-    """A row of odometry holds until the next one; the first also before its own time."""
+    """Convert a car's tables; odometry holds until the next row, the first also before its time."""
     stamps, seen_ns = odometry.stamps("t_s"), detections.stamps("t_s")
     if not len(stamps):
         raise odometry.fault("no row")
@@ -193,15 +193,14 @@ def _of_steps(
 def _columns(
     polar: Float[np.ndarray, "R 2"],
 ) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
-    """Ranges, and bearings in (−π, π]."""
     return polar[:, 0].copy(), np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi)
 
 
 def _in_the_end(
     increments: Float[np.ndarray, "I 3"], covariances: Float[np.ndarray, "I 3 3"]
 ) -> Float[np.ndarray, "I 3 3"]:
-    """Covariances of (x, y, theta) in the frame of the pose before, converted to (forward, left,
-    turn) at the end.
+    """Convert covariances of (x, y, theta) in the previous pose's frame to (forward, left, turn) at
+    the end.
     """
     c, s = np.cos(increments[:, 2]), np.sin(increments[:, 2])
     turned = np.zeros((len(increments), 3, 3))
@@ -229,9 +228,7 @@ def _polar(
 
 
 def _named(seen: Detections) -> Detections:
-    """Scans with the labels as identities, for comparison; detections without a label are
-    left out.
-    """
+    """Scans with labels as identities, for comparison; unlabelled detections are omitted."""
     message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
     chosen = seen.ids != NO_LABEL
     _, first = np.unique(np.column_stack((message, seen.ids)), axis=0, return_index=True)
@@ -277,7 +274,7 @@ def _positions(
 
 
 def pieces(whole: RobotStream, count: int) -> tuple[RobotStream, ...]:
-    """One log as several robots r1, r2, … with unknown initial poses, of as many intervals each."""
+    """Cut a log into robots r1, r2, … with unknown initial poses and equal interval counts."""
     intervals = whole.intervals
     bounds = np.linspace(0, len(intervals.end_ns), count + 1).astype(np.int64)
     names = tuple(f"r{i + 1}" for i in range(count))
@@ -297,7 +294,7 @@ def _piece(
     begin_ns, end_ns = int(own.end_ns[0] - own.duration_ns[0]), int(own.end_ns[-1])
     back = begin_ns - zero_ns
     seen = whole.landmark_detections
-    # A scan at the end of an interval belongs to it; one at the first start to the first.
+    # A scan at an interval's end belongs to it; one at the first start to the first.
     first, last = np.searchsorted(seen.stamps_ns, [begin_ns + (index > 0), end_ns + 1])
     mine = seen.only(int(first), int(last))
     gps_ns, gps = whole.positions_ns, whole.positions

@@ -1,9 +1,9 @@
-"""The UTIAS multi-robot cooperative localisation and mapping data sets (MRCLAM).
+"""UTIAS multi-robot cooperative localisation and mapping data sets (MRCLAM).
 
-Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. A set is 17 text files: `Barcodes.dat`,
-`Landmark_Groundtruth.dat`, and of each robot N its odometry, measurements and ground truth.
+Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. A set has 17 text files: `Barcodes.dat`,
+`Landmark_Groundtruth.dat`, and odometry, measurements and ground truth of each robot N.
 Measurements name a *barcode*; `Barcodes.dat` gives its subject: a robot (its number) or a landmark.
-Dropped rows are counted in the notes with their reason.
+Dropped rows are counted in notes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,19 +22,18 @@ from sim.world.streams import RobotStream, StartPose, WorldStreams
 from team.config import RobotConfig
 
 ROBOTS = 5
-"""Subjects 1 … 5 are robots, even those whose files are missing; landmarks come after them."""
+"""Subjects 1 … 5 are robots, even without files; landmarks follow."""
 
 BARCODES = ("subject", "barcode")
 SURVEY = ("subject", "x [m]", "y [m]", "x std-dev [m]", "y std-dev [m]")
 
 
 def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
-    """The measurements of the robots r1, r2, … (the number is the data set's); raises DatasetError.
+    """Read the measurements of robots r1, r2, … (data set numbers); raises DatasetError.
 
-    Odometry row k acts from its time until the next row's, both odometry_delay_s and the robot's
-    clock_offset_s later; the robot corrects the latter itself. Stamps are the data set's, in
-    nanoseconds since 1970. A robot's initial pose is its ground truth at its first measurement,
-    with the world's start sigmas.
+    Odometry row k acts from its time to the next row's, delayed by odometry_delay_s and the robot's
+    clock_offset_s, which the robot corrects. Stamps are nanoseconds since 1970. A robot's initial
+    pose is its ground truth at its first measurement, with the world's start sigmas.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
@@ -80,7 +79,6 @@ def _streams(
 
 
 def _subjects(barcodes: Float[np.ndarray, "B 2"]) -> dict[int, int]:
-    """Barcode → subject."""
     if not len(barcodes) or np.any(barcodes != np.rint(barcodes)) or np.any(barcodes < 0):
         raise DatasetError("Barcodes.dat: expected rows of two whole numbers, subject and barcode")
     subject_of = {int(code): int(subject) for subject, code in barcodes}
@@ -135,7 +133,7 @@ def _start(world: UtiasWorld, log: Log) -> StartPose | None:
 
 
 def _truth_notes(log: Log) -> list[str]:
-    """Notes on figures that can not be computed, for want of ground truth in time."""
+    """Notes on figures without timely ground truth."""
     notes = []
     if start_pose(log.truth_ns, log.truth, log.start_ns) is None:
         notes.append("no ground truth at its first measurement: its start pose is not known")

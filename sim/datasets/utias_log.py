@@ -1,4 +1,4 @@
-"""One robot of a UTIAS data set: its three files, in order of time, cut where nothing is known."""
+"""One robot of a UTIAS data set: three files by time, cut at unknown stretches."""
 
 import re
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
 
 @dataclass(frozen=True)
 class Log:
-    """Odometry, measurements by subject and truth; start_ns: the begin of the first measurement."""
+    """Odometry, measurements by subject and truth; start_ns: start of the first measurement."""
 
     robot: str
     subject: int
@@ -31,13 +31,13 @@ class Log:
     notes: tuple[str, ...]
 
     def without(self, dropped: Bool[np.ndarray, " R"], reason: str) -> "Log":
-        """The log without some measurements, and a note that counts them."""
+        """Drop measurements, with a note that counts them."""
         note = count_note(int(np.count_nonzero(dropped)), "measurement", f"dropped: {reason}")
         notes = (*self.notes, note) if note else self.notes
         return replace(self, measurements=self.measurements.where(~dropped), notes=notes)
 
     def until(self, end_ns: int) -> "Log":
-        """The log up to the last odometry interval that ends at end_ns or before."""
+        """Log up to the last odometry interval that ends by end_ns."""
         intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
         last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
         samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
@@ -51,7 +51,7 @@ class Log:
 
 
 def present_robots(files: Mapping[str, File]) -> list[int]:
-    """The numbers of the robots that have a file of odometry or of measurements."""
+    """Numbers of the robots with an odometry or measurement file."""
     matches = (re.fullmatch(r"Robot([1-9]\d*)_(Odometry|Measurement)\.dat", name) for name in files)
     return sorted({int(match[1]) for match in matches if match})
 
@@ -59,7 +59,7 @@ def present_robots(files: Mapping[str, File]) -> list[int]:
 def log_of(
     robot: str, files: Mapping[str, File], subject_of: Mapping[int, int], delay_ns: int
 ) -> Log:
-    """The files of the robot r1, r2, …; subject_of: barcode → subject. Raises DatasetError."""
+    """Files of a robot r1, r2, …; subject_of: barcode → subject. Raises DatasetError."""
     present = present_robots(files)
     subject = int(robot[1:]) if re.fullmatch(r"r[1-9]\d*", robot) else 0
     if subject not in present:
@@ -75,7 +75,7 @@ def log_of(
     measurements, measurement_notes = measurements_of(measured, subject_of)
     truth_ns, truth, truth_notes = truth_of(true_rows)
     missing = (
-        "no odometry: only what it saw is given" if not len(intervals.end_ns) else "",
+        "no odometry: only its observations are used" if not len(intervals.end_ns) else "",
         "no measurements: only its odometry is given" if not len(measurements.stamps_ns) else "",
         "no ground truth: its trajectory's error can not be computed" if not len(truth) else "",
     )

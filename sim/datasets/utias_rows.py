@@ -1,6 +1,4 @@
-"""Rows of UTIAS tables → measurements in order of time, with a note for each kind of row that is
-dropped.
-"""
+"""Convert rows of UTIAS tables to ordered measurements, with notes on dropped rows."""
 
 from collections.abc import Mapping
 
@@ -11,28 +9,24 @@ from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from sim.world.streams import Intervals
 
 LONG_GAP_NS = 2_000_000_000
-"""Least gap in the odometry or the truth that is noted."""
+"""Least reported gap in odometry or truth."""
 
 START_WINDOW_NS = 200_000_000
-"""The initial pose is computed from the ground truth within this time of the robot's first
-measurement.
-"""
+"""Time around a robot's first measurement from which the initial pose is computed."""
 
 START_SPREAD_RAD = 0.2
-"""Largest difference [rad] between headings of that ground truth (the base turns at most 0.58
-rad/s).
-"""
+"""Largest heading difference [rad] within that time (the base turns at most 0.58 rad/s)."""
 
 
 def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
-    """Seconds, rounded to the microsecond (a double holds no more of a time since 1970)."""
+    """Round seconds to the microsecond, the precision of a double since 1970."""
     return np.rint(seconds * 1e6).astype(np.int64) * 1000
 
 
 def intervals_of(
     rows: Float[np.ndarray, "N 3"], delay_ns: int
 ) -> tuple[Intervals, tuple[str, ...]]:
-    """Odometry rows (t, v, ω): row k's velocities act over [t_k, t_{k+1}] + delay."""
+    """Odometry rows (t, v, ω): row k acts over [t_k, t_{k+1}] + delay."""
     rows, backward = _by_time(rows)
     stamps = nanoseconds(rows[:, 0]) + delay_ns
     duration = np.diff(stamps)
@@ -48,7 +42,7 @@ def intervals_of(
         count_note(
             int(np.count_nonzero(~lasting)),
             "odometry row",
-            "dropped: another row has the same time, so it lasts no time",
+            "dropped: another row has the same time",
         ),
     ]
     if np.any(duration > LONG_GAP_NS):
@@ -60,7 +54,7 @@ def intervals_of(
 def measurements_of(
     rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
 ) -> tuple[Scans, tuple[str, ...]]:
-    """Measurement rows (t, barcode, range, bearing) → measurements by subject."""
+    """Convert measurement rows (t, barcode, range, bearing) to measurements by subject."""
     rows, backward = _by_time(rows)
     codes = np.array(sorted(subject_of), dtype=np.float64)
     subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
@@ -90,7 +84,7 @@ def measurements_of(
 def truth_of(
     rows: Float[np.ndarray, "N 4"],
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], tuple[str, ...]]:
-    """Ground truth rows (t, x, y, θ) as they are, in order of time."""
+    """Unchanged ground truth rows (t, x, y, θ) by time."""
     rows, backward = _by_time(rows)
     stamps = nanoseconds(rows[:, 0])
     notes = [
@@ -105,10 +99,10 @@ def truth_of(
 def start_pose(
     truth_ns: Int64[np.ndarray, " T"], truth: Float[np.ndarray, "T 3"], start_ns: int
 ) -> Float[np.ndarray, "3"] | None:
-    """The true pose at start_ns, interpolated on the circle; None without truth at that time.
+    """True pose at start_ns, interpolated on the circle, or None.
 
-    Resampled truth has wrong headings beside the wrap at ±π, so the samples about the start vote:
-    those away from the one that is nearest to all others are left out.
+    Resampled truth has wrong headings beside ±π, so only samples about the start that agree with
+    the one nearest to all others count.
     """
     first, last = np.searchsorted(
         truth_ns, [start_ns - START_WINDOW_NS, start_ns + START_WINDOW_NS + 1]
@@ -116,9 +110,9 @@ def start_pose(
     if first == last:
         return None
     poses = truth[first:last]
-    apart = np.abs(on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
-    middle = int(np.argmin(apart.sum(axis=1)))
-    agreeing = apart[middle] <= START_SPREAD_RAD
+    difference = np.abs(on_circle(poses[:, 2, np.newaxis] - poses[:, 2]))
+    middle = int(np.argmin(difference.sum(axis=1)))
+    agreeing = difference[middle] <= START_SPREAD_RAD
     since = (truth_ns[first:last][agreeing] - start_ns).astype(np.float64)
     x, y, heading = poses[agreeing].T
     turned = on_circle(heading - poses[middle, 2])
@@ -127,6 +121,6 @@ def start_pose(
 
 
 def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
-    """Rows in stable order of their first column, and how often it went backward."""
+    """Sort rows stably by the first column; also returns the number of backward steps."""
     backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
     return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward

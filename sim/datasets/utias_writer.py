@@ -1,4 +1,4 @@
-"""Write streams as a data set in the UTIAS MRCLAM format, which `sim.datasets.utias` reads."""
+"""Write streams in the UTIAS MRCLAM format, for `sim.datasets.utias`."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,15 +11,15 @@ from sim.world.streams import RobotStream, WorldStreams
 Row = tuple[str | float, ...]
 
 FIRST_BARCODE = 100
-"""Subject k has the barcode 100 + k, so that barcodes and subjects can not be confused."""
+"""Subject k has barcode 100 + k, so barcodes and subjects cannot be confused."""
 
 
 def write_utias(streams: WorldStreams, directory: Path | str) -> None:
-    """One folder of text files: times to the microsecond, all other numbers to nine decimals.
+    """Write a folder of text files: times in microseconds, other numbers to nine decimals.
 
-    Robot i of the streams becomes subject and file i + 1. Landmarks keep their ids, unless one is
-    among the robots' subjects (1 … 5, or as many as there are robots): then all ids are moved past
-    them. The format has no start poses, covariances or empty messages; it gives none of them.
+    Robot i becomes subject and file i + 1. Landmarks keep their ids unless one is a robot's subject
+    (1 … 5, or the number of robots): then all ids are moved beyond. The format has no start poses,
+    covariances or empty messages.
     """
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ def write_utias(streams: WorldStreams, directory: Path | str) -> None:
 
 
 def beyond_utias(streams: WorldStreams) -> list[str]:
-    """The forms of these measurements that the format does not have."""
+    """Measurement forms that the format lacks."""
     intervals = [stream.intervals for stream in streams.streams]
     seen = [stream.landmark_detections for stream in streams.streams]
     found = {
@@ -56,11 +56,11 @@ def beyond_utias(streams: WorldStreams) -> list[str]:
         "landmarks as points": any(each.points is not None for each in seen),
         "covariances of landmarks": any(each.covariances is not None for each in seen),
     }
-    return [form for form, there in found.items() if there]
+    return [form for form, is_present in found.items() if is_present]
 
 
 def landmark_shift(streams: WorldStreams) -> int:
-    """The number that `write_utias` adds to the landmarks' ids."""
+    """Number that `write_utias` adds to landmark ids."""
     last_robot = max(ROBOTS, len(streams.streams))
     seen = [stream.landmark_detections.ids for stream in streams.streams]
     ids = np.concatenate([streams.landmark_ids, *seen])
@@ -84,7 +84,7 @@ def _write_robot(folder: Path, stream: RobotStream, number: Mapping[str, int], s
 
 
 def _odometry_rows(stream: RobotStream) -> list[Row]:
-    """A row where each interval begins, and one that ends the last, by the odometry's own clock."""
+    """A row at the start of each interval and at the end of the last, on the odometry's clock."""
     intervals = stream.intervals
     if not len(intervals.end_ns):
         return []
@@ -96,7 +96,6 @@ def _odometry_rows(stream: RobotStream) -> list[Row]:
 
 
 def _measured_rows(stream: RobotStream, number: Mapping[str, int], shift: int) -> list[Row]:
-    """Landmarks and teammates by time, as barcodes."""
     subject_of = np.array([number[name] for name in stream.teammates], dtype=np.int64)
     landmarks, teammates = stream.landmark_detections, stream.teammate_detections
     subjects = (landmarks.ids.astype(np.int64) + shift, subject_of[teammates.ids])
@@ -111,7 +110,7 @@ def _measured_rows(stream: RobotStream, number: Mapping[str, int], shift: int) -
 
 
 def _seconds(stamp_ns: int) -> str:
-    """Nanoseconds as seconds with six decimals, exact to the microsecond."""
+    """Seconds with six decimals, exact to the microsecond."""
     micro = (stamp_ns + 500) // 1000
     sign, micro = ("-", -micro) if micro < 0 else ("", micro)
     return f"{sign}{micro // 10**6}.{micro % 10**6:06d}"

@@ -1,1 +1,1 @@
-"""Other people's logs → data sets in folders of CSV tables."""
+"""Import foreign logs as data sets in folders of CSV tables."""

@@ -1,4 +1,4 @@
-"""ROS 2 bags → tables: finds the topics, and converts their messages."""
+"""Import ROS 2 bags: find the topics and convert their messages to tables."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -24,10 +24,9 @@ from team.ros2.translator import Translator
 
 @dataclass
 class Imported:
-    """The tables of a bag's robots.
+    """Tables of a bag's robots.
 
-    notes: the topics used and left out, and why, in words. messages: number of messages that
-    were read.
+    notes: topics used and omitted, with reasons. messages: number read.
     """
 
     robots: list[RobotTables]
@@ -36,10 +35,9 @@ class Imported:
 
 
 def import_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
-    """The tables of a bag; raises BagError, UndecidedError.
+    """Tables of a bag; raises BagError, UndecidedError.
 
-    topics: each robot's topics; None: as their names and types propose them, if there is one way
-    only. robot: the name of the bag's only robot.
+    topics: of each robot; None: from names and types if unambiguous. robot: name of the only robot.
     """
     with opened_bag(path) as bag:
         chosen = topics or decide_topics(bag, path, robot)
@@ -102,8 +100,8 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
 
 
 def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
-    """A translator for each robot; where robots share a topic of detections, all transforms of the
-    bag are read first, since they decide to which robot a detection belongs.
+    """Translator of each robot; if robots share a detection topic, all transforms are read first to
+    assign detections.
     """
     frames = {name: _static_frames(bag, each.odometry) for name, each in topics.robots.items()}
     owners = Owners(topics.robots, frames)
@@ -128,7 +126,7 @@ def _stamped(record: Record, arrival_ns: int) -> Record:
 
 
 def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
-    """Take the mount of the robot's first sensor into the tables; returns notes."""
+    """Add the mount of the robot's first sensor to the tables; returns notes."""
     if not translator.mounts:
         return []
     tables.mount = next(iter(translator.mounts.values())).pose
@@ -141,9 +139,7 @@ def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
 
 
 def _static_frames(bag: Bag, odometry: str) -> Frames:
-    """The static transforms of a robot: those without a namespace, and those in one that its
-    odometry topic has, too.
-    """
+    """Static transforms of a robot: those without namespace, or in its odometry topic's."""
     frames = Frames()
     for record in _records(bag, static_topics(odometry)):
         if isinstance(record, TransformsRecord):
@@ -153,7 +149,6 @@ def _static_frames(bag: Bag, odometry: str) -> Frames:
 
 
 def _records(bag: Bag, topics: Collection[str]) -> Iterator[Record]:
-    """The sound messages of these topics."""
     for raw in bag.messages(topics):
         try:
             yield decode(raw.kind, raw.data, bag.store)

@@ -1,4 +1,4 @@
-"""Propose the use of the topics of a ROS 2 bag by their names, types and frames."""
+"""Propose the use of a ROS 2 bag's topics by names, types and frames."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -16,19 +16,17 @@ POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceS
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 WHEEL_WORDS = ("wheel", "wheels", "encoder", "encoders", "raw", "controller", "drive")
 PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
-"""Words in the first part of a topic that name a part of a robot, and no robot."""
+"""Initial topic words that name a part of a robot, not a robot."""
 SAMPLED_MESSAGES = 2000
-"""Number of messages of /tf that are searched for tags."""
+"""Number of /tf messages searched for tags."""
 
 
 class UndecidedError(DatasetError):
-    """The names and types of a bag's topics do not decide which are used; the text has a remedy."""
+    """A bag's topics are ambiguous; the text has a remedy."""
 
 
 class Proposal(NamedTuple):
-    """The topics of each robot; others: further topics that may be its odometry; warnings: what is
-    ambiguous.
-    """
+    """Topics of each robot; others: further possible odometry; warnings: ambiguities."""
 
     robots: dict[str, RobotTopics]
     others: dict[str, list[str]]
@@ -36,15 +34,13 @@ class Proposal(NamedTuple):
 
 
 def propose_topics(path: Path) -> str:
-    """A bag's topics, and a proposal for the file that assigns them; raises BagError."""
+    """A bag's topics, with a proposed assignment file; raises BagError."""
     with opened_bag(path) as bag:
         return _question(path, bag, _proposed(bag, None))
 
 
 def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
-    """The topics of each robot by their names and types; raises UndecidedError where they do not
-    decide.
-    """
+    """Topics of each robot by names and types; raises UndecidedError if ambiguous."""
     found = _proposed(bag, robot)
     if found.warnings:
         raise UndecidedError(_question(path, bag, found))
@@ -53,7 +49,7 @@ def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
 
 def _question(path: Path, bag: Bag, found: Proposal) -> str:
     return (
-        f"{path}: which topics are what?\n{listing(bag.topics)}\n"
+        f"{path}: the topics are ambiguous.\n{listing(bag.topics)}\n"
         + "".join(f"{doubt}\n" for doubt in found.warnings)
         + "Write it into a file, as topics.toml, beginning with this:\n\n"
         + as_toml(found)
@@ -62,7 +58,6 @@ def _question(path: Path, bag: Bag, found: Proposal) -> str:
 
 
 def _proposed(bag: Bag, robot: str | None) -> Proposal:
-    """The topics of each robot as their names, types and frames propose them."""
     found = bag.topics
     tagged = _tags_in(bag)
     bases = {topic.name: _base_in(bag, topic) for topic in found if topic.kind in ODOMETRY}
@@ -98,10 +93,10 @@ def _proposed(bag: Bag, robot: str | None) -> Proposal:
 
 
 def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> list[str] | list[None]:
-    """The namespaces that are robots; None: all topics are one robot's.
+    """Namespaces that are robots; None: all topics are one robot's.
 
-    Several namespaces with odometry are one robot's where none has both odometry and detections,
-    and all odometry is of one frame.
+    Namespaces belong to one robot if none has both odometry and detections, and all odometry has
+    one frame.
     """
     spaces = sorted({_namespace(name) for name in bases})
     if len(spaces) < 2:
@@ -111,13 +106,13 @@ def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> lis
 
 
 def _only_space(topics: list[Topic]) -> str:
-    """The namespace of a single robot's odometry; empty where there are several."""
+    """Namespace of a single robot's odometry; empty for several."""
     spaces = {_namespace(topic.name) for topic in topics if topic.kind in ODOMETRY}
     return spaces.pop() if len(spaces) == 1 else ""
 
 
 def _base_in(bag: Bag, topic: Topic) -> str:
-    """The frame whose pose an odometry topic has, by its first sound message."""
+    """Frame of an odometry topic's pose, by its first valid message."""
     for raw in bag.messages([topic.name]):
         try:
             record = decode(raw.kind, raw.data, bag.store)
@@ -128,7 +123,7 @@ def _base_in(bag: Bag, topic: Topic) -> str:
 
 
 def _choice(odometry: list[str]) -> str:
-    """Which of several odometry topics is proposed, and why."""
+    """Proposed odometry topic of several, with the reason."""
     if len(odometry) < 2:
         return ""
     return (
@@ -140,9 +135,7 @@ def _choice(odometry: list[str]) -> str:
 def _candidates(
     topics: list[Topic], tagged: set[str], space: str | None
 ) -> tuple[list[str], list[str], list[str]]:
-    """The candidates for odometry, the likeliest first, detections and truth in one namespace;
-    None: in all.
-    """
+    """Candidates for odometry (likeliest first), detections and truth in a namespace; None: all."""
     here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
     true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
     odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
@@ -160,7 +153,7 @@ def _is_truth(topic: Topic) -> bool:
 
 
 def _namespace(topic: str) -> str:
-    """The first part of /r1/odom; empty for /odom, /odometry/filtered and /wheel/odom."""
+    """First part of /r1/odom; empty for /odom, /odometry/filtered and /wheel/odom."""
     parts = topic.strip("/").split("/")
     part = len(parts) > 1 and (parts[0].startswith("odom") or has_word(parts[0], PART_WORDS))
     return parts[0] if len(parts) > 1 and not part else ""
@@ -173,7 +166,6 @@ def _robot_name(space: str, robot: str | None) -> str:
 
 
 def _tags_in(bag: Bag) -> set[str]:
-    """The topics of transforms that contain tags."""
     found = set()
     for topic in bag.topics:
         if topic.kind != TRANSFORMS or topic.name.rpartition("/")[2] == STATIC:
@@ -193,7 +185,7 @@ def _tags_in(bag: Bag) -> set[str]:
 
 
 def listing(topics: list[Topic]) -> str:
-    """A bag's topics, one a line, with a remark where a topic can not be used."""
+    """A bag's topics, one per line, with remarks on unusable ones."""
     lines = []
     for topic in topics:
         used = "" if topic.kind in READERS else "   (not read here)"
@@ -202,7 +194,7 @@ def listing(topics: list[Topic]) -> str:
 
 
 def as_toml(found: Proposal) -> str:
-    """The file that assigns topics to robots, in TOML."""
+    """TOML file that assigns topics to robots."""
     lines = []
     for name, topics in found.robots.items():
         either = "".join(f'   # or "{other}"' for other in found.others.get(name, ()))

@@ -1,4 +1,4 @@
-"""Maps of columns: which of a user's columns become which of ours, and proposals for such a map."""
+"""Column maps from a user's columns to ours, and proposals for them."""
 
 import re
 import tomllib
@@ -17,9 +17,7 @@ from sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One of the user's columns: scale · number + offset. Without both its text is taken as
-    it is.
-    """
+    """A user's column: scale · number + offset, or without both its text."""
 
     column: str
     scale: float = 1.0
@@ -27,9 +25,9 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One table: the ends of the names of the files that lie side by side in it, and its columns.
+    """A table: endings of the names of files joined side by side, and its columns.
 
-    drop: by the user's column, the texts of rows that are no measurements.
+    drop: by user column, texts of rows that are no measurements.
     """
 
     files: tuple[str, ...]
@@ -44,7 +42,7 @@ TABLES: Mapping[str, Sequence[str]] = {
     "detections": (*detections_table.COLUMNS, *POINTS, *POINT_COVARIANCE),
     "labels": detections_table.LABELS,
 }
-"""The columns that each table may have: those of a data set; detections may be points, too."""
+"""Allowed columns of each table: a data set's, and points for detections."""
 REQUIRED: Mapping[str, Sequence[str]] = {
     **folder.REQUIRED,
     "detections": ("t_s",),
@@ -75,7 +73,7 @@ SYNONYMS: Mapping[str, str] = {
     "range_m": "range ranges r distance dist rho rng",
     "bearing_rad": "bearing bearings beta angle azimuth brg",
 }
-"""Names of columns, in words between which nothing, a mark or a capital letter may stand."""
+"""Column names as words, separated by nothing, a mark or a capital letter."""
 DEGREE = "0.017453292519943295"
 UNITS = {
     "s": "1", "sec": "1", "ms": "1e-3", "msec": "1e-3", "us": "1e-6", "usec": "1e-6", "ns": "1e-9",
@@ -85,7 +83,7 @@ UNITS = {
     "kmh": "0.2777777777777778", "kph": "0.2777777777777778", "rad_s": "1", "rad_sec": "1",
     "rps": "1", "deg_s": DEGREE, "deg_sec": DEGREE, "dps": DEGREE,
 }  # fmt: skip
-"""The factor to our unit, by the unit at the end of a column's name."""
+"""Factor to our unit, by the unit at the end of a column name."""
 LARGEST_S = 1e11
 """Times from here on are no seconds: as Unix times, 1e11 s is in the year 5138, 1e11 ms in 1973."""
 KINDS = tuple(TABLES)
@@ -100,16 +98,16 @@ FILE_NAMES: Mapping[str, Sequence[str]] = {
     "landmarks": ("landmark",),
     "start": ("start",),
 }
-"""Parts of file names by the kind of table that they indicate."""
+"""Parts of file names that indicate a table kind."""
 PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "truth", "gt", "tag",
             "marker", "landmark", "twist", "encoder", "measured", "measurement", "header",
             "field", "true", "groundtruth", "ref", "reference", "mocap", "optitrack",
             "vicon")  # fmt: skip
-"""Words before a column's name that repeat its file's kind: odom_x, pose.position.y."""
+"""Prefixes of column names that repeat the file's kind: odom_x, pose.position.y."""
 
 
 def load_map(path: Path) -> Map:
-    """Read a map in TOML; raises DatasetError."""
+    """Read a TOML column map; raises DatasetError."""
     try:
         found = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Map)
     except (OSError, UnicodeDecodeError) as error:
@@ -134,7 +132,7 @@ def load_map(path: Path) -> Map:
 
 
 def map_columns(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
-    """The columns under our names, as text; raises DatasetError."""
+    """Columns under our names, as text; raises DatasetError."""
     found = {}
     for ours, theirs in columns.items():
         column = Column(theirs) if isinstance(theirs, str) else theirs
@@ -154,9 +152,7 @@ def map_columns(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[st
 
 
 class _Guess(NamedTuple):
-    """A table that a file probably has: our columns, and whether file and table are called alike;
-    rank: the better of two files for one table is higher.
-    """
+    """Probable table of a file: our columns, and whether names match; a higher rank is better."""
 
     file: str
     kind: str
@@ -166,9 +162,7 @@ class _Guess(NamedTuple):
 
 
 def propose_map(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
-    """Propose a map in TOML for these files as far as the columns' names determine it; also the
-    columns that it lacks.
-    """
+    """Propose a TOML map for these files as far as names allow; also returns missing columns."""
     guesses: list[_Guess] = []
     lacking: list[str] = []
     for name, table in files.items():
@@ -196,10 +190,10 @@ def propose_map(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
 
 
 def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
-    """The table that has most of these columns, of equals the one that the file is called after;
-    and the truth, where odometry has reference columns beside its own.
+    """Table with most of these columns, then by file name; and truth, if odometry has reference
+    columns.
 
-    Files and columns that are called a reference are no measurements.
+    Reference files and columns are no measurements.
     """
     reference = [each for each in header if has_word(each, TRUTH_WORDS)]
     is_reference = has_word(Path(name).stem, TRUTH_WORDS)
@@ -221,7 +215,7 @@ def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
 
 
 def _guess(name: str, kind: str, header: Sequence[str]) -> _Guess | None:
-    """The columns that a kind of table has of a file's; None where it lacks some."""
+    """Columns of a table kind in a file; None if incomplete."""
     found = {ours: near for ours in TABLES[kind] if (near := _near(ours, header)) is not None}
     columns = _of_one_form(kind, found)
     whole = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
@@ -234,7 +228,7 @@ def _guess(name: str, kind: str, header: Sequence[str]) -> _Guess | None:
 
 
 def _of_one_form(kind: str, columns: dict[str, str]) -> dict[str, str]:
-    """The columns without those of a second form of the same measurement."""
+    """Columns of one measurement form only."""
     left_out: Sequence[str] = ()
     if kind == "odometry" and "forward_m_s" in columns:
         left_out = POSES
@@ -244,7 +238,7 @@ def _of_one_form(kind: str, columns: dict[str, str]) -> dict[str, str]:
 
 
 def _near(ours: str, header: Sequence[str]) -> str | None:
-    """The column whose name is close to ours, if there is one."""
+    """Column with a name close to ours, if any."""
     names = {_joined(name) for name in SYNONYMS.get(ours, "").split()}
     names.add(_joined(_without_unit(ours)[0]))
     for theirs in header:
@@ -257,7 +251,7 @@ def _near(ours: str, header: Sequence[str]) -> str | None:
 
 
 def _without_unit(name: str) -> tuple[str, str]:
-    """A column's name in small letters without its unit, and the factor of the unit."""
+    """Lower-case column name without unit, and the unit's factor."""
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
     plain = re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
     for unit in sorted(UNITS, key=len, reverse=True):
@@ -276,9 +270,7 @@ def _joined(name: str) -> str:
 
 
 def _clock(chosen: str, table: CsvTable) -> dict[str, str]:
-    """The column of times with a scale, where its name has no unit and its numbers are no
-    seconds.
-    """
+    """Time column with a scale, if its name has no unit and its numbers are no seconds."""
     cells = table.columns.get(chosen.strip('"'), [])
     try:
         largest = abs(float(cells[0]))

@@ -1,4 +1,4 @@
-"""CSV files with columns of their own names, and trajectories, → tables."""
+"""Import CSV files with foreign column names, and trajectories."""
 
 from collections.abc import Collection, Sequence
 from math import atan2
@@ -20,7 +20,7 @@ from sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, pro
 from sim.importing.tables import RobotTables
 
 QUATERNION = 8
-"""Number of columns of a trajectory in TUM's format: t x y z qx qy qz qw."""
+"""Columns of a TUM trajectory: t x y z qx qy qz qw."""
 
 
 def import_files(
@@ -30,11 +30,11 @@ def import_files(
     everyones: Collection[str] = (),
     command: str = "",
 ) -> tuple[RobotTables, list[str]]:
-    """Import one robot's tables from CSV files; also notes on the files used and left out.
+    """Import one robot's tables from CSV files; also returns notes on the files.
 
-    everyones: the names of all robots' files; a table whose files only other robots have is left
-    out. command: the command line to repeat with a map. Raises DatasetError; without a map its text
-    proposes one, unless every column has our name.
+    everyones: file names of all robots; a table whose files only other robots have is omitted.
+    command: command line to repeat with a map. Raises DatasetError; without a map its text proposes
+    one, unless every column has our name.
     """
     files = {path.name: read_table(path, str(path)) for path in paths}
     if len(files) < len(paths):
@@ -54,7 +54,7 @@ def import_files(
 
 
 def _by_names(files: dict[str, CsvTable], command: str) -> Map:
-    """The map of files whose columns have our names; raises DatasetError with a proposal."""
+    """Map of files with our column names; raises DatasetError with a proposal."""
     found: Map = {}
     for name, table in files.items():
         kind = Path(name).stem
@@ -107,9 +107,9 @@ def _take(
 
 
 def _polar(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
-    """Detections with ranges and bearings in place of points (ahead, left): r = |p|, β = atan2.
+    """Convert detections from points (ahead, left): r = |p|, β = atan2.
 
-    Their covariance is J C Jᵀ with the Jacobian J of (r, β) with respect to the point.
+    The covariance is J C Jᵀ with the Jacobian J of (r, β) with respect to the point.
     """
     if not all(name in columns for name in POINTS):
         return columns
@@ -137,7 +137,6 @@ def _texts(numbers: Float[np.ndarray, " rows"]) -> list[str]:
 
 
 def _joined(tables: Sequence[CsvTable]) -> CsvTable:
-    """Tables side by side, row by row."""
     first = tables[0]
     columns = dict(first.columns)
     for other in tables[1:]:
@@ -148,7 +147,7 @@ def _joined(tables: Sequence[CsvTable]) -> CsvTable:
 
 
 def trajectory(path: Path) -> list[tuple[str, object, object, object]]:
-    """The rows (t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or of TUM's format; raises
+    """Rows (t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or in TUM format; raises
     DatasetError.
     """
     lines = path.read_text("utf-8", errors="replace").splitlines()

@@ -1,4 +1,4 @@
-"""Import a user's files, bag, log or data set into a data set's folder."""
+"""Import a user's files, bag, log or data set into a data-set folder."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -35,10 +35,10 @@ MEASURED = ("odometry", "observations", "sightings", "detections")
 
 @dataclass(frozen=True)
 class Request:
-    """A user's request for an import.
+    """Import request.
 
-    sources: files or folders. starts: initial poses by robot (a pose, then two standard deviations
-    or none); "" is the only robot. truth: a trajectory of the only robot.
+    sources: files or folders. starts: initial poses by robot (pose, then two or no standard
+    deviations); "" is the only robot. truth: trajectory of the only robot.
     """
 
     sources: Sequence[Path]
@@ -51,10 +51,9 @@ class Request:
 
 @dataclass
 class Report:
-    """The result of an import.
+    """Result of an import.
 
-    robots: their names. notes: the files and rows used and left out, in words. messages: number of
-    messages that were read from bags.
+    robots: names. notes: used and omitted files and rows. messages: number read from bags.
     """
 
     robots: list[str]
@@ -81,7 +80,7 @@ def import_data(request: Request, folder: Path) -> Report:
 
 
 def _own_form(request: Request, folder: Path) -> Report:
-    """Copy a data set or a log of ours, with the initial poses that are given."""
+    """Copy our own data set or log, with the given initial poses."""
     source = request.sources[0]
     given = {"--robot": request.robot, "--columns": request.columns, "--truth": request.truth}
     for option in (name for name, value in given.items() if value is not None):
@@ -104,7 +103,7 @@ def _own_form(request: Request, folder: Path) -> Report:
 
 
 def _started(name: str, robots: Collection[str]) -> str:
-    """The robot whose initial pose `--start` gives; raises DatasetError."""
+    """Robot that `--start` refers to; raises DatasetError."""
     robot = name or (next(iter(robots)) if len(robots) == 1 else "")
     if robot not in robots:
         raise DatasetError(
@@ -114,9 +113,7 @@ def _started(name: str, robots: Collection[str]) -> str:
 
 
 def _is_foreign(source: Path) -> bool:
-    """Whether a folder has CSV files with names of their own, in it or in one folder for each
-    robot.
-    """
+    """Whether a folder has foreign CSV files, directly or in one folder per robot."""
     try:
         kind_of(source)
     except DatasetError:
@@ -125,10 +122,9 @@ def _is_foreign(source: Path) -> bool:
 
 
 def _files_by_robot(request: Request) -> dict[str, list[Path]]:
-    """The CSV files of each robot: of a folder, of each of its folders, or of each folder that is
-    given.
+    """CSV files of each robot: of a folder, of its sub-folders, or of each given folder.
 
-    Files beside the robots' folders (the true landmarks) belong to every robot.
+    Files beside the robots' folders (true landmarks) belong to every robot.
     """
     found: dict[str, list[Path]] = {}
     for source in request.sources:
@@ -136,18 +132,18 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
             raise DatasetError(f"{source}: give folders, one for each robot, or files of one robot")
         inner = {each.name: sorted(each.glob("*.csv")) for each in sorted(source.iterdir())}
         inner = {name: files for name, files in inner.items() if files}
-        beside = sorted(source.glob("*.csv"))
+        common = sorted(source.glob("*.csv"))
         if inner and request.robot:
             raise DatasetError(
                 f"--robot {request.robot}: {source} has a folder for each robot, "
                 f"{', '.join(inner)}, which names it; rename the folder"
             )
         if inner:
-            found |= {name: [*files, *beside] for name, files in inner.items()}
+            found |= {name: [*files, *common] for name, files in inner.items()}
         elif len(request.sources) == 1:
-            found[request.robot or ONE_ROBOT] = beside
+            found[request.robot or ONE_ROBOT] = common
         else:
-            found[source.name] = beside
+            found[source.name] = common
     for name in found:
         if not re.fullmatch(ROBOT_NAME, name):
             raise DatasetError(
@@ -171,9 +167,7 @@ def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
 
 
 def proposal(path: Path) -> str:
-    """The topics of a bag, and a proposal for the file that assigns them; empty for a path
-    that is no bag.
-    """
+    """A bag's topics, with a proposed assignment file; empty for other paths."""
     if not is_bag(path) or is_own_log(path):
         return ""
     try:
@@ -183,7 +177,7 @@ def proposal(path: Path) -> str:
 
 
 def is_own_log(path: Path) -> bool:
-    """Whether a file is the log of a team."""
+    """Whether a file is a team's log."""
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:

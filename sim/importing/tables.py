@@ -1,4 +1,4 @@
-"""One robot's tables on their way into a data set's folder."""
+"""One robot's tables before they are written to a data set's folder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,10 +12,9 @@ from team.ros2.translator import Measured, Pose, Seen, Speeds
 
 @dataclass
 class RobotTables:
-    """The rows of one robot's tables.
+    """Rows of one robot's tables.
 
-    columns: of tables that choose their columns themselves. mount: the pose (x, y, yaw) of the
-    sensor on the base.
+    columns: of tables that choose their columns. mount: sensor pose (x, y, yaw) on the base.
     """
 
     robot: str
@@ -24,7 +23,7 @@ class RobotTables:
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def add(self, table: str, columns: Sequence[str], row: Row) -> None:
-        """Append a row; columns that only some rows have are empty in the others."""
+        """Append a row; columns of only some rows are empty in the others."""
         known = self.columns.setdefault(table, columns)
         if len(columns) > len(known):
             self.columns[table] = columns
@@ -54,7 +53,7 @@ class RobotTables:
                     self.add(table, ("t_s", column, *POINTS), (time, name, *point))
 
     def start(self, pose: Sequence[float], sigmas: Sequence[float] = ()) -> None:
-        """Set the initial pose; sigmas: its standard deviations (position [m], heading [rad])."""
+        """Set the initial pose; sigmas: standard deviations (position [m], heading [rad])."""
         row: list[object] = list(pose)
         columns = [*POSES]
         if sigmas:
@@ -64,7 +63,7 @@ class RobotTables:
         self.columns["start"], self.rows["start"] = columns, [row]
 
     def write(self, folder: Path) -> None:
-        """Write the tables into a folder of the robot's name, and the true landmarks beside it."""
+        """Write the tables into a folder of the robot's name, and true landmarks beside it."""
         place = folder / self.robot
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():
@@ -76,5 +75,4 @@ class RobotTables:
 
 
 def _fitted(row: Row, width: int) -> Row:
-    """The row, filled up with empty cells."""
     return [*row, *[""] * (width - len(row))]

@@ -1,1 +1,1 @@
-"""A whole team as processes: started, watched, ordered about, ended."""
+"""A team's processes: start, supervision, end."""

@@ -1,8 +1,7 @@
-"""Start the template, ahead of everything else that `launch` imports and computes.
+"""Start the template before `launch` imports anything else.
 
-What a team needs takes a second and a half to import and to load; meanwhile the launch reads its
-command line and its scenario on another core. This module imports next to nothing, so that the
-template is started within the first hundredth of a second: docs/decisions/12.
+A team's imports take 1.5 s; meanwhile the launch reads command line and scenario on another core.
+This module's imports are minimal, so the template starts within 10 ms: docs/decisions/12.
 """
 
 import os
@@ -15,7 +14,7 @@ from sim.launch.linux import adopt_orphans
 # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
 PROGRAM = (sys.executable, "-P", "-m", "sim")
 TEMPLATE = "template"
-"""`python -m sim template FD`: started by `launch`, no command for users."""
+"""Internal command `python -m sim template FD` of `launch`."""
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -26,15 +25,15 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-"""The environment of a process whose libraries have one thread each."""
+"""Environment that gives each library one thread."""
 _ROOM = 4_096
-"""Bytes of a forked process's command line; the template is started with that many spaces."""
+"""Bytes for a forked process's command line, reserved as spaces."""
 
 
 class Template:
-    """The process from which a team's are forked, and the socket by which it is asked to.
+    """Process from which a team's processes are forked, and its request socket.
 
-    output: the descriptor for its errors until it has a file of its own.
+    output: error descriptor until it has its own file.
     """
 
     def __init__(self, output: int) -> None:
@@ -61,17 +60,17 @@ _waiting: list[Template] = []
 
 
 def start_ahead() -> None:
-    """Start a template, where the system has what it needs; `taken` returns it."""
+    """Start a template if the system supports it; `taken` returns it."""
     if sys.stderr is not None and adopt_orphans():
         _waiting.append(Template(sys.stderr.fileno()))
 
 
 def taken() -> Template | None:
-    """The template that was started ahead, if any, for its one user."""
+    """Template started ahead, if any, for its one user."""
     return _waiting.pop() if _waiting else None
 
 
 def end_ahead() -> None:
-    """End the template that was started ahead and that nobody has taken: the command has failed."""
+    """End an unused template after a failed command."""
     if (template := taken()) is not None:
         template.end()

@@ -1,4 +1,4 @@
-"""`teamslam launch`: the whole team as processes, watched until its final map is there."""
+"""`teamslam launch`: the team as processes, supervised until the final map."""
 
 import signal
 import time
@@ -21,27 +21,24 @@ from team.wire.bus import BusError
 from team.wire.zenoh.bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
-"""Time [s] within which the router must report its endpoint; a busy machine starts Python
-slowly.
-"""
+"""Time [s] within which the router reports its endpoint; Python starts slowly on a busy machine."""
 POSES = (ch.OWN_POSE, ch.TEAM_POSE)
-"""Channels of which an observer that does not keep up may lose messages."""
+"""Channels that may lose messages to a slow observer."""
 REFUSED = 2
-"""The exit status of a command that can not do what it was asked to."""
+"""Exit status for an impossible request."""
 
 
 class LaunchError(RuntimeError):
-    """The team could not be started or did not end well; the text says who and why."""
+    """The team could not start or end well; the text has process and reason."""
 
 
 @dataclass
 class Outcome:
-    """The result of a launch.
+    """Result of a launch.
 
-    deaths: processes that were killed at the very end, so that none was started again: no failure
-    where map and log are whole. restarts: how often each process was started again. used: the
-    resources of each process, over all its lives. compiling_s: the share of wall_s that went into
-    compiling kernels. end_reason: the reason why the run ended, in words.
+    deaths: processes killed at the end and not restarted; no failure if map and log are whole.
+    used: resources by process over all its lives. compiling_s: share of wall_s spent compiling
+    kernels.
     """
 
     log: Path
@@ -60,10 +57,9 @@ class Outcome:
 def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
-    `show` is called again and again with the state of the team. A process that dies is started
-    again, or given up (`sim.launch.supervision`). Raises BusError when the router can not listen at
-    its endpoint, LaunchError when it does not start. SIGINT and SIGTERM end every process and raise
-    KeyboardInterrupt.
+    `show` repeatedly receives the team's state. A dead process is restarted or given up
+    (`sim.launch.supervision`). Raises BusError if the router cannot listen, LaunchError if it does
+    not start. SIGINT and SIGTERM end every process and raise KeyboardInterrupt.
     """
     began = time.monotonic()
     resolved = plan.folder / "scenario.json"
@@ -125,7 +121,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM interrupts as Ctrl-C does, so that the log is completed."""
+    """Treat SIGTERM as Ctrl-C, so the log is completed."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -151,16 +147,16 @@ def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> S
 
 
 def _signer(own: Credentials) -> Signs:
-    """The signer of orders, imported here, since without keys nothing is signed."""
+    """Signer of orders, imported only if there are keys."""
     from team.keys.signing import Signer
 
     return Signer(own)
 
 
 def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, ZenohBus]:
-    """The router's endpoint, and this process's own bus there.
+    """Router's endpoint, and this process's bus there.
 
-    A router that is killed meanwhile is started again; its own refusal is raised.
+    A router killed meanwhile is restarted; its own refusal is raised.
     """
     while True:
         try:
@@ -178,7 +174,7 @@ def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, 
 
 
 def _endpoint(service: Supervised) -> str:
-    """The router's endpoint. Started again, it listens there, too."""
+    """Router's endpoint, also of a restarted one."""
     router = service.child
     deadline = time.monotonic() + ROUTER_PATIENCE_S
     while time.monotonic() < deadline:
@@ -196,7 +192,7 @@ def _endpoint(service: Supervised) -> str:
 
 
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
-    """The processes but for the router. The world comes early: it makes its streams meanwhile."""
+    """Processes except the router. The world comes early, to make its streams meanwhile."""
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
     robots = [

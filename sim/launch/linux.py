@@ -1,7 +1,6 @@
-"""Features of Linux that Python does not offer: adopting orphans, a parent's death, the command
-line.
+"""Linux features missing in Python: adopting orphans, parent's death, command line.
 
-On other systems these functions do nothing and return that.
+On other systems these functions do nothing and report it.
 """
 
 import ctypes
@@ -14,7 +13,7 @@ from pathlib import Path
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
 _ARG_START, _ARG_END = 48, 49
-"""Fields of /proc/PID/stat, counted from 1: between which addresses the command line lies."""
+"""Fields of /proc/PID/stat, from 1, with the command line's address range."""
 
 
 def _prctl(option: int, value: int) -> bool:
@@ -23,26 +22,23 @@ def _prctl(option: int, value: int) -> bool:
 
 
 def adopt_orphans() -> bool:
-    """Become the parent of descendants whose parent ends; returns whether the system allows it."""
+    """Become the parent of orphaned descendants; returns whether the system allows it."""
     return sys.platform == "linux" and _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def end_with_parent(number: signal.Signals) -> None:
-    """Have this process sent a signal when its parent ends."""
+    """Request a signal on the parent's end."""
     if sys.platform == "linux":
         _prctl(_PR_SET_PDEATHSIG, int(number))
 
 
 def threads() -> int:
-    """The number of this process's threads, those of libraries included."""
+    """Number of this process's threads, including those of libraries."""
     return len(os.listdir("/proc/self/task"))
 
 
 def write_command_line(words: Sequence[str]) -> None:
-    """Show other words as the command line of this process, in `ps` and /proc.
-
-    They overwrite the original words, and are cut to their length.
-    """
+    """Overwrite this process's command line, in `ps` and /proc, cut to the original length."""
     from_third = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     begin, end = (int(from_third[field - 3]) for field in (_ARG_START, _ARG_END))
     room = end - begin

@@ -1,4 +1,4 @@
-"""Shows a running team: a live table in a terminal, plain lines elsewhere."""
+"""Show a running team: a live table in a terminal, plain lines elsewhere."""
 
 import re
 import sys
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from sim.launch.truth import LiveErrors
 
 LINE_S = 5.0
-"""Wall time between two plain lines."""
+"""Wall time between plain lines."""
 REPEAT_S = 60.0
-"""Wall time after which a line is repeated that says nothing new."""
+"""Wall time after which an unchanged line is repeated."""
 SETTLED_S = 5.0
-"""A warning that a node withdraws sooner [s], as while a team starts, is not printed as a line."""
+"""A warning withdrawn within this time [s], as during the start, is not printed."""
 WIDE = 80
-"""Columns of a terminal that has room for the whole table."""
+"""Terminal columns for the whole table."""
 MOST_ALIKE = 3
 """Most lines of warnings that differ in their numbers only."""
 _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
@@ -38,9 +38,7 @@ _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 @contextmanager
 def shown(title: str) -> Iterator[Callable[[Watch], None]]:
-    """A function that shows the state of a run again and again, in the form that fits the
-    output.
-    """
+    """Function that repeatedly shows a run's state in the output's form."""
     console = Console(stderr=True)
     if console.is_terminal and sys.stderr.isatty():
         with Live(console=console, refresh_per_second=4, transient=True) as live:
@@ -90,7 +88,7 @@ class _Lines:
             self._print(watch, line)
 
     def _progress(self, watch: Watch, world: m.Status) -> str:
-        """The line on the team's progress; while it starts, on the processes that are missing."""
+        """Progress line; during the start, the missing processes."""
         robots = [s for n, s in watch.statuses.items() if n.startswith("robot/")]
         if world.state == "waiting":
             missing = watch.missing_robots
@@ -110,9 +108,7 @@ class _Lines:
         )
 
     def end(self) -> None:
-        """Print the warnings that are left at the end, however short they have lasted, without
-        those of the final map, which the table shows.
-        """
+        """Print remaining warnings, except those of the final map's table."""
         if self._last is not None:
             fused = self._last.fused
             final = fused.reasons if fused is not None and fused.final else ()
@@ -120,7 +116,7 @@ class _Lines:
             self._warn(self._last, 0.0)
 
     def _warn(self, watch: Watch, settled_s: float) -> None:
-        """Print new warnings that have lasted; of many that differ in their numbers the first."""
+        """Print new lasting warnings, the first of many that differ in numbers."""
         now, warnings = time.monotonic(), progress.warnings(watch, silent_s=settled_s)
         self._since = {w: self._since.get(w, now) for w in map(without_decimals, warnings)}
         for warning in warnings:
@@ -181,13 +177,11 @@ _NARROW = ("steps", "submaps", "pose_sigma_m", "nis_per_dof")
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
-"""Most robots with a row of their own: a table that is higher than the terminal would be cut."""
+"""Most robots with a row each, since a higher table would be cut."""
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:
-    """A row for each robot; NEES and coverage of its poses where there is a truth. A terminal that
-    is not WIDE has room for some figures only.
-    """
+    """One row per robot, with pose NEES and coverage given truth; fewer figures if not WIDE."""
     columns = [each for each in _COLUMNS if width >= WIDE or each[0] in _NARROW]
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)
@@ -216,8 +210,8 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) 
 
 
 def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
-    """How much of the set a robot has, the age of the newest submap that it has of the others, and
-    how many of these have the same set.
+    """A robot's share of the set, age of its newest submap of the others, and number of robots with
+    the same set.
     """
     figures = statuses[f"robot/{robot}"].figures
     sets = [status.figures.get("set_submaps", 0.0) for status in statuses.values()]
@@ -233,7 +227,6 @@ def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
 
 
 def _map_lines(watch: Watch) -> list[str]:
-    """The contents of the team's map, and its warnings."""
     fused, central = watch.fused, watch.statuses.get("central")
     if fused is None:
         return ["no fused map yet"]

@@ -1,4 +1,4 @@
-"""The plan of a launch: the scenario, the files and the options of its processes."""
+"""Plan of a launch: scenario, files and process options."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from sim.scenarios.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The processes of `launch`, with their files and options."""
+    """Processes of `launch`, with files and options."""
 
     scenario: Scenario
     folder: Path
@@ -22,17 +22,15 @@ class Plan:
 
     @property
     def door(self) -> list[str]:
-        """The option by which every process connects with its certificate; empty where no keys are
-        used.
-        """
+        """Certificate option of every process; empty without keys."""
         return [] if self.keys is None else ["--keys", str(self.keys)]
 
     def set_file(self, node: str) -> Path:
-        """The file in which a node stores the set of submaps; node "*": the pattern of all."""
+        """File of a node's set of submaps; node "*": pattern of all."""
         return self.folder / f"{node}.set"
 
     def stores(self, node: str) -> list[str]:
-        """The option by which a node stores the set: a robot that is a peer, or a centre."""
+        """Storage option of a peer or centre."""
         scenario = self.scenario
         if not (scenario.peers or (node == "central" and scenario.central.fusion == "join")):
             return []
@@ -40,5 +38,5 @@ class Plan:
 
     @property
     def earlier_sets(self) -> list[Path]:
-        """The sets of an earlier run in this folder, which are not part of this one."""
+        """Sets of an earlier run in this folder."""
         return sorted(self.folder.glob(self.set_file("*").name))

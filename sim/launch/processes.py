@@ -1,4 +1,4 @@
-"""Start the processes of a team: forked from the warm template, or each from scratch."""
+"""Start a team's processes, forked from the warm template or from scratch."""
 
 import json
 import os
@@ -18,20 +18,19 @@ from team.shell import PARENT
 from team.the_end import SINCE
 
 LOOK_S = 0.005
-"""Time [s] between two checks of a process that is to end."""
+"""Time [s] between checks of an ending process."""
 PATIENCE_S = 600.0
-"""Time [s] within which a template answers, though it may have to compile all kernels before."""
+"""Time [s] for a template's answer, which may include compiling all kernels."""
 _LARGEST_ANSWER = 64
 KERNELS = "kernels"
-"""The first request of a template: `kernels ESTIMATOR RULE SINCE`, with the file for its errors."""
+"""First request of a template: `kernels ESTIMATOR RULE SINCE`, with the file for its errors."""
 
 
 @dataclass(frozen=True)
 class Used:
-    """The resources of a process: CPU, its largest resident set, and its share of memory at the
-    end.
+    """Resources of a process: CPU, peak resident set, final share of memory; None: unknown.
 
-    A page that n processes have in common counts 1/n in the share of each. None: not known.
+    A page shared by n processes counts 1/n.
     """
 
     cpu_s: float = 0.0
@@ -39,17 +38,17 @@ class Used:
     pss_mb: float | None = None
 
     def and_later(self, later: "Used") -> "Used":
-        """The resources of two lives of one process, of which this one is the earlier."""
+        """Resources of two consecutive lives of a process, this one first."""
         pss_mb = self.pss_mb if later.pss_mb is None else later.pss_mb
         peak_rss_mb = max(self.peak_rss_mb, later.peak_rss_mb)
         return Used(self.cpu_s + later.cpu_s, peak_rss_mb, pss_mb)
 
 
 class Process:
-    """A child of this process by its id.
+    """Child of this process by id.
 
-    exit: its status (negative: the signal that ended it), None while it runs. used: its resources;
-    of its memory the last measurement.
+    exit: status (negative: signal), None while running. used: resources, with the last memory
+    measurement.
     """
 
     def __init__(self, pid: int, started: "subprocess.Popen[bytes] | None" = None) -> None:
@@ -59,13 +58,13 @@ class Process:
         self._started = started
 
     def poll(self) -> int | None:
-        """Its exit status; None while it runs."""
+        """Exit status; None while running."""
         if self.exit is None:
             pid, status, used = os.wait4(self.pid, os.WNOHANG)
             if pid:
                 self.exit = os.waitstatus_to_exitcode(status)
-                # Bytes on macOS, kilobytes elsewhere. It has the peak of what was there before
-                # the program, too: that of whoever started it.
+                # Bytes on macOS, kilobytes elsewhere. The peak includes that of the starting
+                # program.
                 most_mb = used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
                 cpu_s = used.ru_utime + used.ru_stime
                 peak_rss_mb = self.used.peak_rss_mb or most_mb
@@ -75,19 +74,19 @@ class Process:
         return self.exit
 
     def measure(self) -> None:
-        """Note its share of memory and its peak so far, where the system reports it (Linux)."""
+        """Measure the memory share and its peak, on Linux."""
         with suppress(OSError, StopIteration):
             pss_mb = self._kilobytes("smaps_rollup", "Pss:") / 1e3
             peak_rss_mb = self._kilobytes("status", "VmHWM:") / 1e3
             self.used = replace(self.used, pss_mb=pss_mb, peak_rss_mb=peak_rss_mb)
 
     def _kilobytes(self, file: str, word: str) -> int:
-        """The number of kilobytes behind a word in a file of the system about the process."""
+        """Kilobytes behind a word in a /proc file of the process."""
         lines = Path(f"/proc/{self.pid}/{file}").read_text().splitlines()
         return int(next(line for line in lines if line.startswith(word)).split()[1])
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether it has ended within this time."""
+        """Whether it ends within this time."""
         deadline = time.monotonic() + timeout_s
         while self.poll() is None:
             if time.monotonic() >= deadline:
@@ -96,19 +95,17 @@ class Process:
         return True
 
     def signal(self, number: int) -> None:
-        """Send it a signal, if it has not ended."""
+        """Send a signal unless it has ended."""
         if self.poll() is None:
             os.kill(self.pid, number)
 
 
 class Starter:
-    """Starts the processes of one run; a context that ends the template.
+    """Start the processes of one run; a context that ends the template.
 
-    warm: the estimator and the rule whose kernels a template loads, from which all are forked: the
-    one that was started ahead, if there is one. With None, on a system that can not adopt orphans,
-    and after a template has died, each process is started from scratch. log: the file for the
-    template's errors. compiled: called while the template compiles kernels, with the number
-    compiled and the estimated total.
+    warm: estimator and rule whose kernels a template loads before forking. With None, without
+    orphan adoption, or after a template's death, processes start from scratch. log: file for the
+    template's errors. compiled: receives the number of compiled kernels and the estimated total.
     """
 
     def __init__(
@@ -137,7 +134,7 @@ class Starter:
         return self._asks is not None
 
     def start(self, words: Sequence[str], output: int) -> Process:
-        """Start `teamslam TEMPLATES`; output: the descriptor of its output and errors."""
+        """Start `teamslam TEMPLATES`; output: descriptor of output and errors."""
         if self._asks is not None:
             try:
                 return Process(self._forked(self._asks, words, output))
@@ -154,9 +151,7 @@ class Starter:
         return Process(started.pid, started)
 
     def _forked(self, asks: socket.socket, words: Sequence[str], output: int) -> int:
-        """The id of a process that the template has forked; raises OSError if it does not
-        answer.
-        """
+        """Id of a process forked by the template; raises OSError without an answer."""
         socket.send_fds(asks, [json.dumps(list(words)).encode()], [output])
         while answer := asks.recv(_LARGEST_ANSWER):
             match answer.decode().split():
@@ -190,9 +185,9 @@ class Starter:
 
 
 def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
-    """A child's environment: one BLAS thread, tied to this process, unbuffered output.
+    """Child environment: one BLAS thread, bound to this process, unbuffered output.
 
-    since_ns: the beginning of the run, for a child that is started again after the end of the run.
+    since_ns: beginning of the run, for a child restarted after its end.
     """
     tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
     return {**mine, **ONE_THREAD, **tied}

@@ -1,4 +1,4 @@
-"""What a running team's state says in words: its progress, its warnings, who is not joined yet."""
+"""Text on a running team's state: progress, warnings, unjoined robots."""
 
 import math
 import time
@@ -8,17 +8,15 @@ from sim.launch.watch import DRIVERS, Watch, team_time
 from team.wire import messages as m
 
 AHEAD_S = 10.0
-"""A world that is ahead of the map by less [s] is not worth a word."""
+"""Smallest reported lead of the world over the map [s]."""
 NAMED = 5
-"""Number of missing robots that are named."""
+"""Most missing robots that are named."""
 PATIENCE_S = 8.0
-"""Time [s] before absent nodes are warned of: processes start slowly on a busy machine."""
+"""Time [s] before absent nodes are reported: processes start slowly on a busy machine."""
 
 
 def _taken(watch: Watch) -> tuple[float, float]:
-    """How many of the world's measurements the robots have consumed, and their number; the world
-    may be far ahead of them.
-    """
+    """Measurements consumed by the robots, and the total; the world may be far ahead."""
     total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
     robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
     taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
@@ -26,22 +24,21 @@ def _taken(watch: Watch) -> tuple[float, float]:
 
 
 def done(watch: Watch) -> float:
-    """The share of the world's measurements that the robots have consumed."""
+    """Share of the measurements that the robots consumed."""
     taken, total = _taken(watch)
     return taken / total if total else 0.0
 
 
 def is_live(watch: Watch) -> bool:
-    """Whether drivers measure, and no world."""
+    """Whether drivers measure instead of a world."""
     return watch.world is not None and watch.world.node == DRIVERS
 
 
 def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
-    """The failures, and the nodes' warnings; absent nodes are warned of after PATIENCE_S only.
+    """Failures and node warnings; absent nodes after PATIENCE_S only.
 
-    While the team starts every node lacks every other: the world's warning stands for all. That a
-    robot is not joined yet is no warning: the lines on the map name it. silent_s: what a node
-    has said longer ago than this [s] is left out, since it may hold no more; 0: nothing is.
+    During the start every node misses every other, so the world's warning stands for all. silent_s:
+    age [s] beyond which a node's warning is dropped, as it may no longer hold; 0: never.
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
         return list(watch.failures)
@@ -63,17 +60,17 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
 
 
 def starting(watch: Watch) -> str:
-    """The number of robots that have started, and the names of the others."""
+    """Number of started robots and names of the others."""
     missing = watch.missing_robots
-    there = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
+    started = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
     if not missing:
-        return f"{there}; waiting for the first measurements"
+        return f"{started}; waiting for the first measurements"
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    return f"{there}; waiting for {', '.join(missing[:NAMED])}{more}"
+    return f"{started}; waiting for {', '.join(missing[:NAMED])}{more}"
 
 
 def share(watch: Watch) -> str:
-    """The progress in words: it is not known how much drivers will measure yet."""
+    """Progress as text; the total is unknown for drivers."""
     if not is_live(watch):
         return f"{done(watch):.0%}"
     taken, total = _taken(watch)
@@ -81,7 +78,7 @@ def share(watch: Watch) -> str:
 
 
 def times(watch: Watch, world: m.Status) -> str:
-    """The team time of the map; that of the world, too, which may be far ahead of it."""
+    """Team time of the map, and of a world far ahead."""
     ahead_s = _behind_s(watch, world)
     if is_live(watch) or ahead_s < AHEAD_S:
         return team_time(world)
@@ -90,21 +87,19 @@ def times(watch: Watch, world: m.Status) -> str:
 
 
 def _behind_s(watch: Watch, world: m.Status) -> float:
-    """How far the map is behind the world [s]; all of the run where there is none yet."""
+    """Delay of the map behind the world [s]; the whole run without a map."""
     if watch.fused is None or not watch.fused.stamp_ns:
         return world.figures.get("team_time_s", 0.0)
     return max(0.0, 1e-9 * (world.stamp_ns - watch.fused.stamp_ns))
 
 
 def apart(watch: Watch) -> list[tuple[str, str]]:
-    """The robots that are not in the team's map yet, each with the test that failed."""
+    """Unjoined robots, each with its failed test."""
     return [] if watch.fused is None else list(not_joined(watch.fused.reasons))
 
 
 def consistency(watch: Watch) -> str:
-    """The consistency monitor's figures; against the truth NEES and coverage of the map's
-    landmarks.
-    """
+    """Consistency monitor's figures; with truth, NEES and coverage of the landmarks."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
     parts = [

@@ -1,8 +1,7 @@
-"""Supervise the processes of a team: restarts those that die and gives up those without progress.
+"""Supervise a team's processes: restart dead ones, give up those without progress.
 
-The map does not need recorder and viewer: where they are given up the team goes on, and the run
-fails in the end. A robot that is given up is named as lost in the final map. Without router, world
-or centre there is no map: then the run ends. Peers need no centre.
+Without recorder or viewer the team continues, and the run fails at its end. A robot given up is
+named as lost in the final map. Without router, world or centre the run ends; peers need no centre.
 """
 
 import math
@@ -19,33 +18,33 @@ from team.wire import messages as m
 from team.wire.bus import Bus, BusError, Outgoing
 
 SILENT_S = 10.0
-"""A running process without a message for this long [s] is named."""
+"""Silence [s] after which a running process is reported."""
 FEW = 3
-"""Of more silent processes than this it is only said how many there are."""
+"""Above this number, silent processes are only counted."""
 COMPUTING = "is computing"
 MANY = "many"
 REPEAT_S = 60.0
-"""The silence of one process, or of many, is told again after this time [s] at the earliest."""
+"""Least time [s] between reports of the same silence."""
 STARTING_S = 60.0
-"""A starting process without any message for this long [s] is named: a busy machine is slow."""
+"""Silence [s] after which a starting process is reported: a busy machine is slow."""
 MEASURE_S = 2.0
-"""Time [s] between two measurements of the processes' memory; the last is at the final map."""
+"""Time [s] between memory measurements; the last is at the final map."""
 END_DELAY_S = 1.0
-"""Time [s] after a process's end within which the final map may still arrive here."""
+"""Time [s] after a process's end for the final map to arrive."""
 LEAVING_S = 60.0
-"""A process that still runs after the final map is ended, and named, when for this long [s] no
-other one has ended and the recorder has received nothing."""
+"""After the final map, a process is ended and reported if for this long [s] no other has ended and
+the recorder has received nothing.
+"""
 _NODES = {"router": "router", "world": "world", "central": "central"}
 _WITHOUT_IT_NO_MAP = frozenset(_NODES)
 
 
 def node_of(name: str) -> str:
-    """The node that a process is: `robot-r1` is `robot/r1`."""
+    """Node of a process: `robot-r1` is `robot/r1`."""
     return f"robot/{name.removeprefix('robot-')}" if name.startswith("robot-") else name
 
 
 def _is_needed(name: str, watch: Watch) -> bool:
-    """Whether there is no map without this process."""
     return name in _WITHOUT_IT_NO_MAP and not (name == "central" and watch.peers)
 
 
@@ -56,10 +55,9 @@ def supervise(
     show: Callable[[Watch], None],
     end_silent_s: float | None,
 ) -> None:
-    """Watch the processes until all but the router, the first, have ended or are given up.
+    """Watch the processes until all but the router (the first) have ended or are given up.
 
-    end_silent_s: a process without a message for this long [s] is ended, so that it is started
-    again.
+    end_silent_s: silence [s] after which a process is ended, to be restarted.
     """
     silence, memory = Silence(end_silent_s), Memory()
     leaving: Leaving | None = None
@@ -82,9 +80,9 @@ def supervise(
 
 
 def _receive(bus: Bus, watch: Watch) -> None:
-    """Take what has arrived; where the link to the router is refused, supervise without it.
+    """Receive messages; if the router refuses the link, supervise without it.
 
-    The processes have links of their own, and end by themselves.
+    The processes have their own links and end by themselves.
     """
     try:
         watch.take(bus)
@@ -104,7 +102,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     if status is None:
         return
     if status > 0 and not is_final and not service.has_ended_for(END_DELAY_S):
-        return  # it may know of a provisional end that has not arrived here yet
+        return  # a provisional end may not have arrived yet
     failed_at_the_end = is_final and status > 0
     if (status == 0 and service.name != "router") or failed_at_the_end:
         service.over = True
@@ -118,25 +116,25 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
         watch.restarts[service.name] = service.restarts + 1
         watch.note(f"{ended.name} (pid {ended.pid}) {ended.how}: it is started again")
         return
-    deaths = f"it died {service.fruitless} times without getting any further, and is given up"
+    deaths = f"it died {service.fruitless} times without progress, and is given up"
     watch.given_up.append(service.name)
     watch.failures.append(f"{failure(ended)}; {deaths}")
     node = node_of(service.name)
     order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
     if not _is_needed(service.name, watch):
-        with suppress(BusError):  # named by `_receive`
+        with suppress(BusError):  # reported by `_receive`
             publish_order(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
 
 
 class Leaving:
-    """The end of a run: processes leave, and the recorder receives what they still have."""
+    """End of a run: processes leave, and the recorder receives their last messages."""
 
     def __init__(self) -> None:
         self._reached = (-1, -1.0)
         self._since_s = 0.0
 
     def stands_still(self, services: Sequence[Supervised], watch: Watch) -> bool:
-        """Whether nothing has moved for LEAVING_S."""
+        """Whether nothing has changed for LEAVING_S."""
         now_s = time.monotonic()
         reached = sum(not service.is_watched for service in services), watch.progress("recorder")
         if reached != self._reached:
@@ -151,20 +149,20 @@ def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
             name = f"{service.name} (pid {service.child.pid})"
             stopped = ", since it was stopped" if service.child.is_stopped else ""
             watch.failures.append(
-                f"{name} had not left after the final map, and nothing moved for {LEAVING_S:g} s"
+                f"{name} had not left after the final map, with no activity for {LEAVING_S:g} s"
                 f"{stopped}: it was ended"
             )
 
 
 class Memory:
-    """Measures the processes' share of memory now and then, the last time at the final map."""
+    """Memory shares of the processes, measured periodically and at the final map."""
 
     def __init__(self) -> None:
         self._due = 0.0
         self._over = False
 
     def look(self, services: Sequence[Supervised], *, is_final: bool) -> None:
-        """Measure, if it is time."""
+        """Measure if due."""
         now = time.monotonic()
         if (now >= self._due or is_final) and not self._over:
             self._due, self._over = now + MEASURE_S, is_final
@@ -173,7 +171,7 @@ class Memory:
 
 
 class Silence:
-    """Names processes that are connected and send nothing."""
+    """Report connected processes that send nothing."""
 
     def __init__(self, end_s: float | None) -> None:
         self._end_s = end_s
@@ -181,9 +179,7 @@ class Silence:
         self._last_note: dict[str, float] = {}
 
     def look(self, services: Sequence[Supervised], watch: Watch) -> None:
-        """Name the processes that have become silent, many in one line; end one where end_silent_s
-        says so.
-        """
+        """Report newly silent processes; end one after end_silent_s."""
         now = time.monotonic()
         new: list[tuple[Supervised, float]] = []
         for service in services:
@@ -192,7 +188,7 @@ class Silence:
                 self._silent.discard(child.pid)
                 continue
             last_message = watch.last_message.get(node_of(service.name), 0.0)
-            if service.name == "router":  # it says nothing itself: all others are silent with it
+            if service.name == "router":  # has no messages: all others are silent with it
                 last_message = max(watch.last_message.values(), default=0.0)
             silent_s = now - max(last_message, child.started)
             if silent_s < SILENT_S:
@@ -209,7 +205,7 @@ class Silence:
         self._tell(new, watch, now)
 
     def _tell(self, new: Sequence[tuple[Supervised, float]], watch: Watch, now: float) -> None:
-        """Name each of a few; of many say how many there are. Each is said once in REPEAT_S."""
+        """Name a few processes or count many, each once in REPEAT_S."""
         many = len(self._silent) > FEW
         for service, silent_s in new:
             child = service.child
@@ -223,7 +219,7 @@ class Silence:
             self._last_note[MANY] = now
             named = ", ".join(service.name for service, _ in new[:FEW])
             watch.note(
-                f"{len(self._silent)} processes, {named} among them, have said nothing for "
+                f"{len(self._silent)} processes, {named} among them, have sent no message for "
                 f"{SILENT_S:.0f} s: this computer may be too busy for the team, which goes on "
                 "slower"
             )
@@ -231,29 +227,29 @@ class Silence:
     @staticmethod
     def _note(watch: Watch, service: Supervised, state: str, silent_s: float) -> None:
         pid = service.child.pid
-        # A healthy process that is slow is not to be ended: only one that stands still for long.
+        # End only a process that stands still, not a slow one.
         stands_still = service.child.is_stopped or silent_s >= STARTING_S
         restart = f". To have it started again: kill -9 {pid}"
         remedy = restart if stands_still and state != COMPUTING else ""
         watch.note(
-            f"{service.name} (pid {pid}) {state} and has said nothing for {silent_s:.0f} s: "
+            f"{service.name} (pid {pid}) {state} and has sent no message for {silent_s:.0f} s: "
             f"the team may wait for it{remedy}"
         )
 
 
 def lacking_in(watch: Watch) -> str:
-    """The robots that the final map lacks, in words; empty: none."""
+    """Robots missing in the final map, as text."""
     return "" if watch.fused is None or not watch.fused.final else lacking(watch.fused)
 
 
 def names_only(ended: Ended, lacks: str) -> bool:
-    """Whether a process failed only because the final map lacks robots, which `launch` names."""
+    """Whether a process failed only because of missing robots, which `launch` reports."""
     last = ended.last_lines[-1] if ended.last_lines else ""
     return bool(lacks) and ended.exit == 1 and last.endswith(f"error: {lacks}")
 
 
 def failure(ended: Ended) -> str:
-    """How a process failed, and its last lines."""
+    """How a process failed, with its last lines."""
     parts = [f"{ended.name} (pid {ended.pid}) {ended.how}"]
     if ended.last_lines:
         parts.append("its last lines:\n" + "\n".join(f"    {line}" for line in ended.last_lines))

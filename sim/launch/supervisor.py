@@ -1,4 +1,4 @@
-"""Child processes: starts, restarts and ends them, and names those that fail."""
+"""Child processes: start, restart, end and failure report."""
 
 import math
 import signal
@@ -11,22 +11,21 @@ from sim.launch.processes import Starter, Used
 from team.wire.text import one_line
 
 LAST_LINES = 12
-"""Lines of a failed process's output that are shown."""
 GRACE_S = 5.0
-"""Time [s] for a process to stop when it is asked to."""
+"""Time [s] for a requested stop."""
 FRUITLESS = 5
-"""A process is given up after this many deaths in a row without progress."""
+"""Consecutive deaths without progress before a process is given up."""
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
-"""Longest wait [s] before a process that has died is started again."""
+"""Longest wait [s] before a restart."""
 _PROC = Path("/proc")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a process ended: its exit status (negative: the signal that ended it), its last lines.
+    """End of a process: exit status (negative: signal) and last lines.
 
-    asked: it was asked to stop, and did. used: its resources.
+    asked: it stopped on request. used: its resources.
     """
 
     name: str
@@ -38,14 +37,14 @@ class Ended:
 
     @property
     def how(self) -> str:
-        """The end in words."""
+        """The end as text."""
         if self.exit < 0:
             return f"was ended by {signal.Signals(-self.exit).name}"
         return f"ended with exit status {self.exit}"
 
 
 class Child:
-    """One `teamslam …` process, its output in a file of its own."""
+    """A `teamslam …` process with its own output file."""
 
     def __init__(
         self, name: str, arguments: Sequence[str], folder: Path, starter: Starter, life: int = 0
@@ -57,26 +56,26 @@ class Child:
         with self.output.open("ab" if life else "wb") as file:
             self._before = self.output.stat().st_size
             self._process = starter.start(arguments, file.fileno())
-        # A short run may be over before the next measurement.
+        # A short run may end before the next measurement.
         self.measure()
 
     @property
     def pid(self) -> int:
-        """The process id."""
+        """Process id."""
         return self._process.pid
 
     def measure(self) -> None:
-        """Note its share of memory."""
+        """Measure its share of memory."""
         self._process.measure()
 
     @property
     def exit(self) -> int | None:
-        """The exit status; None while it runs."""
+        """Exit status; None while running."""
         return self._process.poll()
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the process exists but does not run (SIGSTOP), where the system reports it."""
+        """Whether the process is stopped (SIGSTOP), as far as reported."""
         try:
             state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
         except (OSError, IndexError):
@@ -85,7 +84,7 @@ class Child:
 
     @property
     def is_computing(self) -> bool:
-        """Whether the process uses a processor or waits for one, where the system reports it."""
+        """Whether the process is running or runnable, as far as reported."""
         try:
             state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
         except (OSError, IndexError):
@@ -93,11 +92,11 @@ class Child:
         return state == "R"
 
     def kill(self) -> None:
-        """End it, stopped or not, without asking before."""
+        """End it at once, even if stopped."""
         self._process.signal(signal.SIGKILL)
 
     def stop(self) -> None:
-        """Ask it to stop."""
+        """Request its end."""
         if self.exit is None:
             self._asked = True
             self._process.signal(signal.SIGTERM)
@@ -110,26 +109,24 @@ class Child:
         return self.ended()
 
     def ended(self) -> Ended:
-        """How it ended; to be called once it has."""
+        """How it ended; call after its end."""
         status = self.exit
         assert status is not None
         asked = self._asked and status != -signal.SIGKILL
         return Ended(self.name, self.pid, status, self.last_lines(), asked, self._process.used)
 
     def last_lines(self) -> tuple[str, ...]:
-        """The last lines of its output."""
+        """Last lines of its output."""
         text = self.output.read_bytes()[self._before :].decode("utf-8", "replace")
         return tuple(one_line(line) for line in text.splitlines()[-LAST_LINES:])
 
 
 @dataclass
 class Supervised:
-    """A process that is started again by the same command when it dies, after longer and longer
-    waits.
+    """Process restarted by the same command on death, after growing waits.
 
-    A process that dies FRUITLESS times in a row without progress is given up. reached: its progress
-    at its last death, in its own unit. ended_s: when its end was noticed, by a monotonic clock.
-    used: the resources of its earlier lives.
+    Given up after FRUITLESS deaths in a row without progress. reached: progress at its last death.
+    ended_s: detection of its end (monotonic). used: resources of earlier lives.
     """
 
     name: str
@@ -151,16 +148,16 @@ class Supervised:
 
     @property
     def is_watched(self) -> bool:
-        """Whether it runs, or will run again."""
+        """Whether it runs or will run again."""
         return not (self.over or self.given_up)
 
     def has_ended_for(self, time_s: float) -> bool:
-        """Whether its end was noticed at least this long ago."""
+        """Whether its end was detected at least this long ago."""
         self.ended_s = self.ended_s or time.monotonic()
         return time.monotonic() - self.ended_s >= time_s
 
     def died(self, reached: float) -> None:
-        """Note a death: the process will be started again, or is given up."""
+        """Schedule a restart after a death, or give the process up."""
         self.fruitless = 1 if reached > self.reached else self.fruitless + 1
         self.reached = max(self.reached, reached)
         if self.fruitless >= FRUITLESS:
@@ -170,7 +167,7 @@ class Supervised:
         self.due = time.monotonic() + wait_s
 
     def start_again(self) -> None:
-        """Start it if it is time."""
+        """Restart it if due."""
         if self.due is not None and time.monotonic() >= self.due:
             self.due = self.ended_s = None
             self.restarts += 1
@@ -179,9 +176,7 @@ class Supervised:
 
 
 def end_all(children: Sequence[Child], *, last: str = "recorder") -> list[Ended]:
-    """Ask all to stop and end those that do not; the child named `last` is asked after the
-    others.
-    """
+    """Request all to stop and end the rest; `last` is asked after the others."""
     ended = {}
     for group in (
         [c for c in children if c.name not in (last, "router")],

@@ -1,9 +1,8 @@
-"""The warm template: a process of one thread that has imported and loaded what a team needs.
+"""Warm template: a single-threaded process with a team's imports and kernels loaded.
 
-`launch` starts it first. Each process of the team is forked from it, which takes milliseconds where
-imports and kernels take two seconds, and shares its memory. A forked process has the launch as its
-parent, its own session, no input and its output in its own file, and continues as if it had been
-started by its command line: docs/decisions/12-processes-forked-from-a-template.md.
+Forking from it takes milliseconds instead of two seconds and shares memory. A forked process has
+the launch as parent, its own session and output file, no input, and continues as if started by its
+command line: docs/decisions/12-processes-forked-from-a-template.md.
 """
 
 import gc
@@ -44,16 +43,15 @@ MODULES = (
     "team.recording.shell",
     "team.robot.main",
 )
-"""What the processes of a team import, in the order in which it is loaded: the router's first.
+"""Modules of a team's processes in loading order, the router's first.
 
-Between two of them the template looks whether it is asked for the router; all other processes wait
-until everything is there that they share.
+Between two of them the template checks for the router's request; other processes wait for all.
 """
 
 
 @dataclass(frozen=True)
 class _Request:
-    """The command line to start, and the file for its output."""
+    """Command line to start, and its output file."""
 
     words: list[str]
     output: int
@@ -63,8 +61,7 @@ def become_a_process(prepare: Callable[[], object]) -> None:
     """Become the template that sys.argv describes; returns in each forked process, with its
     sys.argv.
 
-    The template itself never returns: it ends when its launch does. prepare: initialisation that
-    every process would do first.
+    The template ends with its launch. prepare: common initialisation.
     """
     end_with_parent(signal.SIGKILL)
     gc.disable()  # imported modules stay
@@ -84,7 +81,7 @@ def become_a_process(prepare: Callable[[], object]) -> None:
                 return
     pair = pair or _noted(_received(asked), launch)
     _load_kernels(pair[0], pair[1], asked)
-    # The collector of a forked process leaves the objects of now in place.
+    # Exclude present objects from collection in forked processes.
     gc.freeze()
     while True:
         if _serve(_received(asked), asked, launch):
@@ -92,7 +89,7 @@ def become_a_process(prepare: Callable[[], object]) -> None:
 
 
 def _noted(request: _Request, launch: int) -> list[str]:
-    """The estimator and the rule of the first request, which gives the template its file, too."""
+    """Estimator and rule of the first request, which also names the template's file."""
     kind, estimator, rule, since_ns = request.words
     assert kind == KERNELS
     os.environ |= {PARENT: str(launch), SINCE: since_ns}
@@ -103,18 +100,16 @@ def _noted(request: _Request, launch: int) -> list[str]:
 
 
 def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
-    """Load all kernels; if they were never compiled, three processes compile them and report the
-    progress.
-    """
+    """Load all kernels; uncompiled ones are compiled by three processes with progress reports."""
     from sim.launch import warm_up
     from team.estimation.compiling import compilations
 
     is_warm = warm_up.is_warm(estimator, rule)
     if not is_warm:
-        gc.enable()  # compiling makes much that does not stay
+        gc.enable()  # compiling creates much garbage
     with compilations(lambda done, of: asked.sendall(f"compiled {of}".encode()), warm_up.FORMS):
         if (estimator, rule) == ("hybrid", "join") and not is_warm:
-            # Each takes kernels that the others do not need before their end.
+            # Each compiles kernels that the others need late.
             others = [
                 _forked(warm_up.fold_made_up_submaps),
                 _forked(warm_up.follow_made_up_submaps),
@@ -127,7 +122,7 @@ def _load_kernels(estimator: str, rule: str, asked: socket.socket) -> None:
 
 
 def _forked(run: Callable[[], object]) -> int:
-    """The process id of a child that runs this and ends; what it leaves undone, others do."""
+    """Process id of a child that runs this and ends; failures are left to others."""
     template = os.getpid()
     if child := os.fork():
         return child
@@ -139,9 +134,9 @@ def _forked(run: Callable[[], object]) -> int:
 
 
 def end_by(run: Callable[[], None]) -> NoReturn:
-    """Call `run`, and end this forked process as Python would, but without freeing its modules.
+    """Call `run` and end this forked process like Python, but without freeing its modules.
 
-    Freeing them would copy every page that it shares with the others: 0.2 s and 100 MB each.
+    Freeing would copy every shared page: 0.2 s and 100 MB each.
     """
     status: object = None
     try:
@@ -162,7 +157,7 @@ def _is_asked(asked: socket.socket, patience_s: float) -> bool:
 
 
 def _serve(request: _Request, asked: socket.socket, launch: int) -> bool:
-    """Fork the process that is asked for; returns True in that process."""
+    """Fork the requested process; returns True in it."""
     if threads() != 1:
         sys.exit(f"the template has {threads()} threads: a fork would not be safe")
     read, write = os.pipe()
@@ -175,7 +170,7 @@ def _serve(request: _Request, asked: socket.socket, launch: int) -> bool:
         return True
     os.close(write)
     os.close(request.output)
-    os.waitpid(between, 0)  # from now on the launch is the parent
+    os.waitpid(between, 0)  # now the launch becomes the parent
     with open(read, "rb") as pipe:
         asked.sendall(pipe.read())
     return False
@@ -189,7 +184,7 @@ def _received(asked: socket.socket) -> _Request:
 
 
 def _fork_again(write: int, launch: int) -> None:
-    """Return in a child of this process, which ends: the child then is the launch's."""
+    """Return in a grandchild, whose parent becomes the launch."""
     between = os.getpid()
     child = os.fork()
     if child:
@@ -198,12 +193,12 @@ def _fork_again(write: int, launch: int) -> None:
     os.close(write)
     while os.getppid() == between:
         time.sleep(0.001)
-    if os.getppid() != launch:  # which has ended meanwhile
+    if os.getppid() != launch:  # ended meanwhile
         os._exit(1)
 
 
 def _begin(request: _Request) -> None:
-    """Become the requested process: its session, its streams, its command line."""
+    """Become the requested process: session, streams, command line."""
     gc.enable()
     os.setsid()
     nothing = os.open(os.devnull, os.O_RDONLY)

@@ -1,7 +1,7 @@
 """Compare a running team's poses and map with the truth as they arrive.
 
-It computes `central.desk.evaluation`'s figures of what has arrived so far; without truth it stays
-empty. Poses and maps in a frame that no known initial pose fixes are not compared.
+The figures are those of `central.desk.evaluation` so far; empty without truth. Frames that no known
+initial pose fixes are not compared.
 """
 
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from team.wire import messages as m
 from team.wire.bus import Sample
 
 EVERY_NS = 1_000_000_000
-"""A robot's pose is compared at most once per this much team time; the others are not decoded."""
+"""Least team time between a robot's compared poses; others are not decoded."""
 
 
 @dataclass
@@ -29,12 +29,12 @@ class _Robot:
     team_ns: int = -1
 
     def begin_again(self, *, given_map: bool) -> None:
-        """Forget poses and errors: those that follow are of another kind, or in another frame."""
+        """Discard poses and errors before a change of kind or frame."""
         self.given_map, self.tally = given_map, NeesTally()
         self.errors.forget_poses()
 
     def judge(self) -> None:
-        """Compare every pose up to the newest truth; forgets truth that no later pose needs."""
+        """Compare every pose up to the newest truth; discards used truth."""
         if (found := self.errors.known()) is not None:
             self.tally.take(found.nees, 3)
             self.errors.forget(int(found.stamps_ns[-1]))
@@ -42,10 +42,9 @@ class _Robot:
 
 @dataclass
 class LiveErrors:
-    """The errors of a team so far.
+    """Errors of a team so far.
 
-    landmarks: of the newest fused map, each in its own 2 × 2 covariance, in the frame as the map
-    lies.
+    landmarks: of the newest fused map, in 2 × 2 covariances, unaligned.
     """
 
     landmarks: NeesTally = field(default_factory=NeesTally)
@@ -62,18 +61,16 @@ class LiveErrors:
     )
 
     def of(self, robot: str) -> NeesTally:
-        """The errors of a robot's online poses: given the team's map, where there are such
-        poses.
-        """
+        """Errors of a robot's online poses, given the team's map if there are such."""
         return self._robots[robot].tally if robot in self._robots else NeesTally()
 
     def wants(self, channel: ch.Channel, robot: str, sample: Sample) -> bool:
-        """Whether the sample is worth decoding."""
+        """Whether the sample needs decoding."""
         if channel not in (ch.OWN_POSE, ch.TEAM_POSE):
             return True
         known = self._robot(robot)
         if channel is ch.TEAM_POSE:
-            is_again = sample.stamp_ns <= known.team_ns  # it may withdraw the pose of this time
+            is_again = sample.stamp_ns <= known.team_ns  # may withdraw the pose of this time
             known.team_ns = sample.stamp_ns
             if is_again:
                 return True
@@ -82,7 +79,7 @@ class LiveErrors:
         return known.errors.is_due(sample.stamp_ns)
 
     def take(self, channel: ch.Channel, message: m.Message) -> None:
-        """Take one message of any channel; those of other channels are ignored."""
+        """Process a message of any channel."""
         match message:
             case m.InitialPose():
                 self._frames.take(message)
@@ -112,7 +109,6 @@ class LiveErrors:
         robot.judge()
 
     def _take_map(self, fused: m.FusedMap) -> None:
-        """Take a map in place of the one before."""
         self.landmarks = NeesTally()
         if self._frames.has(fused.frame) and (fit := self._truth.fit(fused)) is not None:
             self.landmarks.take(fit.nees, 2)

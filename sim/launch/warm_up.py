@@ -1,4 +1,4 @@
-"""Compile the kernels once, before many processes need them: later processes read the cache."""
+"""Compile the kernels once into the cache, before many processes need them."""
 
 import hashlib
 import sys
@@ -30,19 +30,16 @@ from team.wire.channels import SUBMAP, channel_of
 
 _VERSIONS = (sys.version, numba.__version__, binding.get_host_cpu_name())
 _STEPS = 48
-"""Number of one-second steps of the small team's run."""
 FORMS = 210
-"""Number of forms of kernels that a small team compiles with Hybrid-SLAM and joined submaps."""
+"""Kernel forms that a small team compiles with Hybrid-SLAM and joined submaps."""
 PLACES = np.array([[10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0], [10.0, 20.0]])
-"""Positions [m] of the made-up landmarks."""
+"""Positions [m] of artificial landmarks."""
 
 
 def warm_up(estimator: str, fusion: str) -> None:
-    """Run a small team of two in memory with estimator and rule, unless this program has done so
-    before.
+    """Run a small team in memory with estimator and rule, unless this program has done so.
 
-    The robots have different motion models, and the centre's loss is robust, so that kernels of
-    both kinds are compiled.
+    Different motion models and a robust loss at the centre compile kernels of both kinds.
     """
     if not is_warm(estimator, fusion):
         run_small_team(estimator, fusion)
@@ -50,30 +47,28 @@ def warm_up(estimator: str, fusion: str) -> None:
 
 
 def is_warm(estimator: str, fusion: str) -> bool:
-    """Whether the kernels of the two have been compiled by this program."""
+    """Whether this program has compiled the kernels of the two."""
     stamp = _stamp(estimator, fusion)
     return stamp is None or stamp.exists()
 
 
 def note_warm(estimator: str, fusion: str) -> None:
-    """Note beside the kernels that they are compiled."""
+    """Mark the kernels as compiled."""
     stamp = _stamp(estimator, fusion)
-    with suppress(OSError):  # then the next launch does it again
+    with suppress(OSError):  # then the next launch repeats it
         if stamp is not None:
             stamp.touch()
 
 
 def _stamp(estimator: str, fusion: str) -> Path | None:
-    cached = getattr(wrapped, "stats", None)  # with NUMBA_DISABLE_JIT nothing is compiled
+    cached = getattr(wrapped, "stats", None)  # nothing is compiled with NUMBA_DISABLE_JIT
     return (
         None if cached is None else Path(cached.cache_path) / f"ready-{_program(estimator, fusion)}"
     )
 
 
 def _program(estimator: str, fusion: str) -> str:
-    """Digest of what the kernels of the two depend on: our sources, the compiler and the
-    processor.
-    """
+    """Digest of our sources, compiler and processor, on which the kernels depend."""
     digest = hashlib.blake2b(digest_size=8)
     for text in (*_VERSIONS, estimator, fusion):
         digest.update(f"{text}\n".encode())
@@ -85,25 +80,24 @@ def _program(estimator: str, fusion: str) -> str:
 
 
 def run_small_team(estimator: str, fusion: str) -> None:
-    """Run a small team of two in memory: every kernel that the pair uses is compiled or loaded.
+    """Run a small team of two in memory to compile or load every kernel of the pair.
 
-    The robots have different motion models, and the centre's loss is robust, so that kernels of
-    both kinds are compiled.
+    Different motion models and a robust loss at the centre compile kernels of both kinds.
     """
     for _ in _small_team(estimator, fusion):
         pass
-    logarithm(inverse(np.zeros(3)))  # the centre asks this of robots without an initial pose
+    logarithm(inverse(np.zeros(3)))  # used by the centre for robots without initial pose
 
 
 def run_to_the_first_submap(estimator: str, fusion: str) -> None:
-    """The same until the centre has its first submap: this needs most kernels of the robots."""
+    """Run until the centre's first submap, which needs most robot kernels."""
     for sample in _small_team(estimator, fusion):
         if channel_of(sample.key) == (SUBMAP, "r1"):
             return
 
 
 def fold_made_up_submaps() -> Fold:
-    """The fold of six made-up submaps of two robots: this needs the kernels of the centre alone."""
+    """Fold six artificial submaps of two robots, which needs the centre's kernels."""
     fold = EMPTY_FOLD
     for robot in ("r1", "r2"):
         fold = started(fold, InitialPoseFactor(robot, 1, np.zeros(3)))
@@ -120,8 +114,8 @@ def fold_made_up_submaps() -> Fold:
 
 
 def follow_made_up_submaps() -> Followed:
-    """A robot's map after two made-up submaps, and its pose there: this needs the kernels by which
-    robots find themselves in the team's map.
+    """Robot map and pose after two artificial submaps, which needs the kernels of localisation in
+    the team's map.
     """
     first, *later = map(_made_up, range(3))
     found = followed(WholeMap(first.ids, first.mean, first.covariance), later)
@@ -130,7 +124,7 @@ def follow_made_up_submaps() -> Followed:
 
 
 def _made_up(k: int) -> LocalMap:
-    """The submap of a robot that has moved k metres since it began, and moves another one."""
+    """Submap from metre k to metre k + 1 of a robot's path."""
     mean = np.concatenate([[1.0, 0.0, 0.0], (PLACES - [k, 0.0]).ravel()])
     return LocalMap(np.arange(5, dtype=np.uint32), mean, np.diag(np.full(len(mean), 0.01)))
 

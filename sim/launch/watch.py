@@ -1,4 +1,4 @@
-"""The state of a running team: its nodes' last statuses, its map, and events of its processes."""
+"""State of a running team: last node statuses, map, process events."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 TURN_S = 0.1
 DRIVERS = "drivers"
-"""The drivers of a live team, as one node."""
+"""Node name of all drivers of a live team."""
 UNIX_S = 1e9
 """Team times from here on are Unix times: 1e9 s is in 2001."""
 SILENT_S = 10.0
-"""A driver without a status for longer than this [s] is named: it sends one each second."""
+"""Driver silence [s] that is reported; a status is due each second."""
 _PROGRESS = ("measurements", "submaps", "messages")
-"""Figures of a status that grow with the node's progress."""
+"""Status figures that grow with progress."""
 
 
 def _no_errors() -> "LiveErrors":
-    """An empty `LiveErrors`, imported here: the import takes longer than starting the processes."""
+    """Empty `LiveErrors`, imported here because the import outlasts the start of the processes."""
     from sim.launch.truth import LiveErrors
 
     return LiveErrors()
@@ -38,15 +38,13 @@ def _no_errors() -> "LiveErrors":
 
 @dataclass
 class Watch:
-    """The state of the team while it runs: the last status of each node, and the last map.
+    """State of a running team: last status of each node, last map.
 
-    robots: their names. drivers: of a live team, whose drivers are waited for. errors: of poses
-    and map, where there is truth. place: the options by which other commands reach the team. call:
-    the same as a driver's program has them. notes: events of processes, in words. restarts: how
-    often each process was started again. given_up: the nodes that were given up. last_message: the
-    time of each node's last status. peers: the robots that are to have a final map of their own;
-    concluded: those that have it; concluded_s: since when. centre: presents peers' messages as a
-    centre's. signer: signs orders, where there are keys.
+    drivers: awaited drivers of a live team. place: options by which other commands reach the team;
+    call: the same for a driver's program. notes: process events. restarts: by process.
+    last_message: time of each node's last status. peers: robots that need a final map; concluded:
+    those that have it, since concluded_s. centre: presents peers' messages as a centre's. signer:
+    signs orders.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -70,26 +68,26 @@ class Watch:
 
     @property
     def world(self) -> m.Status | None:
-        """The world's status; of a live team the sum of all its drivers' statuses."""
+        """The world's status; for a live team, the sum of its drivers'."""
         if self.drivers is None:
             return self.statuses.get("world")
-        there = [s for node, s in self.statuses.items() if node.startswith("source/")]
+        statuses = [s for node, s in self.statuses.items() if node.startswith("source/")]
         figures = {
-            "of": sum(status.figures.get("measurements", 0.0) for status in there),
-            "team_time_s": max((s.figures.get("team_time_s", 0.0) for s in there), default=0.0),
+            "of": sum(status.figures.get("measurements", 0.0) for status in statuses),
+            "team_time_s": max((s.figures.get("team_time_s", 0.0) for s in statuses), default=0.0),
         }
-        states = {status.state for status in there}
+        states = {status.state for status in statuses}
         return m.Status(
-            stamp_ns=max((status.stamp_ns for status in there), default=0),
+            stamp_ns=max((status.stamp_ns for status in statuses), default=0),
             node=DRIVERS,
             state=states.pop() if len(states) == 1 else "measuring" if states else "waiting",
             figures=figures,
-            warnings=tuple(self._drivers_lacking(there)),
+            warnings=tuple(self._drivers_lacking(statuses)),
         )
 
-    def _drivers_lacking(self, there: Sequence[m.Status]) -> Iterator[str]:
-        """Which drivers of a live team are waited for, and what to do; of `there` the statuses."""
-        missing = in_order(set(self.drivers or ()) - {_robot(status) for status in there})
+    def _drivers_lacking(self, statuses: Sequence[m.Status]) -> Iterator[str]:
+        """Warnings about missing or silent drivers, given the statuses received."""
+        missing = in_order(set(self.drivers or ()) - {_robot(status) for status in statuses})
         if missing:
             first = missing[0]
             yield (
@@ -99,7 +97,7 @@ class Watch:
                 f"{first} {self.place} goes on without it"
             )
         now = time.monotonic()
-        for status in sorted(there, key=_robot):
+        for status in sorted(statuses, key=_robot):
             robot = _robot(status)
             silent = now - self.last_message.get(status.node, now) > SILENT_S
             if status.state == "left" or (silent and status.state != "ended"):
@@ -108,16 +106,16 @@ class Watch:
                     f"teamslam end --without {robot} {self.place}"
                 )
             elif status.state == "waiting":
-                yield f"the driver of {robot} is there and has handed over no odometry yet"
+                yield f"the driver of {robot} is running and has sent no odometry yet"
 
     @property
     def missing_robots(self) -> list[str]:
-        """The robots that have not sent a status yet."""
+        """Robots without a status."""
         return [each for each in self.robots if f"robot/{each}" not in self.statuses]
 
     @property
     def end_reason(self) -> str:
-        """The reason why a run that has ended did so, in words."""
+        """Why the run ended, as text."""
         if self.is_over:
             return "the final map is there"
         if self.given_up:
@@ -126,8 +124,8 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the final map is there: the centre's; without a centre that of every peer, but
-        for those that are given up or withdrawn, whether they agree or not.
+        """Whether the final map exists: the centre's, or without a centre every peer's except those
+        given up or withdrawn, whether or not they agree.
         """
         if not self.peers:
             return self.fused is not None and self.fused.final
@@ -137,7 +135,7 @@ class Watch:
         return bool(needed) and self.concluded.keys() >= set(needed)
 
     def take(self, bus: Bus) -> None:
-        """Take the messages that have arrived since the last call."""
+        """Process newly arrived messages."""
         for sample in bus.receive(TURN_S):
             self._take(sample)
             counterpart = self.centre.of(sample) if self.peers else None
@@ -166,19 +164,19 @@ class Watch:
             self.errors.take(channel, message)
 
     def _take_fault(self, fault: m.Fault) -> None:
-        """Note the first fault of a node as a failure; its status counts the others."""
+        """Record a node's first fault as a failure; its status counts the others."""
         named = f"{fault.node} set aside "
         if not any(failure.startswith(named) for failure in self.failures):
             what = f"{fault.origin}: {fault.error} at {fault.place}: {fault.text}"
             self.failures.append(f"{named}{what}")
 
     def note(self, text: str) -> None:
-        """Note an event of a process."""
+        """Record a process event."""
         elapsed = time.monotonic() - self.began
         self.notes.append(f"at {elapsed:.1f} s {text}")
 
     def progress(self, node: str) -> float:
-        """The progress of a node by its last status; for the router, that of the whole team."""
+        """Progress by a node's last status; for the router, the team's."""
         names = list(self.statuses) if node == "router" else [node]
         statuses = [self.statuses[name] for name in names if name in self.statuses]
         figures = [status.figures.get(name, 0.0) for status in statuses for name in _PROGRESS]
@@ -186,12 +184,11 @@ class Watch:
 
 
 def _robot(status: m.Status) -> str:
-    """The robot of a driver's status."""
     return status.node.removeprefix("source/")
 
 
 def team_time(world: m.Status) -> str:
-    """The team's time in words: the time of day (UTC) where it is Unix time."""
+    """Team time as text: time of day (UTC) for Unix time."""
     seconds = world.figures.get("team_time_s", 0.0)
     if seconds < UNIX_S:
         return f"team time {seconds:,.0f} s"

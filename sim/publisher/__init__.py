@@ -1,1 +1,1 @@
-"""The world's process: publishes measurements as far as credit allows."""
+"""World process: publishes measurements as far as credit allows."""

@@ -1,7 +1,7 @@
-"""Check that robots and centre run with the configurations that the world's scenario gives them.
+"""Check that robots and centre run with the configurations of the world's scenario.
 
-Processes that were started by hand may have been given other options. The announcement of each
-robot and of the centre is compared with the scenario, field by field.
+Processes started by hand may have other options, so each announcement is compared with the scenario
+by field.
 """
 
 import json
@@ -11,14 +11,14 @@ from typing import Any
 from team.wire import messages as m
 
 SHOWN = 3
-"""Most differing fields that a warning names; with a whole other scenario there are dozens."""
+"""Most differing fields in a warning."""
 REMEDY = "start it again with the same scenario and options"
 
 
 class Configurations:
-    """The expected configurations by node, and the announcements that have arrived.
+    """Expected configurations by node, and received announcements.
 
-    A node's newest announcement counts. Nothing is compared where nothing is expected.
+    A node's newest announcement counts. Without expectations nothing is compared.
     """
 
     def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
@@ -28,7 +28,7 @@ class Configurations:
         self._mismatches: dict[str, str] = {}
 
     def take(self, announced: m.Configuration) -> None:
-        """Take one announcement."""
+        """Compare an announcement."""
         if not self._expected:
             return
         node = announced.node
@@ -52,28 +52,25 @@ class Configurations:
 
     @property
     def mismatches(self) -> tuple[str, ...]:
-        """The nodes with another configuration, the fields in which it differs, and the remedy; by
-        node.
-        """
+        """Deviating nodes, their fields and the remedy, by node."""
         return tuple(self._mismatches[node] for node in sorted(self._mismatches))
 
     @property
     def forbid(self) -> bool:
-        """Whether a node of the scenario has announced another configuration, and never the right
-        one.
+        """Whether a scenario's node announced only wrong configurations.
 
-        Where both have arrived, another process, or a stranger, uses the node's name: that is a
-        warning, as for nodes that are not in the scenario, but the world begins.
+        If both arrived, another process, or a stranger, uses the name: a warning, as for nodes
+        outside the scenario, but the world begins.
         """
         return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 
     def unheard(self, nodes: Collection[str]) -> list[str]:
-        """Those of these nodes whose announcement is expected and has not arrived."""
+        """Nodes whose expected announcement has not arrived."""
         return sorted((self._expected.keys() & set(nodes)) - self._announced)
 
 
 def differences(announced: str, expected: str) -> list[str]:
-    """The fields in which two configurations in JSON differ, with both values, by name."""
+    """Differing fields of two JSON configurations, with both values."""
     theirs, ours = dict(_fields(json.loads(announced))), dict(_fields(json.loads(expected)))
     return [
         f"{name} is {theirs.get(name, 'absent')} there and {ours.get(name, 'absent')} here"
@@ -83,7 +80,7 @@ def differences(announced: str, expected: str) -> list[str]:
 
 
 def _fields(value: Any, at: str = "") -> Iterator[tuple[str, str]]:
-    """(path, value in JSON) of every field that is not a table itself."""
+    """(path, JSON value) of every field that is not a table."""
     if isinstance(value, dict) and value:
         for name, part in value.items():
             yield from _fields(part, f"{at}.{name}" if at else name)

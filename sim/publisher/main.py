@@ -1,4 +1,4 @@
-"""The world's process: its node's shell, which publishes as long as there is credit."""
+"""Shell of the world node, which publishes as far as credit allows."""
 
 import logging
 import threading
@@ -18,7 +18,7 @@ from team.wire.bus import Bus, Outgoing
 from team.wire.digest import configured
 
 PACE_S = 0.002
-"""Wait [s] when there is nothing to publish, until the clock or the credit moves on."""
+"""Wait [s] for the clock or credit."""
 _LOG = logging.getLogger("teamslam")
 
 
@@ -76,7 +76,7 @@ def run_world(
 
 
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
-    """The configurations that the centre and the robots of a scenario announce, by node."""
+    """Configurations that centre and robots of a scenario announce, by node."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
     robots = {node: configured(node, 0, 0, robot) for node, robot in nodes.items()}
     central = configured("central", 0, 0, scenario.central)

@@ -1,8 +1,7 @@
-"""The world's node: publishes every robot's measurements in team time, as far as credit allows.
+"""World node: publishes every robot's measurements in team time, as far as credit allows.
 
 It begins when every expected node is alive, never drops a measurement, and ends with the last
-counters. It is the source of the streams, so it also answers requests for measurements that a
-receiver has missed.
+counters. As the source of the streams it also answers requests for missed measurements.
 """
 
 from collections import deque
@@ -30,24 +29,21 @@ from team.wire.bus import Outgoing
 from team.wire.codec import decoded
 
 BLOCKED_S = 5.0
-"""A node whose credit has been missing for this long [s] is named in the status."""
+"""Duration [s] of missing credit after which a node is named in the status."""
 RESUME_S = 2.0
-"""A world that is started again waits this long [s] for everyone's progress."""
+"""Wait [s] of a restarted world for all progress reports."""
 
 
 @dataclass
 class WorldNode:
-    """Publishes the world: call `begin`, then `publish` again and again until `ended`, and `handle`
-    for each message.
+    """Publish the world: call `begin`, `publish` until `ended`, and `handle` for each message.
 
-    expected: the nodes that must be alive before the first measurement. speed: team seconds per
-    second of the shell's clock; infinite for as fast as credit allows. cache: number of a robot's
-    last measurements that can be requested again; None: all. A request for an older one begins a
-    new incarnation instead: an unknown initial pose, and counters from zero. configurations: the
-    expected announcements; the world does not begin while one forbids it. tells_map: the true
-    landmarks are published for robots that only localise themselves. batch_s: most team time
-    between two looks at incoming messages. peers: robots whose own final maps the world waits
-    for, until all are of the same set.
+    expected: nodes that must be alive first. speed: team seconds per clock second; infinite for
+    credit-limited. cache: last measurements of a robot that can be requested again; None: all. An
+    older request begins a new incarnation instead: unknown initial pose, counters from zero.
+    configurations: expected announcements; a wrong one holds back the world. tells_map: publish
+    true landmarks for localisation-only robots. batch_s: most team time between checks for
+    messages. peers: robots whose own final maps are awaited, until all have the same set.
     """
 
     streams: WorldStreams
@@ -94,19 +90,19 @@ class WorldNode:
         ch.GIVEN_UP,
     )
     announcements: ClassVar[tuple[ch.Channel, ...]] = (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG)
-    """Further channels to subscribe to where configurations are compared."""
+    """Further subscriptions if configurations are compared."""
 
     @property
     def waiting_for(self) -> list[str]:
-        """The nodes that are not alive yet, or have not announced their configuration yet."""
+        """Nodes not yet alive, or without announced configuration."""
         if self._began_at is not None:
             return []
         silent = self.configurations.unheard(self.expected & self._alive)
         return sorted([*(self.expected - self._alive), *silent])
 
     def begin(self) -> list[Outgoing]:
-        """The first messages: the scenario, the true landmarks for the evaluator, and the known map
-        if robots only localise themselves.
+        """First messages: scenario, true landmarks for the evaluator, and the known map for
+        localisation-only robots.
         """
         out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
         if self.streams.landmarks is not None:
@@ -127,8 +123,8 @@ class WorldNode:
         return out
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true: credit for more than was published, a final map before the
-        end.
+        """Reason why a message is impossible: credit beyond the published, or a final map before
+        the end.
         """
         match message:
             case m.Progress():
@@ -150,7 +146,7 @@ class WorldNode:
         return None
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take progress, liveliness, configurations, the final map; the answer is always empty."""
+        """Process progress, liveliness, configurations and final map; returns nothing to send."""
         match message:
             case m.Liveliness():
                 self._take_liveliness(message)
@@ -181,9 +177,9 @@ class WorldNode:
         return []
 
     def _finish(self) -> None:
-        """End once the centre, if one is expected, and every peer have their final maps.
+        """End once the centre, if expected, and every peer have their final maps.
 
-        Peers need no centre: an absent one is not waited for.
+        Peers do not need the centre, so an absent one is not awaited.
         """
         conclusions = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
         agreed = (
@@ -197,8 +193,7 @@ class WorldNode:
         """Treat progress beyond the published measurements as complete: a stranger published the
         rest.
 
-        Otherwise the world would wait without end for the credit of a robot or a recorder that took
-        a stranger's messages.
+        Otherwise the world would wait forever for credit of a node that took a stranger's messages.
         """
         if progress.node == "recorder":
             stream = (progress.robot, progress.incarnation)
@@ -207,9 +202,7 @@ class WorldNode:
             source.consumed = max(source.consumed, source.published)
 
     def _note_consumed(self, progress: m.Progress) -> None:
-        """Note the progress that robots report before this process has begun: that of an earlier
-        process.
-        """
+        """Record progress reported before this process began: that of an earlier process."""
         stream = (progress.robot, progress.incarnation)
         if progress.robot in self._sources:
             self._consumed[stream] = max(self._consumed.get(stream, 0), progress.measurements)
@@ -218,7 +211,7 @@ class WorldNode:
     def _take_liveliness(self, message: m.Liveliness) -> None:
         (self._alive.add if message.alive else self._alive.discard)(message.node)
         came = not self._recorder and "recorder" in self._alive
-        if came and self._began_at is not None:  # its progress counts the messages in its log
+        if came and self._began_at is not None:  # its progress counts its log's messages
             self._recorded, self._unrecorded = {}, self._out_of_reach
         self._recorder = "recorder" in self._alive
         for name, source in self._sources.items():
@@ -227,11 +220,11 @@ class WorldNode:
             self._finish()
 
     def _going_on(self, clock_s: float) -> bool:
-        """Whether an earlier process had begun the world, and everyone's progress is known.
+        """Whether an earlier process had begun the world, and all progress is known.
 
-        Robots and recorder report their progress again to a new world. The streams are the same for
-        the same scenario, so this process continues from the least progress, in the same
-        incarnations. A receiver drops what it has already, and requests what it lacks.
+        Robots and recorder report to a new world. One scenario gives the same streams, so this
+        process continues from the least progress, in the same incarnations. Receivers drop
+        repetitions and request gaps.
         """
         if not self._consumed:
             return False
@@ -242,8 +235,8 @@ class WorldNode:
         return not waiting or clock_s - self._resumed_at >= RESUME_S
 
     def _skip(self) -> list[Outgoing]:
-        """Leave out the measurements that everyone has; returns the initial poses once more, for a
-        centre that starts later.
+        """Skip measurements that everyone has; returns the initial poses again for a late
+        centre.
         """
         starts = []
         for name, source in self._sources.items():
@@ -251,9 +244,7 @@ class WorldNode:
                 (e for n, e in self._consumed if n == name), default=FIRST_INCARNATION
             )
             consumed = self._consumed.get((name, incarnation), 0)
-            if (
-                incarnation > FIRST_INCARNATION
-            ):  # where it began is not known any more, but how far it came
+            if incarnation > FIRST_INCARNATION:  # only its progress is known, not its begin
                 at = int(np.searchsorted(source.stream.stamps_ns, self._passed_ns[name], "right"))
                 source.incarnation, source.published = incarnation, max(at, 1)
                 self._begin_incarnation(source)
@@ -277,23 +268,21 @@ class WorldNode:
 
     @property
     def _out_of_reach(self) -> int:
-        """Number of measurements that can not be requested any more: a recorder that starts later
-        never gets them.
-        """
+        """Number of measurements no longer available to a late recorder."""
         if self.cache is None:
             return 0
         return sum(max(0, x.published - self.cache) for x in self._sources.values())
 
     @property
     def unrecorded(self) -> int:
-        """Number of measurements that a living recorder still lacks by its own progress."""
+        """Number of measurements that a living recorder still lacks."""
         if not self._recorder:
             return 0
         return self._published - self._unrecorded - sum(self._recorded.values())
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next measurements, at most BATCH and of batch_s: as many as pace and credit allow."""
-        if self.ended:  # a new incarnation may begin after the end; it has its own last counters
+        """Next measurements, limited by BATCH, batch_s, pace and credit."""
+        if self.ended:  # a new incarnation may begin after the end, with its own last counters
             out, self._starts = self._starts, []
             return [*out, Outgoing(ch.END, "", self._end())] if out else []
         if self._began_at is None:
@@ -316,9 +305,9 @@ class WorldNode:
             if stamp_ns > horizon:
                 self._blocked_by = None
                 break
-            if (who := self._without_credit(source)) is not None:
+            if (node := self._without_credit(source)) is not None:
                 before = self._blocked_by
-                self._blocked_by = before if before and before[0] == who else (who, clock_s)
+                self._blocked_by = before if before and before[0] == node else (node, clock_s)
                 self._clock_s = clock_s
                 break
             self._blocked_by = None
@@ -338,13 +327,11 @@ class WorldNode:
     def _horizon_ns(self, clock_s: float) -> float:
         assert self._began_at is not None
         if self.speed == float("inf"):
-            return self.speed  # at the first look no time has passed: 0 · ∞ is not a number
+            return self.speed  # no time has passed at first: 0 · ∞ is not a number
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _without_credit(self, source: Source) -> str | None:
-        """The node whose progress is required before the next measurement of this robot; None: no
-        one's.
-        """
+        """Node whose progress blocks this robot's next measurement, or None."""
         if source.alive and source.published - source.consumed >= CREDIT_MEASUREMENTS:
             return ch.robot_node(source.stream.robot)
         return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
@@ -360,9 +347,7 @@ class WorldNode:
         return m.End(stamp_ns=self.now_ns, streams=ends, notes=tuple(notes))
 
     def measurements(self, request: bytes) -> Iterable[bytes]:
-        """The answer to a `MeasurementsRequest`: the published measurements that it asks for,
-        ANSWER at most.
-        """
+        """Answer a `MeasurementsRequest` with at most ANSWER published measurements."""
         requested = decoded(request, m.MeasurementsRequest)
         source = self._sources.get(requested.robot)
         if source is None or requested.incarnation not in (0, source.incarnation):
@@ -377,7 +362,7 @@ class WorldNode:
         return answered(within_cache, source.counter, lambda n: source.message(source.base + n))
 
     def _begin_incarnation(self, source: Source) -> None:
-        """Begin the stream anew at an unknown pose, where it can not be continued."""
+        """Restart an interrupted stream at an unknown pose."""
         source.incarnation += 1
         source.base = source.published - 1
         source.consumed = source.base
@@ -385,7 +370,7 @@ class WorldNode:
         self._starts.append(Outgoing(ch.START, source.stream.robot, start))
 
     def status(self) -> m.Status:
-        """The progress of the world, for people."""
+        """Progress of the world."""
         total = self._published + len(self._order)
         figures = {
             "measurements": float(self._published),
@@ -396,10 +381,8 @@ class WorldNode:
         state = "publishing" if self._began_at is not None else "waiting"
         warnings = (f"waiting for {', '.join(waiting)}",) if waiting else ()
         if self._blocked_by is not None and self._clock_s - self._blocked_by[1] >= BLOCKED_S:
-            who, since = self._blocked_by
-            warnings = (
-                f"{who} holds the team up: it has got no further for {self._clock_s - since:.0f} s",
-            )
+            node, since = self._blocked_by
+            warnings = (f"{node} blocks the team: no progress for {self._clock_s - since:.0f} s",)
         return m.Status(
             stamp_ns=self.now_ns,
             node="world",
@@ -410,6 +393,6 @@ class WorldNode:
 
 
 def expected_nodes(robots: Sequence[str], *, recorder: bool, centre: bool = True) -> frozenset[str]:
-    """The nodes that must be alive before the world begins."""
+    """Nodes that must be alive before the world begins."""
     nodes = {ch.robot_node(robot) for robot in robots} | ({"central"} if centre else set())
     return frozenset(nodes | {"recorder"} if recorder else nodes)

@@ -1,4 +1,4 @@
-"""One robot's stream as a world publishes it: each measurement as its message, and the truth."""
+"""A robot's stream as published messages, and the truth."""
 
 from dataclasses import dataclass
 from typing import TypedDict
@@ -23,7 +23,7 @@ _CHANNEL_OF_KIND = {
 
 
 class Name(TypedDict):
-    """The fields that every measurement has."""
+    """Common fields of measurements."""
 
     stamp_ns: int
     robot: str
@@ -33,7 +33,7 @@ class Name(TypedDict):
 
 @dataclass
 class Source:
-    """One robot's stream; its present incarnation began at measurement `base` of the whole."""
+    """A robot's stream; its present incarnation began at measurement `base`."""
 
     stream: RobotStream
     incarnation: int = FIRST_INCARNATION
@@ -45,16 +45,16 @@ class Source:
 
     @property
     def counter(self) -> int:
-        """Number of measurements that were published in this incarnation."""
+        """Number of measurements published in this incarnation."""
         return self.published - self.base
 
     def outgoing(self, index: int) -> Outgoing:
-        """The measurement at `index` of the whole stream, on its channel."""
+        """Measurement at `index` of the whole stream, with its channel."""
         channel = _CHANNEL_OF_KIND[int(self.stream.kinds[index])]
         return Outgoing(channel, self.stream.robot, self.message(index))
 
     def message(self, index: int) -> m.Measurement:
-        """The measurement at `index` of the whole stream, numbered as in this incarnation."""
+        """Measurement at `index` of the whole stream, numbered in this incarnation."""
         stream, kind = self.stream, self.stream.kinds[index]
         stamp_ns = int(stream.stamps_ns[index])
         name = Name(
@@ -74,7 +74,7 @@ class Source:
         return _start(stream.start, name)
 
     def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:
-        """The true poses up to a time that are not published yet, once they span `batch_ns`."""
+        """Unpublished true poses up to a time, once they span `batch_ns`."""
         stream = self.stream
         if stream.truth is None or stream.truth_ns is None:
             return []
@@ -106,7 +106,7 @@ def _start(start: s.StartPose | None, name: Name) -> m.InitialPose:
 def _observations(
     z: s.ObservationMeasurement, name: Name
 ) -> m.Observations | m.Points | m.Detections:
-    """A scan in its sensor's form: without identities, as points, or as ranges and bearings."""
+    """A scan in its form: without identities, points, or ranges and bearings."""
     covariances = b"" if z.covariances is None else from_floats(z.covariances)
     if z.hidden:
         return m.Detections(
@@ -142,7 +142,6 @@ def _sightings(t: s.SightingMeasurement, name: Name) -> m.Sightings:
 
 
 def _odometry(odometry: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
-    """One interval in its odometry's form."""
     if odometry.increment is not None:
         return m.Increment(
             **name,
@@ -166,9 +165,7 @@ def _odometry(odometry: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
 
 
 def for_the_evaluator(stream: RobotStream) -> list[Outgoing]:
-    """The true identities of unidentified detections, and the path that another sensor (GPS)
-    measured.
-    """
+    """True identities of unidentified detections, and another sensor's (GPS) path."""
     out, seen, first_ns = [], stream.landmark_detections, int(stream.stamps_ns[0])
     if seen.hidden is not None and seen.hidden.any():
         rows = np.repeat(seen.hidden, np.diff(seen.offsets))

@@ -1,1 +1,1 @@
-"""A simulated radio at each robot's bus, which drops messages from out of reach."""
+"""Simulated radio at each robot's bus."""

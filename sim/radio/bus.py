@@ -1,11 +1,8 @@
-"""Simulate a robot's radio at its bus: over a router, messages from robots out of reach are
-dropped on arrival.
+"""Simulate a robot's radio at its bus: drop messages of robots out of reach on arrival.
 
-The world, which alone knows all positions, announces in advance which robots reach each other
-(`world/radio`). A message counts as sent at its stamp, so a run does not depend on the speed of
-team time. The bytes of a message and its receiver decide whether it is lost. Only messages of
-robots and their drivers go by radio; the world, the recorder and the operator belong to the test
-bench.
+The world announces radio reach in advance (`world/radio`). A message counts as sent at its stamp,
+so a run does not depend on the speed of team time; its bytes and receiver decide random loss. Only
+messages of robots and their drivers go by radio.
 """
 
 import heapq
@@ -29,7 +26,7 @@ _RADIO = {
 
 
 class RadioBus:
-    """The bus of one robot behind a simulated radio."""
+    """Bus of one robot behind a simulated radio."""
 
     def __init__(self, bus: Bus, robot: str, radio: Radio, reach: Reach | None = None) -> None:
         self._bus = bus
@@ -52,7 +49,7 @@ class RadioBus:
         return getattr(self._bus, name)
 
     def publish(self, out: Outgoing) -> int:
-        """Publish; a robot's `Done` message marks the end of its stream."""
+        """Publish; a `Done` message ends the robot's stream."""
         self._now_ns = max(self._now_ns, out.message.stamp_ns)
         self._done = self._done or out.channel is ch.ROBOT_DONE
         self._tap(self.tap)
@@ -62,16 +59,14 @@ class RadioBus:
             self._tap(None)
 
     def _tap(self, tap: Tap | None) -> None:
-        """Record in the robot's own log the messages that the radio delivered, not those that it
-        dropped.
-        """
+        """Record delivered messages only in the robot's own log."""
         if hasattr(self._bus, "tap"):
             self._bus.tap = tap
 
     def ask(
         self, channel: ch.Channel, name: str, request: m.Message, timeout_s: float
     ) -> list[bytes]:
-        """Request and wait; such requests go to the test bench, or to the robot's own source."""
+        """Request from the test bench or the robot's own source, and wait."""
         self._tap(self.tap)
         try:
             return self._bus.ask(channel, name, request, timeout_s)
@@ -79,13 +74,13 @@ class RadioBus:
             self._tap(None)
 
     def request(self, channel: ch.Channel, name: str, request: m.Message) -> None:
-        """Request something; a request to a robot out of reach is dropped."""
+        """Send a request; dropped if the robot is out of reach."""
         robot = ch.robot_of(name)
         if channel is not ch.MEMBERS or robot is None or self._reaches(robot, self._now_ns):
             self._bus.request(channel, name, request)
 
     def answer(self, channel: ch.Channel, name: str, answer: Answer) -> None:
-        """Answer requests; one from a robot out of reach gets nothing."""
+        """Answer requests of robots in reach."""
 
         def answer_in_reach(request: bytes) -> Iterable[bytes]:
             if channel is ch.MEMBERS:
@@ -97,9 +92,7 @@ class RadioBus:
         self._bus.answer(channel, name, answer_in_reach)
 
     def receive(self, timeout_s: float) -> list[Sample]:
-        """The messages that the radio delivers, and the tokens of robots that have come into reach
-        or left it.
-        """
+        """Delivered messages, and tokens of robots that came into or left reach."""
         through: list[Sample] = []
         for sample in self._bus.receive(timeout_s):
             found = ch.channel_of(sample.key)
@@ -120,9 +113,7 @@ class RadioBus:
         return received
 
     def _sender(self, channel: ch.Channel, name: str) -> str | None:
-        """The other robot that publishes on this key by radio; None: it is not by radio, or our
-        own.
-        """
+        """Other robot that publishes on this key by radio, or None."""
         if channel.name not in _RADIO:
             return None
         robot = ch.robot_of(name) if channel.template.startswith("{node}") else name
@@ -149,7 +140,7 @@ class RadioBus:
         if reach is None or other not in reach.ends_ns:
             return reach is None
         ended = at_ns >= reach.ends_ns[other]
-        if ended:  # its stream is over: it waits until this robot's is, too
+        if ended:  # its stream is over: wait for the end of this robot's
             return self._done
         return reach.between(self._robot, other, at_ns)
 
@@ -164,27 +155,27 @@ class RadioBus:
         self._tokens[robot] = decoded(sample.payload, m.Liveliness).alive
 
     def _changes(self) -> list[Sample]:
-        """The liveliness tokens of robots that have come into reach or left it: a robot is alive
-        for another while it lives and is in reach.
+        """Liveliness tokens of robots that came into or left reach: alive means living and in
+        reach.
         """
         changed = []
         for robot, alive in self._tokens.items():
-            there = alive and self._reaches(robot, self._now_ns)
-            if there != self._near.get(robot):
-                self._near[robot] = there
+            in_reach = alive and self._reaches(robot, self._now_ns)
+            if in_reach != self._near.get(robot):
+                self._near[robot] = in_reach
                 node = ch.robot_node(robot)
-                token = m.Liveliness(stamp_ns=0, node=node, alive=there)
+                token = m.Liveliness(stamp_ns=0, node=node, alive=in_reach)
                 changed.append(Sample(ch.ALIVE.key(node), encoded(token), 0, time.time_ns(), 0))
         return changed
 
 
 def behind_radio(bus: Bus, robot: str, radio: Radio) -> Bus:
-    """A robot's bus behind its radio."""
+    """Wrap a robot's bus in its radio."""
     return cast(Bus, RadioBus(bus, robot, radio))
 
 
 def plan_of(reach: Reach) -> m.RadioPlan:
-    """The world's announcement of which robots reach each other."""
+    """Encode the world's announcement of radio reach."""
     import numpy as np
 
     return m.RadioPlan(
@@ -196,7 +187,7 @@ def plan_of(reach: Reach) -> m.RadioPlan:
 
 
 def reach_in(payload: bytes) -> Reach | None:
-    """Which robots reach each other, by the world's announcement."""
+    """Decode the world's announcement of radio reach."""
     import numpy as np
 
     try:

@@ -1,1 +1,1 @@
-"""Scenarios: the user's document, its resolved form for processes, and the streams of its world."""
+"""Scenarios: user document, resolved form for processes, and streams of the world."""

@@ -1,4 +1,4 @@
-"""Check scenarios: errors name the field's path, its known values, and a remedy."""
+"""Check scenarios: errors name field path, known values and remedy."""
 
 import difflib
 import math
@@ -9,27 +9,26 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import msgspec
 
 TOP_LEVEL = ("seed", "estimator", "fusion")
-"""Fields of robots and centre that the scenario has once, at its top, for all of them."""
+"""Robot and centre fields that the scenario has once, at its top."""
 
 _IN_WORDS = {
     "^[a-z][a-z0-9_]{0,31}$": "a small letter, then small letters, digits and _ (32 at most)",
     "^[A-Za-z0-9_.-]{1,64}$": "letters, digits, _, . and - (64 at most)",
 }
-"""The patterns of names."""
 
 
 LARGEST_SIGMA_RAD = 0.5
-"""A larger standard deviation of a bearing [rad] is probably in degrees."""
+"""Bearing standard deviation [rad] above which degrees are probable."""
 
 
 class ScenarioError(ValueError):
-    """A scenario that can not be run; the text names file, field and remedy."""
+    """Invalid scenario; the text names file, field and remedy."""
 
 
 def check_fields(value: object, declared: Any, at: str) -> None:
-    """Raise ScenarioError for unknown fields, wrong choices and numbers that are not finite.
+    """Raise ScenarioError for unknown fields, wrong choices and non-finite numbers.
 
-    declared: the type of `value`; `at`: its path in the file. Types and bounds are left to msgspec.
+    declared: type of `value`; `at`: its path in the file. msgspec checks types and bounds.
     """
     if get_origin(declared) is Annotated:
         declared = get_args(declared)[0]
@@ -56,7 +55,6 @@ def check_fields(value: object, declared: Any, at: str) -> None:
 
 
 def _check_radians(sigma: object, at: str) -> None:
-    """Raise ScenarioError for a bearing's standard deviation that is probably in degrees."""
     if isinstance(sigma, int | float) and LARGEST_SIGMA_RAD < sigma <= math.pi:
         raise ScenarioError(
             f"{sigma:g} rad is {math.degrees(sigma):.0f}°, at {at}; if it is in degrees, "
@@ -66,29 +64,29 @@ def _check_radians(sigma: object, at: str) -> None:
 
 @cache
 def types_of(declared: type) -> dict[str, Any]:
-    """The fields of a struct with their types, evaluated once: this takes longer than a check."""
+    """Evaluated field types of a struct, cached because evaluation outlasts a check."""
     return {field.name: field.type for field in msgspec.structs.fields(declared)}
 
 
 def check_known(name: str, known: list[str], at: str) -> None:
-    """Raise ScenarioError if `name` is not among the known fields at this place."""
+    """Raise ScenarioError if `name` is not known at this place."""
     if name in known:
         return
     where = f"at {at}" if at else "at the top"
     hint = close(name, known)
     if name in TOP_LEVEL:
-        hint = f"; `{name}` is said once for the whole team, at the top of the file"
+        hint = f"; `{name}` is set once for the whole team, at the top of the file"
     raise ScenarioError(f"unknown field `{name}` {where}; known: {', '.join(known)}{hint}")
 
 
 def close(name: object, known: Iterable[str]) -> str:
-    """A question whether the closest known name is meant; empty where none is close."""
+    """Suggestion of the closest known name, or empty."""
     found = difflib.get_close_matches(str(name), list(known), n=1)
     return f"; did you mean `{found[0]}`?" if found else ""
 
 
 def plain(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
-    """From "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b"."""
+    """Convert "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b"."""
     problem, _, path = str(error).partition(" - at `")
     field = path.rstrip("`").removeprefix("$").lstrip(".")
     where = ".".join(part for part in (at, field) if part)
@@ -104,7 +102,5 @@ def _is_struct(declared: Any) -> bool:
 
 
 def _here(name: str, at: str) -> bool:
-    """Whether a field is known at this place; those that the scenario has once are known at the top
-    only.
-    """
+    """Whether a field is allowed at this place; TOP_LEVEL fields only at the top."""
     return not at or name not in TOP_LEVEL

@@ -27,30 +27,28 @@ from team.config import RobotConfig
 MAX_ROBOTS = 1_000
 UTIAS_ROBOTS = 5
 ANY_ROBOT = "any_robot"
-"""Stands for each robot of a data set that is not known yet."""
+"""Placeholder for each robot of an unread data set."""
 
 Fields = dict[str, Any]
 
 
 def builtin_names() -> tuple[str, ...]:
-    """The names of the scenarios that are installed with the package."""
+    """Names of the installed scenarios."""
     found = (entry.name for entry in files("sim.scenarios.builtin").iterdir())
     return tuple(sorted(name[:-5] for name in found if name.endswith(".toml")))
 
 
 def named_document(name: str) -> tuple[Fields, str]:
-    """The document of a built-in scenario or of a user's file, laid over its base; its short
-    name.
-    """
+    """Document of a built-in scenario or user file, merged over its base; and its short name."""
     if name in builtin_names():
         return _builtin(name), name
     return _based(own_document(name)), Path(name).stem
 
 
 def own_document(name: str) -> Fields:
-    """The document of a user's file as it stands there.
+    """Document of a user's file, unmerged.
 
-    Its data set's path is relative to that file, and here to the working directory; a file within a
+    The data set's path is converted from file-relative to working-directory-relative; a file in a
     zip describes that zip.
     """
     archive, path = _file_at(Path(name))
@@ -77,7 +75,7 @@ def own_document(name: str) -> Fields:
 
 
 def _file_at(path: Path) -> tuple[Path | None, Path | zipfile.Path]:
-    """The zip on the way to a file, if there is one, and the file."""
+    """Zip on the way to a file, if any, and the file."""
     for above in path.parents:
         if above.is_file() and zipfile.is_zipfile(above):
             return above, zipfile.Path(above, path.relative_to(above).as_posix())
@@ -85,10 +83,9 @@ def _file_at(path: Path) -> tuple[Path | None, Path | zipfile.Path]:
 
 
 def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
-    """The fields with defaults merged below every robot and names given; `known`: the fields of a
-    scenario.
+    """Merge defaults into every robot and add names; `known`: fields of a scenario.
 
-    The user's values are checked where they were written, so that an error names that place.
+    Values are checked where the user wrote them, so errors name that place.
     """
     for name in document:
         check_known(name, [*known, "base", "defaults", "robot_count"], "")
@@ -117,7 +114,6 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
 
 
 def _unnamed(world: Fields, count: object) -> list[Fields]:
-    """The robots of a document that names none."""
     if count is not None:
         return [{}] * checked_count(count)
     if world.get("kind") == "folder":
@@ -130,14 +126,14 @@ def _unnamed(world: Fields, count: object) -> list[Fields]:
 
 
 def checked_table(value: object, at: str) -> Fields:
-    """The value if it is a table; raises ScenarioError."""
+    """Return the value if it is a table; raises ScenarioError."""
     if not isinstance(value, dict):
         raise ScenarioError(f"expected a table, got {type(value).__name__} at {at}")
     return value
 
 
 def checked_count(count: object) -> int:
-    """The value if it is the size of a team; raises ScenarioError."""
+    """Return the value if it is a team size; raises ScenarioError."""
     if not isinstance(count, int) or isinstance(count, bool):
         raise ScenarioError(f"expected a number of robots from 1 to {MAX_ROBOTS}, got {count!r}")
     if not 1 <= count <= MAX_ROBOTS:
@@ -159,7 +155,7 @@ def _parsed(text: str) -> Fields:
 
 
 def _based(document: Fields) -> Fields:
-    """The document laid over the built-in scenario that it names as its base."""
+    """Merge the document over its built-in base scenario."""
     if "base" not in document:
         return document
     own = {key: value for key, value in document.items() if key != "base"}
@@ -182,7 +178,7 @@ def _based(document: Fields) -> Fields:
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
-    """Tables merged at every depth; other values are replaced by those above."""
+    """Merge tables at every depth; other values are replaced."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)
@@ -192,7 +188,7 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
 
 
 def _check_part(value: Fields, declared: type[msgspec.Struct], at: str, needed: Fields) -> None:
-    """Check a part of the document alone, so that an error names where the user wrote it."""
+    """Check a part of the document, so errors name its place."""
     check_fields(value, declared, at)
     try:
         msgspec.convert(needed | value, declared)

@@ -1,7 +1,7 @@
-"""A scenario: the world, the team's robots with their models, the centre and the seed.
+"""A scenario: world, robots with models, centre and seed.
 
-Users write TOML (`sim.scenarios.document` has the form); processes receive the resolved scenario as
-JSON (`dumps`, `loads`).
+Users write TOML (`sim.scenarios.document`); processes receive the resolved scenario as JSON
+(`dumps`, `loads`).
 """
 
 import re
@@ -40,17 +40,17 @@ __all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads
            "scenario_warnings", "with_options"]  # fmt: skip
 
 FAR_M = 10.0
-"""The end of a sensor's range where nothing gives it."""
+"""Default end of a sensor's range."""
 
 
 class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A resolved scenario: the team's configuration, its world, and the radio between peers."""
+    """Resolved scenario: team configuration, world, and radio between peers."""
 
     world: World
     radio: Radio = Radio()
 
     def config_of(self, robot: str) -> RobotConfig | None:
-        """The configuration of a robot; of one that is not named that of newcomers, if any."""
+        """Configuration of a robot; for an unnamed one, that of newcomers."""
         named = next((config for config in self.robots if config.id == robot), None)
         if named is not None or not isinstance(self.world, LiveWorld) or not self.world.admit:
             return named
@@ -61,19 +61,19 @@ class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def is_live(self) -> bool:
-        """Whether there is no world, and each robot has a driver."""
+        """Whether robots have drivers and no world."""
         return isinstance(self.world, LiveWorld)
 
     @property
     def admits(self) -> bool:
-        """Whether robots that are not named may join the team."""
+        """Whether unnamed robots may join."""
         return isinstance(self.world, LiveWorld) and self.world.admit
 
 
 def load(name_or_path: str | Path) -> Scenario:
-    """A built-in scenario by its name, or a user's TOML file; raises ScenarioError.
+    """Load a built-in scenario by name, or a user's TOML file; raises ScenarioError.
 
-    A data set's path in a file is relative to that file.
+    A data set's path is relative to the file.
     """
     name = str(name_or_path)
     known = list(types_of(Scenario))
@@ -96,10 +96,10 @@ def with_options(
     comm_range_m: float | None = None,
     identities: str | None = None,
 ) -> Scenario:
-    """The scenario with the changes of a command line; None leaves a field as it is.
+    """Apply command-line changes; None leaves a field unchanged.
 
-    peers, centre: whether there are peers, and a centre. robots: their number; further ones repeat
-    the scenario's robots in turn, with new ids. Raises ScenarioError.
+    peers, centre: whether they exist. robots: number; further ones repeat the scenario's in turn,
+    with new ids. Raises ScenarioError.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
@@ -128,7 +128,7 @@ def with_options(
 
 
 def _profile_of(scenario: Scenario) -> AssociationProfile:
-    """The thresholds of association, in the lengths of the coarsest of the robots' sensors."""
+    """Association thresholds, in lengths of the robots' coarsest sensor."""
     world = scenario.world
     seen_m = world.visible_to_m if isinstance(world, SimulatedWorld) else None
     far_m = FAR_M if seen_m is None else seen_m
@@ -137,7 +137,7 @@ def _profile_of(scenario: Scenario) -> AssociationProfile:
 
 
 def _world_of(scenario: Scenario, path: str) -> Fields:
-    """The scenario's world with another data set, of whichever kind that is."""
+    """The scenario's world with another data set of any kind."""
     world = scenario.world
     if isinstance(world, SimulatedWorld):
         raise ScenarioError(
@@ -154,9 +154,7 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
 
 
 def _kind_of(path: str, otherwise: str) -> str:
-    """The kind of a data set; `otherwise` where it can not be determined, so that reading it names
-    the fault.
-    """
+    """Kind of a data set; `otherwise` if undetermined, so that reading it reports the fault."""
     from sim.datasets.kinds import kind_of
     from sim.datasets.tables import DatasetError
 
@@ -167,20 +165,18 @@ def _kind_of(path: str, otherwise: str) -> str:
 
 
 def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
-    """The robots that the data set has; where it has none of them, its own robots by the pattern of
-    these.
-    """
+    """Robots that the data set has; without any, its own robots by their pattern."""
     chosen = [robot for robot in robots if robot["id"] in names]
     return chosen or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
 
 
 def dumps(scenario: Scenario) -> str:
-    """The resolved scenario as JSON; `loads` gives an equal one."""
+    """Resolved scenario as JSON for `loads`."""
     return msgspec.json.encode(scenario).decode()
 
 
 def loads(text: str) -> Scenario:
-    """A resolved scenario from its JSON, also of a log with former names; raises ScenarioError."""
+    """Resolved scenario from JSON, also with former names; raises ScenarioError."""
     try:
         fields = msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.DecodeError as error:
@@ -189,8 +185,8 @@ def loads(text: str) -> Scenario:
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
-    """Warns of settings that are valid and probably a mistake: a simulated robot without
-    odometry noise.
+    """Warnings of valid but probably mistaken settings: a simulated robot without odometry
+    noise.
     """
     if not isinstance(scenario.world, SimulatedWorld):
         return []
@@ -202,7 +198,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
 
 
 def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
-    """As many robots: the first ones as they are, further ones by their pattern in turn."""
+    """Extend or cut robots to a count; further ones repeat the pattern."""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
     unused = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
@@ -211,7 +207,7 @@ def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
 
 
 def _converted(fields: Fields) -> Scenario:
-    """Plain fields → a scenario whose parts fit together; raises ScenarioError."""
+    """Convert plain fields to a consistent scenario; raises ScenarioError."""
     check_world(checked_table(fields.get("world", {}), "world"))
     for choice, declared in (
         ("estimator", Estimator),
@@ -227,9 +223,7 @@ def _converted(fields: Fields) -> Scenario:
 
 
 def _filled(scenario: Scenario) -> Scenario:
-    """The scenario with its seed, estimator and rule set in the robots and the centre, and
-    validated.
-    """
+    """Copy seed, estimator and rule to robots and centre, and validate."""
     if (scenario.estimator, scenario.fusion) not in PAIRS:
         raise ScenarioError(
             f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
@@ -275,7 +269,7 @@ def _filled(scenario: Scenario) -> Scenario:
 
 
 def _check_way_points(robots: int, world: SimulatedWorld) -> None:
-    """Check that robots without a path of their own drive between random way-points without end."""
+    """Check that robots without a path drive between endless random way-points."""
     width = world.size_m if world.radius_m is None else 2.0 * world.radius_m
     endless = robots > len(world.paths) and not world.way_point_count
     if endless and world.way_point_tolerance_m > 0.5 * width:

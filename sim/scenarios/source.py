@@ -1,4 +1,4 @@
-"""The streams of a scenario's world, whichever kind it is."""
+"""Streams of a scenario's world of any kind."""
 
 import hashlib
 from dataclasses import replace
@@ -47,14 +47,14 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
         return folder(scenario.world, scenario.robots)
     if isinstance(scenario.world, LiveWorld):
         raise ScenarioError(
-            f"{scenario.name}: a live team has no world: its robots' drivers say what they "
-            "measure (docs/your_robot.md); for recorded data give --dataset"
+            f"{scenario.name}: a live team has no world: its robots' drivers publish the "
+            "measurements (docs/your_robot.md); for recorded data give --dataset"
         )
     return utias(scenario.world, scenario.robots)
 
 
 def scenario_beside(path: str | Path) -> str:
-    """The scenario that a data set brings with it, or the built-in one for its kind."""
+    """Scenario of a data set, or the built-in one for its kind."""
     kind = kind_of(path)
     own = scenario_in(path)
     if own is not None:
@@ -65,10 +65,9 @@ def scenario_beside(path: str | Path) -> str:
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
-    """The scenario without the robots that have no files in its data set, and a note on them.
+    """Remove robots without files in the data set; also returns a note on them.
 
-    Where no robot has files nothing is left out, so that reading the data set names the fault.
-    Raises DatasetError.
+    If none has files all stay, so that reading the data set reports the fault. Raises DatasetError.
     """
     world = scenario.world
     if isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld) or not world.path:
@@ -90,9 +89,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
 
 
 def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
-    """Whether the robots are given the landmarks. Raises ScenarioError where these are not
-    known.
-    """
+    """Whether the robots receive the landmarks. Raises ScenarioError if unknown."""
     needed = scenario.estimator in NEEDS_MAP
     if needed and streams.landmarks is None:
         raise ScenarioError(
@@ -103,10 +100,10 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
 
 
 def noise_seed(scenario: Scenario) -> int:
-    """The key of the world's random numbers, from the scenario's name and its seed.
+    """Key of the world's random numbers, from scenario name and seed.
 
-    So two scenarios have independent noise: results over the seeds of both are two findings. It is
-    a positive integer of 63 bits.
+    Scenarios have independent noise, so results over the seeds of both are independent. A positive
+    63-bit integer.
     """
     text = f"{scenario.name}/{scenario.seed}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

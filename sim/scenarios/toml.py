@@ -1,4 +1,4 @@
-"""A resolved scenario as TOML: the one that runs the team of a simulated world on its data set."""
+"""A resolved scenario as TOML that runs its team on the written data set."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,16 +14,16 @@ from team.config import RobotConfig
 
 
 def data_set_scenario(scenario: Scenario) -> str:
-    """The same robots and centre for the UTIAS data set in the folder of this text.
+    """Same robots and centre for the UTIAS data set in this text's folder.
 
-    The robots are called r1, r2, … as in every UTIAS world. Fields with their default are left out.
+    Robots are named r1, r2, …; default fields are omitted.
     """
     ids = [f"r{i}" for i in range(1, len(scenario.robots) + 1)]
     return _text(scenario, ids, {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ()))
 
 
 def folder_scenario(scenario: Scenario) -> str:
-    """The same robots and centre for the folder of CSV tables that contains this text."""
+    """Same robots and centre for the folder of CSV tables with this text."""
     ids = [robot.id for robot in scenario.robots]
     unknown = [robot for robot in ids if starts_unknown(scenario.world, robot)]
     world: dict[str, Any] = {"kind": "folder", "path": "."}
@@ -44,7 +44,7 @@ def _text(scenario: Scenario, ids: Sequence[str], world: Mapping[str, Any]) -> s
 def _chosen(
     value: msgspec.Struct, declared: type[msgspec.Struct], without: tuple[str, ...]
 ) -> dict[str, Any]:
-    """The fields that differ from their default, in inner tables, too."""
+    """Non-default fields, including inner tables."""
     chosen: dict[str, Any] = {}
     for field in msgspec.structs.fields(declared):
         part = getattr(value, field.name)

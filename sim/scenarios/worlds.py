@@ -1,4 +1,4 @@
-"""The kinds of world that a scenario may have, and the error for one of none of them."""
+"""Kinds of world, and the error for an unknown kind."""
 
 from sim.scenarios.checks import ScenarioError, check_fields, close, types_of
 from sim.scenarios.document import Fields, builtin_names
@@ -21,7 +21,7 @@ WORLDS: dict[str, type[World]] = {
 
 
 def check_world(world: Fields) -> None:
-    """Check the kind of a world and the names of its fields; raises ScenarioError."""
+    """Check a world's kind and field names; raises ScenarioError."""
     kind = world.get("kind")
     if not isinstance(kind, str) or kind not in WORLDS:
         raise ScenarioError(_which(kind))
@@ -37,7 +37,6 @@ def check_world(world: Fields) -> None:
 
 
 def _which(kind: object) -> str:
-    """The error for an unknown kind of world."""
     known = ", ".join(f'"{each}"' for each in WORLDS)
     if kind is not None:
         return f"expected one of {known}, got {kind!r} at world.kind{close(kind, WORLDS)}"

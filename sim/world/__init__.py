@@ -1,1 +1,1 @@
-"""Worlds: the streams of any world, and a simulated one that shares no model with the filter."""
+"""Streams of any world, and a simulated world that shares no model with the filter."""

@@ -1,4 +1,4 @@
-"""The kinds of world that a scenario may name, as a user describes them."""
+"""Kinds of world in a scenario, as users describe them."""
 
 from itertools import pairwise
 from math import hypot
@@ -21,43 +21,39 @@ Point = tuple[float, float]
 class SimulatedWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="simulated"
 ):
-    """A square place of side size_m with point landmarks; robots drive steps of step_s seconds.
+    """Square of side size_m with point landmarks; robots drive in steps of step_s seconds.
 
-    radius_m: the place is a disc about (0, 0) instead: random landmarks and way-points have a
-    uniform direction and a radius that is uniform up to it, and robots start at its centre.
+    radius_m: a disc about (0, 0) instead: random landmarks and way-points have uniform direction
+    and radius, and robots start at its centre.
 
-    landmarks: their positions, or landmark_count of them at random. layout: "uniform"; "twins",
-    each with another one twin_m beside it; or "rooms", a grid of rooms × rooms equal squares with
-    the same pattern, which no map can tell apart.
+    landmarks: positions, or landmark_count at random. layout: "uniform"; "twins", each with another
+    twin_m away; or "rooms", a grid of rooms × rooms equal squares with one pattern, which no map
+    can distinguish.
 
-    paths: path i has the way-points of robot i. A robot without one drives to random way-points at
-    up to speed_m_s and turn_rate_rad_s; a way-point is reached within way_point_tolerance_m. With
-    way_point_count the world ends, before `steps`, when all robots have reached that many.
-    steering: "together" turns and drives in one step; "turn-first" does not drive in a step that
-    turns.
+    paths: path i has robot i's way-points. Others drive to random way-points at up to speed_m_s and
+    turn_rate_rad_s; a way-point is reached within way_point_tolerance_m. With way_point_count the
+    world ends, before `steps`, when all robots have reached that many. steering: "together" turns
+    and drives in one step; "turn-first" does not drive in a turning step.
 
-    observe_at_start: there is a message of landmarks before the first step, too. visible_from_m,
-    visible_to_m: landmarks at a *true* range between them are measured; absent: the limits of the
-    robot's sensor. They belong to the world, since a gate on noisy measurements at the same limits
-    selects by the noise and biases the map. unknown_starts: the robots whose initial pose the team
-    is not given; "*" is all of them, "!r1" after it all but that one.
+    observe_at_start: also observe landmarks before the first step. visible_from_m, visible_to_m:
+    limits on the *true* range of measured landmarks; absent: the sensor's. They belong to the
+    world, since a gate on noisy measurements selects by noise and biases the map. unknown_starts:
+    robots with unknown initial pose; "*" is all, a following "!r1" excludes one.
 
-    outlier_share: the probability of a measurement of a landmark to be an outlier. outlier_kind: a
-    "measurement" gets a uniform range and bearing, an "identity" becomes that of another landmark;
-    "drop" leaves out the very measurements that the others spoil, all else being the same, for
-    comparison.
+    outlier_share: outlier probability of a landmark measurement. outlier_kind: "measurement" has
+    uniform range and bearing, "identity" that of another landmark; "drop" omits exactly the
+    measurements that the others spoil, for comparison.
 
-    odometry: its form: "speeds", "increments" on SE(2), or a car's wheel speed and "steering".
-    odometry_claims: increments come with a covariance, that of the motion model's forward, lateral
-    and turn; the errors of the last two have the correlation odometry_correlation. landmark_form:
-    "ranges" and bearings, or "points" in the sensor's frame. landmark_claims: each comes with a
-    covariance of its own, whose standard deviations are the sensor's times factors between these
-    two, and with errors of that size. claims_factor: these covariances are the true ones divided by
-    this.
+    odometry: "speeds", "increments" on SE(2), or a car's wheel speed and "steering".
+    odometry_claims: increments carry a covariance, that of the motion model's forward, lateral and
+    turn; odometry_correlation correlates the errors of the last two. landmark_form: "ranges" and
+    bearings, or "points" in the sensor frame. landmark_claims: each measurement carries a
+    covariance, with the sensor's standard deviations times factors between these two, and matching
+    errors. claims_factor: carried covariances are the true ones divided by this.
 
-    identities: "hidden" publishes detections without identities, except for the share `tagged` of
-    landmarks. missed: the probability of a measurement to be left out. clutter: with hidden
-    identities, the share of detections that are of nothing at all.
+    identities: "hidden" publishes detections without identities, except a share `tagged` of
+    landmarks. missed: probability that a measurement is omitted. clutter: with hidden identities,
+    share of false detections.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -107,12 +103,12 @@ class SimulatedWorld(
 class UtiasWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="utias"
 ):
-    """A data set in the UTIAS MRCLAM format.
+    """Data set in the UTIAS MRCLAM format.
 
-    path: its folder or zip. odometry_delay_s: odometry logged at t acts at t + odometry_delay_s on
-    the camera's clock. start_sigma_m, start_sigma_rad: how well the start poses are known; both 0:
-    exactly. unknown_starts: as in a simulated world. duration_s: only this much from the team's
-    first measurement. errata: repair known faults.
+    path: folder or zip. odometry_delay_s: odometry logged at t acts at t + odometry_delay_s on the
+    camera's clock. start_sigma_m, start_sigma_rad: initial-pose uncertainty; both 0: exact.
+    unknown_starts: as in a simulated world. duration_s: limit from the team's first measurement.
+    errata: repair known faults.
     """
 
     path: str = ""
@@ -132,10 +128,10 @@ class UtiasWorld(
 class FolderWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="folder"
 ):
-    """A data set in a folder (or zip) of CSV tables, with a sub-folder for each robot.
+    """Data set in a folder (or zip) of CSV tables, one sub-folder per robot.
 
-    path: the folder. unknown_starts: as in a simulated world, beside the robots without start.csv.
-    duration_s: only this much from the team's first measurement.
+    path: folder. unknown_starts: as in a simulated world, besides robots without start.csv.
+    duration_s: limit from the team's first measurement.
     """
 
     path: str = ""
@@ -147,10 +143,10 @@ class FolderWorld(
 class LiveWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="live"
 ):
-    """No world: each robot has a driver that publishes its measurements and ends its own stream.
+    """No world: each robot's driver publishes its measurements and ends its stream.
 
-    admit: robots that the scenario does not name may join. newcomer: the configuration of such a
-    robot unless its own process gives another; the scenario's [defaults].
+    admit: unnamed robots may join. newcomer: their configuration unless their process gives
+    another; the scenario's [defaults].
     """
 
     admit: bool = False
@@ -160,11 +156,11 @@ class LiveWorld(
 class UnlabelledWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="unlabelled"
 ):
-    """A data set of one robot whose landmarks have no names: odometry.csv and detections.csv.
+    """Data set of one robot with unnamed landmarks: odometry.csv and detections.csv.
 
-    path: the folder. With several robots, each drives a piece of the log from an unknown initial
-    pose. duration_s: only this much from the first measurement. identities: "known" takes its
-    labels for identities, for a run to compare with.
+    path: folder. Several robots each drive a piece of the log from an unknown initial pose.
+    duration_s: limit from the first measurement. identities: "known" uses the labels as identities,
+    for comparison.
     """
 
     path: str = ""
@@ -177,9 +173,7 @@ World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld
 
 
 def starts_unknown(world: World, robot: str) -> bool:
-    """Whether the team is not given this robot's initial pose; that of a live robot comes from
-    its driver.
-    """
+    """Whether the team lacks this robot's initial pose; a live robot's comes from its driver."""
     if isinstance(world, LiveWorld):
         return False
     named = world.unknown_starts
@@ -187,7 +181,7 @@ def starts_unknown(world: World, robot: str) -> bool:
 
 
 class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """These robots reach each other from from_s until to_s of team time since the beginning."""
+    """Robots that reach each other in [from_s, to_s] of team time since the beginning."""
 
     robots: tuple[str, ...]
     from_s: NonNegative
@@ -195,12 +189,11 @@ class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The radio of robots without a centre; by default every message arrives at once.
+    """Radio of robots without a centre; by default instant and lossless.
 
-    comm_range_m: by true distance; absent: any. windows: if there are any, only then, and within
-    the range. loss: the share of messages that never arrive. delay_s: until one does. bytes_per_s:
-    what each link carries; absent: anything. Once a robot's stream has ended it reaches everyone
-    whose stream has ended, too: robots are collected, and what is not known yet spreads.
+    comm_range_m: limit on true distance; absent: none. windows: further limits in time. loss: share
+    of lost messages. delay_s: transmission delay. bytes_per_s: link capacity; absent: unlimited.
+    Robots whose streams have ended reach each other: they are collected, and exchange the rest.
     """
 
     comm_range_m: Positive | None = None
@@ -211,5 +204,5 @@ class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def is_perfect(self) -> bool:
-        """Whether everyone reaches everyone at once."""
+        """Whether all robots reach each other at once."""
         return self == Radio()

@@ -1,8 +1,7 @@
-"""Further forms of a simulated robot's measurements.
+"""Further measurement forms of a simulated robot.
 
-Odometry as motions on SE(2), with or without a covariance, or as a car's encoder values; landmarks
-as points, each with a covariance of its own. The formulas are written here, not taken from the
-filter.
+Odometry as SE(2) motion, with or without covariance, or as a car's encoder values; landmarks as
+points with covariance. The formulas are independent of the filter's.
 """
 
 import numpy as np
@@ -15,11 +14,11 @@ from team.config import MotionModel, Sensor
 Rows = Float[np.ndarray, "K 3"]
 
 LARGEST_CORRELATION = 0.8
-"""Largest absolute correlation of range and bearing in a measurement's own covariance."""
+"""Largest absolute range-bearing correlation of a carried covariance."""
 
 
 def seen_from(poses: Rows, mount: tuple[float, float, float]) -> Rows:
-    """The poses of a sensor that is mounted at `mount` on a base at these poses."""
+    """Sensor poses for base poses and a mount."""
     x, y, heading = mount
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return np.column_stack([
@@ -40,7 +39,7 @@ def measured_increments(
     normals: Rows,
     correlation: float,
 ) -> tuple[Rows, Float[np.ndarray, "K 3 3"]]:
-    """The measured motion between consecutive true poses, and the covariance of its error.
+    """Measure the motion between consecutive true poses, with the covariance of its error.
 
         true motion = measured motion ∘ Exp(f, l, φ)
 
@@ -49,7 +48,7 @@ def measured_increments(
     """
     before, after = poses[:-1], poses[1:]
     true_turn = after[:, 2] - before[:, 2]
-    there = _turned(after[:, :2] - before[:, :2], -before[:, 2])
+    displacement = _turned(after[:, :2] - before[:, :2], -before[:, 2])
     kinds = (motion.forward, motion.lateral, motion.turn)
     sigmas = np.column_stack([deviation(kind, seconds, steps) for kind in kinds])
     shares = np.sqrt(1.0 - correlation**2)
@@ -58,7 +57,7 @@ def measured_increments(
     half = np.sinc(0.5 * turn / np.pi)
     moved = half[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
     measured_turn = true_turn - turn
-    measured = there - _turned(moved, measured_turn)
+    measured = displacement - _turned(moved, measured_turn)
     angle = np.mod(measured_turn + np.pi, 2.0 * np.pi) - np.pi
     C = np.zeros((len(turn), 3, 3))
     C[:, range(3), range(3)] = sigmas**2
@@ -69,7 +68,7 @@ def measured_increments(
 def measured_steering(
     motion: MotionModel, forward: Column, yaw_rate: Column
 ) -> tuple[Column, Column]:
-    """The encoder values of a car at these speeds: (wheel speed [m/s], steering angle [rad]).
+    """Encoder values of a car at these speeds: (wheel speed [m/s], steering angle [rad]).
 
     The base turns about a point forward/yaw_rate to its left, on the line of the rear axle.
     """
@@ -88,10 +87,10 @@ def claimed(
     *,
     points: bool,
 ) -> Float[np.ndarray, "V 3"]:
-    """Covariances of measurements, each of its own size and direction.
+    """Draw measurement covariances, each of its own size and direction.
 
-    The two standard deviations are the sensor's times factors between `sizes`: of range and bearing
-    with a random correlation; of points range_sigma along two orthogonal axes of random direction.
+    Standard deviations are the sensor's times factors between `sizes`: of range and bearing with
+    random correlation; of points, range_sigma along two random orthogonal axes.
     """
     low, high = sizes
     first, second = (low + (high - low) * uniform[:, :2]).T
@@ -110,9 +109,7 @@ def with_errors(
     covariances: Float[np.ndarray, "V 3"],
     normals: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, "V 2"]:
-    """Pairs of numbers with errors of these covariances added, by the rows of their Cholesky
-    factors.
-    """
+    """Add errors of these covariances to pairs of numbers, by Cholesky factors."""
     xx, xy, yy = covariances.T
     first = np.sqrt(xx)
     across = xy / first

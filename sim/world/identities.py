@@ -1,6 +1,6 @@
-"""Worlds without identities: identities are hidden, detections are missed, and clutter is added.
+"""Worlds with hidden identities, missed detections and clutter.
 
-The stream keeps the true identities for the evaluation; they are not published.
+The stream keeps the true identities, unpublished, for the evaluation.
 """
 
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
 
 @dataclass(frozen=True)
 class Hiding:
-    """How identities are hidden.
+    """Parameters of hidden identities.
 
-    tagged: the share of landmarks that keep theirs. missed: the probability of a detection to be
-    left out. clutter: the share of all detections that are of nothing; they lie anywhere in the
-    disc of detections, which reaches out to reach_m or else to the farthest of the robot's.
+    tagged: share of landmarks that keep identities. missed: probability that a detection is
+    omitted. clutter: share of false detections, uniform in the disc of radius reach_m, or of the
+    robot's farthest detection.
     """
 
     tagged: float = 0.0
@@ -27,9 +27,7 @@ class Hiding:
 
 
 def with_hidden_identities(streams: WorldStreams, hiding: Hiding, seed: int) -> WorldStreams:
-    """The streams with detections in the place of observations; random numbers are keyed by seed,
-    robot and purpose.
-    """
+    """Replace observations by detections; random numbers are keyed by seed, robot and purpose."""
     rng = np.random.default_rng([seed, 0x7A65])
     ids = np.unique(np.concatenate([s.landmark_detections.ids for s in streams.streams]))
     ids = ids[ids != NO_LABEL]
@@ -53,7 +51,7 @@ def _hidden(
     if hiding.clutter:
         untagged = _with_clutter(untagged, hiding, rng)
     both = in_order([*parts, untagged])
-    # A scan that saw nothing stays a measurement, whichever kind it is.
+    # An empty scan stays a measurement of either kind.
     return replace(stream, landmark_detections=both)
 
 
@@ -64,7 +62,6 @@ def _rows(
     *,
     hidden: bool,
 ) -> Detections:
-    """Every message with the chosen of its rows only."""
     count = len(seen.stamps_ns)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(message[chosen], minlength=count))))
     was = seen.hidden
@@ -84,9 +81,7 @@ def _rows(
 def _covariances(
     seen: Detections, chosen: Bool[np.ndarray, " R"], *, hidden: bool
 ) -> Float[np.ndarray, "chosen 3"] | None:
-    """The chosen rows' own covariances; hidden ones are sent as ranges and bearings, so that those
-    of points become theirs.
-    """
+    """Covariances of the chosen rows; hidden points are converted to range and bearing."""
     if seen.covariances is None:
         return None
     covariances: Float[np.ndarray, "chosen 3"] = seen.covariances[chosen]
@@ -140,9 +135,9 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
 
 
 def in_order(parts: list[Detections]) -> Detections:
-    """The messages of all parts by time; at equal times those with identities first.
+    """Merge messages by time; at equal times those with identities first.
 
-    Columns that only some parts have, as points or covariances, are NaN in the others' rows.
+    Columns of only some parts, such as points or covariances, are NaN elsewhere.
     """
     if len(parts) == 1:
         return parts[0]

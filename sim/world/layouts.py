@@ -1,4 +1,4 @@
-"""Landmarks that are hard to distinguish: twins, and rooms with the same pattern."""
+"""Ambiguous landmark layouts: twins, and rooms with one pattern."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,13 +6,11 @@ from jaxtyping import Float
 from sim.world.config import SimulatedWorld
 
 INNER = 0.1
-"""Least distance of a landmark from a wall, as a part of a room's side."""
+"""Least wall distance of a landmark, as a share of a room's side."""
 
 
 def laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
-    """landmark_count points of the square; with rooms, the largest number below that gives each
-    room as many.
-    """
+    """Draw landmark_count points of the square, rounded down to equal rooms."""
     if world.layout == "twins":
         return _twins(world, rng)
     side = world.size_m / world.rooms

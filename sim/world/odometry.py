@@ -1,8 +1,7 @@
 """Simulated odometry of a true step, and the slip that it does not measure.
 
-A step is a pair (distance [m], rotation [rad]). The odometry is the true step with the noise of the
-robot's motion model, converted back through its calibration. The formulas are written from the
-sources, not taken from the filter.
+A step is a pair (distance [m], rotation [rad]). Odometry is the true step with the robot's motion
+noise, converted back through its calibration. The formulas follow the sources, not the filter.
 """
 
 import numpy as np
@@ -29,11 +28,11 @@ def measured_speeds(
     normals: Float[np.ndarray, "K 2"],
     wheel_normals: Float[np.ndarray, "K 2"],
 ) -> tuple[Column, Column]:
-    """Forward speed [m/s] and yaw rate [rad/s] that the odometry measures in the true steps.
+    """Measured forward speed [m/s] and yaw rate [rad/s] of the true steps.
 
-    The noises of forward and turn are added to translation d and rotation φ; those of the wheels to
-    the path of each wheel, from which d and φ are computed again. The noisy d and φ give ω and v by
-    φ = ω t + veer·d and |d| = (|v| − turn_drag·|ω|)·t; they are divided by the scales.
+    Forward and turn noise are added to translation d and rotation φ; wheel noise to each wheel's
+    path, from which d and φ are recomputed. The noisy d and φ give ω and v by φ = ω t + veer·d and
+    |d| = (|v| − turn_drag·|ω|)·t; they are divided by the scales.
     """
     of_way, of_turn, _ = _interval_deviations(motion, steps, seconds)
     forward = np.hypot(deviation(motion.forward, seconds, steps), of_way)
@@ -56,9 +55,7 @@ def measured_speeds(
 def slip(
     motion: MotionModel, step: tuple[float, float], seconds: float, normals: Float[np.ndarray, "2"]
 ) -> tuple[float, float]:
-    """The final rotation [rad] and the slip to the left [m] of a step, which odometry does not
-    measure.
-    """
+    """Final rotation [rad] and left slip [m] of a step, which odometry does not measure."""
     steps, duration = np.array([step]), np.array([seconds])
     _, _, of_turn = _interval_deviations(motion, steps, duration)
     turn = np.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
@@ -74,11 +71,11 @@ def slip(
 def _interval_deviations(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of translation, rotation and final rotation by Ma & Ma's α: errors of v, ω, γ, each
-    constant over an interval T.
+    """σ of translation, rotation and final rotation by Ma & Ma's α; errors of v, ω, γ are constant
+    over an interval T.
 
-    In T the translation errs by ε T with var ε = α₁v² + α₂ω². A step of t has t/T such intervals,
-    each with an error of its own: var = (α₁v² + α₂ω²) T² t/T.
+    In T the translation errs by ε T with var ε = α₁v² + α₂ω². A step of t has t/T such intervals:
+    var = (α₁v² + α₂ω²) T² t/T.
     """
     if motion.alphas is None:
         return (np.zeros(len(steps)),) * 3
@@ -94,8 +91,8 @@ def _interval_deviations(
 def _of_the_way(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of forward, lateral and heading errors that are shares of the path, each constant over an
-    interval T.
+    """σ of forward, lateral and heading errors proportional to the path, constant over an interval
+    T.
 
     A step of t has t/T such intervals: σ² = (share · path in T)² t/T.
     """
@@ -112,9 +109,7 @@ def _wheel_errors(
     steps: Float[np.ndarray, "K 2"],
     normals: Float[np.ndarray, "K 2"],
 ) -> tuple[Column, Column]:
-    """The errors [m] of the left and the right wheel's measured path: σ = noise √|path| of each
-    wheel.
-    """
+    """Errors [m] of the left and right wheel's path: σ = noise √|path| of each wheel."""
     distance, turn = steps.T
     left, right = distance - 0.5 * base * turn, distance + 0.5 * base * turn
     return (

@@ -1,7 +1,7 @@
-"""Outliers of the simulated world: measurements that do not depend on their landmark.
+"""Outliers of the simulated world: measurements independent of their landmark.
 
-Which measurements are outliers is drawn in the same way for every kind of outlier; so runs of
-different kinds, and the run in which the same measurements are left out, can be compared.
+All kinds use the same draws, so runs of different kinds, including dropped outliers, are
+comparable.
 """
 
 import numpy as np
@@ -20,12 +20,11 @@ def spoilt(
     landmarks: int,
     uniforms: Float[np.ndarray, "R 3"],
 ) -> Detections:
-    """The detections with a share of the measurements replaced by outliers, from uniform numbers in
-    [0, 1).
+    """Replace a share of the measurements by outliers, from uniform numbers in [0, 1).
 
-    The first number of a row decides whether it is one. "measurement": the other two are the range,
-    uniform in `span` [m], and the bearing, uniform in the field of view. "identity": the second
-    chooses another of the landmarks 1 … `landmarks`. "drop": the measurement is left out.
+    The first number of a row selects outliers. "measurement": the others are the range, uniform in
+    `span` [m], and the bearing, uniform in the field of view. "identity": the second selects
+    another of the landmarks 1 … `landmarks`. "drop": the measurement is omitted.
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":
@@ -57,9 +56,7 @@ def spoilt(
 def _others(
     ids: UInt32[np.ndarray, " R"], landmarks: int, uniform: Float[np.ndarray, " R"]
 ) -> UInt32[np.ndarray, " R"]:
-    """Any of the ids 1 … landmarks but the given one, with equal probability; that one if it is the
-    only one.
-    """
+    """Any other id of 1 … landmarks with equal probability; the only one stays."""
     ahead = 1 + np.floor(uniform * max(landmarks - 1, 1)).astype(np.int64)
     others: UInt32[np.ndarray, " R"] = (ids - 1 + ahead) % landmarks + 1
     return others.astype(np.uint32)

@@ -1,7 +1,7 @@
-"""The true motion of the robots of a simulated world.
+"""True motion of the robots of a simulated world.
 
-A step is a pair (distance [m], rotation [rad]); poses (x, y, θ) are in the world's frame.
-`followed` cuts a polyline into equal steps, `driven` steers from way-point to way-point.
+A step is a pair (distance [m], rotation [rad]); poses (x, y, θ) are in the world frame. `followed`
+cuts a polyline into equal steps, `driven` steers between way-points.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,14 +17,12 @@ Pose = tuple[float, float, float]
 Step = tuple[float, float]
 
 ALIGNED_RAD = 0.02
-"""A robot that turns before it drives begins to drive when its way-point is less than this off its
-heading.
-"""
+"""Largest heading error at which a robot that turns first begins to drive."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """K true steps and the K + 1 true poses before, between and after them."""
+    """K true steps and K + 1 true poses."""
 
     poses: Float[np.ndarray, "K_plus_1 3"]
     steps: Float[np.ndarray, "K 2"]
@@ -32,10 +30,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of one step's motion, and the distance at which a way-point counts as reached.
+    """Motion limits of a step, and the distance at which a way-point is reached.
 
-    turn_first: a step with a rotation has no translation. radius: the smallest turning radius [m]
-    of a car; 0 turns on the spot.
+    turn_first: a rotating step has no translation. radius: smallest turning radius [m] of a car; 0
+    turns on the spot.
     """
 
     distance: float
@@ -46,13 +44,13 @@ class Limits:
 
 
 def wrapped(angle: float) -> float:
-    """The angle in (−π, π]."""
+    """Angle in (−π, π]."""
     turned = (angle + pi) % (2.0 * pi) - pi
     return pi if turned == -pi else turned
 
 
 def followed(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
-    """The polyline through the way-points in steps of equal arc length: rotate, then drive.
+    """Follow the polyline through the way-points in steps of equal arc length: rotate, then drive.
 
     A step across a corner is its chord. The first pose points along the first step.
     """
@@ -78,11 +76,10 @@ def driven(
     steps: int,
     slip: Callable[[int, Step], tuple[float, float]],
 ) -> Drive:
-    """Steer to each way-point in turn; after the last one, stand.
+    """Steer to each way-point in turn; stand after the last.
 
-    A step rotates towards the way-point up to the limit, and drives the less, the more the
-    way-point lies to the side. slip(k, step): the final rotation [rad] and the slip to the left [m]
-    of step k; they move the robot, and no odometry measures them.
+    A step rotates towards the way-point up to the limit, and drives less, the further the way-point
+    lies to the side. slip(k, step): unmeasured final rotation [rad] and left slip [m] of step k.
     """
     poses, taken = [start], []
     target = next(way_points, None)
@@ -99,10 +96,10 @@ def driven(
 def moved(
     pose: Pose, step: Step, kind: Kind, final_turn: float = 0.0, lateral: float = 0.0
 ) -> Pose:
-    """The pose after one step, a slip to the left at its end and a final rotation.
+    """Pose after a step, a left slip and a final rotation.
 
-    turn-then-drive: the whole rotation first, then straight on. All others: the circular arc, whose
-    chord has the length distance · sin(φ/2)/(φ/2) and the direction θ + φ/2.
+    turn-then-drive: full rotation, then straight. Others: the circular arc, whose chord has length
+    distance · sin(φ/2)/(φ/2) and direction θ + φ/2.
     """
     x, y, heading = pose
     distance, turn = step

@@ -1,4 +1,4 @@
-"""Which robots reach each other by radio: by true distance, or in given windows of time."""
+"""Radio reach between robots: by true distance, or in time windows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from sim.world.config import Radio
 from sim.world.streams import RobotStream
 
 PERIOD_NS = 1_000_000_000
-"""Period of team time [ns] for which the reach is constant."""
+"""Team time [ns] of constant reach."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Which robots reach each other: row t holds from first_ns + t · PERIOD_NS for one period.
+    """Reach between robots: row t holds for one period from first_ns + t · PERIOD_NS.
 
-    pairs: T × P, of the robots two by two in their order. ends_ns: when each robot's stream ends.
+    pairs: T × P, pairs of robots in order. ends_ns: end of each robot's stream.
     """
 
     robots: tuple[str, ...]
@@ -27,7 +27,7 @@ class Reach:
     ends_ns: dict[str, int]
 
     def between(self, one: str, other: str, now_ns: int) -> bool:
-        """Whether two robots reach each other at a time; after the last row as in it."""
+        """Whether two robots reach each other; the last row extends."""
         if one == other or one not in self.ends_ns or other not in self.ends_ns:
             return True
         if now_ns >= max(self.ends_ns[one], self.ends_ns[other]):
@@ -39,9 +39,7 @@ class Reach:
 
 
 def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
-    """Which robots reach each other in a world; raises ValueError where a range needs a truth that
-    does not exist.
-    """
+    """Reach between the robots of a world; raises ValueError if a range needs missing truth."""
     robots = tuple(stream.robot for stream in streams)
     first_ns = min((int(s.stamps_ns[0]) for s in streams if len(s)), default=0)
     ends_ns = {s.robot: int(s.stamps_ns[-1]) if len(s) else first_ns for s in streams}
@@ -65,7 +63,6 @@ def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
 
 
 def _positions(stream: RobotStream, times: Int64[np.ndarray, " T"]) -> Float[np.ndarray, "T 2"]:
-    """True positions at some times, by linear interpolation."""
     if stream.truth is None or stream.truth_ns is None or not len(stream.truth):
         raise ValueError(f"radio.comm_range_m needs the truth of {stream.robot}: there is none")
     x, y = (np.interp(times, stream.truth_ns, stream.truth[:, axis]) for axis in (0, 1))

@@ -1,4 +1,4 @@
-"""The range-bearing sensor of the simulated world."""
+"""Range-bearing sensor of the simulated world."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from jaxtyping import Float, Int64
 from team.config import Sensor
 
 SHORTEST_MEASUREMENT_M = 0.05
-"""Least range [m] that is given, since a sensor has no negative range."""
+"""Least measured range [m]."""
 
 SHORTEST_TIME_S = 1e-9
-"""A shorter correlation time [s] counts as this one: no correlation between measurements."""
+"""Least correlation time [s]; shorter means uncorrelated."""
 
 
 @dataclass(frozen=True)
 class Visible:
-    """V true range-bearing pairs, ordered by step and then by point."""
+    """V true range-bearing pairs, by step, then point."""
 
     steps: Int64[np.ndarray, " V"]
     points: Int64[np.ndarray, " V"]
@@ -31,9 +31,9 @@ def visible(
     farthest: float,
     field_of_view: float,
 ) -> Visible:
-    """The points with a true range in [nearest, farthest] and a true bearing in the field of view.
+    """Points with true range in [nearest, farthest] and true bearing in the field of view.
 
-    points: P positions, the same in all steps or K × P.
+    points: P positions, constant or K × P.
     """
     dx = points[..., 0] - poses[:, :1]
     dy = points[..., 1] - poses[:, 1:2]
@@ -48,7 +48,7 @@ def visible(
 def persistent(
     seen: Visible, sensor: Sensor, step_s: float, normals: Float[np.ndarray, "V 4"]
 ) -> Float[np.ndarray, "V 2"]:
-    """Errors of unit variance, a share of which is correlated over time for each point.
+    """Errors of unit variance, partly correlated over time for each point.
 
     n = √white w + √(1 − white) g with white w and, for each point, g of a first-order Gauss-Markov
     process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: V × 4 standard
@@ -57,10 +57,10 @@ def persistent(
     constant = normals[:, 2:].copy()
     times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
     order = np.lexsort((seen.steps, seen.points))
-    again = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
-    gaps = np.diff(seen.steps[order])[again - 1] * step_s
+    repeated = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
+    gaps = np.diff(seen.steps[order])[repeated - 1] * step_s
     correlation = np.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
-    for row, rho in zip(again.tolist(), correlation, strict=True):
+    for row, rho in zip(repeated.tolist(), correlation, strict=True):
         before = constant[order[row - 1]]
         constant[order[row]] = rho * before + np.sqrt(1.0 - rho**2) * constant[order[row]]
     white = np.array([sensor.range_white, sensor.bearing_white])
@@ -70,15 +70,13 @@ def persistent(
 
 
 LENS_ROUNDS = 20
-"""Rounds of the fixed-point iteration for a raw bearing: a lens adds a few per cent, which each
-round multiplies.
-"""
+"""Fixed-point rounds for a raw bearing; each multiplies the error by a lens's few per cent."""
 
 
 def measurements(
     seen: Visible, sensor: Sensor, errors: Float[np.ndarray, "V 2"]
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Ranges [m] and bearings [rad] as the sensor measures them, from errors n of unit variance.
+    """Measured ranges [m] and bearings [rad], from errors n of unit variance.
 
     range = range_scale · (r + σ(r) n₁) + range_offset with σ(r)² = range_sigma² +
     (range_sigma_per_m r)²; bearing = raw + bearing_sigma n₂ with raw = b + bearing_offset +
@@ -100,6 +98,6 @@ def measurements(
 
 
 def on_circle(angles: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
-    """The angles in (−π, π]."""
+    """Wrap angles to (−π, π]."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     return np.where(turned == -np.pi, np.pi, turned)

@@ -1,8 +1,8 @@
-"""A simulated world: true paths, noisy odometry, measurements of landmarks and teammates.
+"""Simulated world: true paths, noisy odometry, measurements of landmarks and teammates.
 
-Nothing here comes from the estimator: the motion and the sensor are written again in `paths`,
-`odometry` and `sensing`, so that an error in either half shows. Every stream of random numbers is
-named by (seed, robot, purpose): a further robot changes nobody else's noise.
+Motion and sensor are implemented independently of the estimator in `paths`, `odometry` and
+`sensing`, so an error in either half shows. Random streams are keyed by (seed, robot, purpose): a
+further robot leaves the others' noise unchanged.
 """
 
 import hashlib
@@ -43,12 +43,11 @@ LEAST_RADIUS = 1.5
 
 
 def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
-    """The streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
+    """Streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
 
-    Robot i follows path i; without a path, or if its motion slips or goes in arcs, it steers to its
-    path's way-points or to random ones. Each step ends with one message of the landmarks seen,
-    perhaps empty, and one of the teammates seen, if any. Where an odometry's clock is late, team
-    time begins so much later than 0 that none of its stamps is negative.
+    Robot i follows path i; without a path, or with slip or arc motion, it steers to way-points.
+    Each step ends with one, possibly empty, landmark message, and one of teammates if any is seen.
+    With a late odometry clock, team time starts later, so no stamp is negative.
     """
     landmarks = _landmarks(world, seed)
     ids = np.arange(1, len(landmarks) + 1, dtype=np.uint32)
@@ -69,7 +68,7 @@ def _clock_ns(robot: RobotConfig) -> int:
 
 
 def generator(seed: int, *names: str) -> np.random.Generator:
-    """The random generator of one purpose, e.g. (seed, robot, "odometry")."""
+    """Random generator of one purpose, e.g. (seed, robot, "odometry")."""
     digest = hashlib.sha256("/".join(names).encode()).digest()
     words = np.random.SeedSequence([seed, int.from_bytes(digest[:16], "little")])
     return np.random.Generator(np.random.Philox(words))
@@ -85,7 +84,7 @@ def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
 
 
 def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-    """Uniform numbers → points of the square, or of the disc by radius and direction."""
+    """Map uniform numbers to points of the square, or of the disc by radius and direction."""
     if world.radius_m is None:
         return uniform * world.size_m
     radius, direction = world.radius_m * uniform[:, 0], 2.0 * np.pi * uniform[:, 1]
@@ -93,7 +92,6 @@ def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[n
 
 
 def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> Drive:
-    """The true motion of one robot."""
     motion = robot.motion
     turn_rate = min(world.turn_rate_rad_s, motion.yaw_rate_limit or np.inf)
     path = np.array(world.paths[index]) if index < len(world.paths) else None
@@ -118,7 +116,7 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
 def _route(
     world: SimulatedWorld, robot: str, path: Float[np.ndarray, "W 2"] | None, seed: int
 ) -> tuple[Pose, Iterator[tuple[float, float]]]:
-    """The initial pose, with the heading of the first step, and the way-points that follow."""
+    """Initial pose along the first step, and the following way-points."""
     way_points = _random_way_points(world, robot, seed) if path is None else _each(path)
     if path is None and world.radius_m is not None:
         return (0.0, 0.0, 0.0), way_points
@@ -153,9 +151,7 @@ def _random_way_points(
 
 
 def _until_all_stand(world: SimulatedWorld, drives: Sequence[Drive]) -> list[Drive]:
-    """The drives up to the step in which the last robot reaches its last way-point, if their number
-    is given.
-    """
+    """Drives up to the step in which the last robot reaches its last way-point, if limited."""
     if not world.way_point_count:
         return list(drives)
     moving = [np.flatnonzero(drive.steps.any(axis=1)) for drive in drives]
@@ -242,7 +238,6 @@ def _observations(
     stamps_ns: Int64[np.ndarray, " K_plus_1"],
     seed: int,
 ) -> Detections:
-    """One message of landmarks for each step, perhaps empty."""
     first = 0 if world.observe_at_start else 1
     at_ns = stamps_ns[first:]
     seen = _visible(world, robot, drive.poses[first:], landmarks[np.newaxis])
@@ -277,9 +272,7 @@ def _with_claims(
     ],
     seed: int,
 ) -> Detections:
-    """Measurements of the visible points, each with a covariance of its own and an error of that
-    covariance.
-    """
+    """Measurements of visible points with individual covariances and matching errors."""
     assert world.landmark_claims is not None
     points = world.landmark_form == "points"
     random = generator(seed, robot.id, "claims")
@@ -307,7 +300,7 @@ def _with_claims(
 def _read(
     world: SimulatedWorld, sensor: Sensor, seen: Visible, seed: int, *names: str
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Ranges and bearings as the sensor measures them, with the random numbers of this purpose."""
+    """Measured ranges and bearings, with random numbers of this purpose."""
     errors = generator(seed, *names).standard_normal((len(seen.steps), 2))
     if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
         lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
@@ -323,7 +316,7 @@ def _sightings(
     ends_ns: Int64[np.ndarray, " K"],
     seed: int,
 ) -> Detections:
-    """One message for each step at whose end a teammate is seen; ids index the robots."""
+    """One message per step that ends with a visible teammate; ids index the robots."""
     robot = robots[index]
     none = np.zeros(0)
     columns = [(none.astype(np.int64), none.astype(np.uint32), none, none)]
@@ -348,7 +341,7 @@ def _sightings(
 def _within_reach(
     world: SimulatedWorld, robot: RobotConfig, drives: Sequence[Drive], index: int
 ) -> list[int]:
-    """The robots that are ever so near to this one, in x and in y, that they may be visible."""
+    """Robots ever close enough, in x and in y, to be visible."""
     _, farthest = _limits(world, robot.sensor)
     reach = 1.001 * (farthest + hypot(*robot.sensor.mount[:2])) + 1e-6
     at = np.stack([drive.poses[1:, :2] for drive in drives])
@@ -362,7 +355,7 @@ def _visible(
     poses: Float[np.ndarray, "K 3"],
     points: Float[np.ndarray, "#K P 2"],
 ) -> Visible:
-    """The points that are truly visible from these poses."""
+    """Points truly visible from these poses."""
     sensor = robot.sensor
     nearest, farthest = _limits(world, sensor)
     if sensor.is_mounted:
@@ -371,16 +364,13 @@ def _visible(
 
 
 def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
-    """The world's true ranges of visibility; where it has none, the limits of the sensor's
-    measurements.
-    """
     nearest = sensor.min_range if world.visible_from_m is None else world.visible_from_m
     farthest = sensor.max_range if world.visible_to_m is None else world.visible_to_m
     return nearest, farthest
 
 
 def _span(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
-    """The ranges at which anything can be seen; no farther than the place is wide."""
+    """Possible ranges, at most the world's width."""
     nearest, farthest = _limits(world, sensor)
     across = hypot(world.size_m, world.size_m) if world.radius_m is None else 2.0 * world.radius_m
     return nearest, max(nearest, min(farthest, across))

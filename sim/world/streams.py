@@ -1,10 +1,9 @@
-"""The streams of any world, simulated or recorded: measurements of each robot in order, and the
-truth.
+"""Streams of a simulated or recorded world: each robot's measurements in order, and the truth.
 
-One counter spans all measurements of a robot, in the order (stamp, kind); measurement 0 is the
-initial pose. An odometry measurement is an interval that is stamped with its *end*, and the
-intervals of a robot are contiguous in time. So at equal stamps the measurements at the end of an
-interval come before it. SI units, radians, bearings in (−π, π].
+One counter spans a robot's measurements in the order (stamp, kind); measurement 0 is the initial
+pose. An odometry measurement is an interval stamped with its *end*; a robot's intervals are
+contiguous. So at equal stamps the measurements at the end of an interval come before it. SI units,
+radians, bearings in (−π, π].
 """
 
 from dataclasses import dataclass, field
@@ -18,14 +17,14 @@ OBSERVATIONS = 1
 SIGHTINGS = 2
 ODOMETRY = 3
 NO_LABEL = 2**32 - 1
-"""The identity of a detection that is clutter, or whose landmark is not known."""
+"""Identity of clutter, or of an unknown landmark."""
 
 KIND_NAMES = ("start pose", "observations", "sightings", "odometry")
 
 
 @dataclass(frozen=True)
 class StartPose:
-    """The pose (x, y, θ) of measurement 0 in the team's frame; covariance None: exactly known."""
+    """Pose (x, y, θ) of measurement 0 in the team's frame; covariance None: exact."""
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"] | None
@@ -33,13 +32,12 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Odometry intervals: end stamp, length, and the mean forward speed [m/s] and yaw rate [rad/s].
+    """Odometry intervals: end stamp, length, mean forward speed [m/s] and yaw rate [rad/s].
 
-    Interval k ends where interval k + 1 begins. steered: of a car, whose forward is the speed of
-    the wheel [m/s] and yaw_rate the steering angle [rad]. increments: odometry that measures
-    motions instead, each the pose (x, y, theta) of its end in the frame of its start; forward and
-    yaw_rate are then zero. covariances: of the increments, in the frame of the end. An increment of
-    NaN: that interval has speeds; a covariance of NaN: that motion has none.
+    Interval k ends where k + 1 begins. steered: a car's, with wheel speed [m/s] and steering angle
+    [rad]. increments: measured motions instead, poses (x, y, theta) of the end in the frame of the
+    start; speeds are then zero. covariances: of the increments, in the frame of the end. A NaN
+    increment: the interval has speeds; a NaN covariance: none.
     """
 
     end_ns: Int64[np.ndarray, " I"]
@@ -52,20 +50,20 @@ class Intervals:
 
     @property
     def as_motions(self) -> Bool[np.ndarray, " I"]:
-        """Which of them measure a motion."""
+        """Mask of intervals that measure a motion."""
         if self.increments is None:
             return np.zeros(len(self.end_ns), np.bool_)
         return np.asarray(~np.isnan(self.increments[:, 0]))
 
     @property
     def claimed(self) -> Bool[np.ndarray, " I"]:
-        """Which of them have a covariance of their own."""
+        """Mask of intervals with a covariance."""
         if self.covariances is None:
             return np.zeros(len(self.end_ns), np.bool_)
         return np.asarray(~np.isnan(self.covariances[:, 0, 0]))
 
     def where(self, chosen: Bool[np.ndarray, " I"]) -> "Intervals":
-        """The chosen intervals."""
+        """Chosen intervals."""
         return Intervals(
             self.end_ns[chosen],
             self.duration_ns[chosen],
@@ -79,16 +77,14 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Detections:
-    """M messages of range-bearing measurements: message m has the rows offsets[m] … offsets[m + 1].
+    """M range-bearing messages: message m has the rows offsets[m] … offsets[m + 1].
 
-    ids are landmark identities, or indices into a tuple of teammates. points: the sensor measures
-    these (x, y) in its frame [m], and ranges and bearings are computed from them. covariances: that
-    each measurement carries, (rr, rb, bb) of range and bearing or (xx, xy, yy) of points. A point
-    of NaN: that one was measured as range and bearing; a covariance of NaN: it has none; the rows
-    of a message are alike. hidden:
-    messages that are published without identities (None: none); their ids are for scoring, NO_LABEL
-    of clutter. signatures: a number for each that is alike for the same landmark, of hidden ones
-    only.
+    ids: landmark identities, or indices of teammates. points: measured (x, y) in the sensor frame
+    [m], from which ranges and bearings are computed. covariances: (rr, rb, bb) of range and bearing
+    or (xx, xy, yy) of points. A NaN point was measured as range and bearing; a NaN covariance is
+    absent; rows of a message are alike. hidden: messages published without identities (None: none),
+    whose ids are for scoring, NO_LABEL for clutter. signatures: similar numbers for the same
+    landmark, hidden ones only.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -102,11 +98,11 @@ class Detections:
     signatures: Float[np.ndarray, " R"] | None = None
 
     def rows(self, message: int) -> slice:
-        """The rows of one message."""
+        """Rows of one message."""
         return slice(int(self.offsets[message]), int(self.offsets[message + 1]))
 
     def only(self, first: int, last: int) -> "Detections":
-        """The messages first … last − 1."""
+        """Messages first … last − 1."""
         rows = slice(int(self.offsets[first]), int(self.offsets[last]))
         return Detections(
             stamps_ns=self.stamps_ns[first:last],
@@ -122,7 +118,7 @@ class Detections:
 
 
 class OdometryMeasurement(NamedTuple):
-    """One interval that ends at stamp_ns; the rest as in `Intervals`."""
+    """Interval that ends at stamp_ns; otherwise as in `Intervals`."""
 
     stamp_ns: int
     duration_ns: int
@@ -136,7 +132,7 @@ class OdometryMeasurement(NamedTuple):
 class ObservationMeasurement(NamedTuple):
     """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty.
 
-    points, covariances, signatures: as in `Detections`. hidden: it is published without the ids.
+    points, covariances, signatures: as in `Detections`. hidden: published without ids.
     """
 
     stamp_ns: int
@@ -160,16 +156,15 @@ class SightingMeasurement(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStream:
-    """All measurements of one robot, numbered by (stamp, kind), the initial pose first; the index
-    into kinds, stamps_ns and rows is the measurement counter.
+    """All measurements of a robot by (stamp, kind), initial pose first; the counter indexes kinds,
+    stamps_ns and rows.
 
-    start: at start_ns, None when the initial pose is not known. rows: the measurement's row in the
-    arrays of its kind. truth (x, y, θ) in the team's frame at truth_ns, or None. notes: what was
-    repaired or can not be given, for users. clock_offset_ns: all stamps here are team time; the
-    odometry's own clock, whose stamps are published, reads this much less. positions: where another
-    sensor, as a GPS, measured the robot at positions_ns, in a frame of its own.
+    start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth
+    (x, y, θ) in the team's frame at truth_ns. notes: repairs and missing data. clock_offset_ns:
+    stamps are team time; published odometry stamps read this much less. positions: by another
+    sensor, such as GPS, at positions_ns in its own frame.
 
-    Raises ValueError for a measurement before the initial pose, or odometry that is not contiguous.
+    Raises ValueError for a measurement before the initial pose, or non-contiguous odometry.
     """
 
     robot: str
@@ -217,11 +212,11 @@ class RobotStream:
             object.__setattr__(self, name, values[order])
 
     def __len__(self) -> int:
-        """The number of measurements, the initial pose included."""
+        """Number of measurements, including the initial pose."""
         return len(self.kinds)
 
     def odometry(self, counter: int) -> OdometryMeasurement:
-        """The odometry interval with this measurement counter."""
+        """Odometry interval of this counter."""
         row = self._row(counter, ODOMETRY)
         intervals = self.intervals
         increment = _known(intervals.increments, row)
@@ -236,7 +231,7 @@ class RobotStream:
         )
 
     def observations(self, counter: int) -> ObservationMeasurement:
-        """The landmarks seen, of the message with this measurement counter."""
+        """Landmark message of this counter."""
         seen = self.landmark_detections
         row = self._row(counter, OBSERVATIONS)
         at = seen.rows(row)
@@ -252,7 +247,7 @@ class RobotStream:
         )
 
     def sightings(self, counter: int) -> SightingMeasurement:
-        """The teammates seen, of the message with this measurement counter."""
+        """Teammate message of this counter."""
         seen = self.teammate_detections
         at = seen.rows(self._row(counter, SIGHTINGS))
         names = tuple(self.teammates[i] for i in seen.ids[at])
@@ -270,21 +265,20 @@ class RobotStream:
 
 
 def _known(values: np.ndarray | None, row: int) -> np.ndarray | None:
-    """A row of the array; None where there is no array, or the row is NaN."""
+    """Row of the array; None if missing or NaN."""
     return None if values is None or np.isnan(values[row].flat[0]) else values[row]
 
 
 def _alike(values: np.ndarray | None, rows: slice) -> np.ndarray | None:
-    """The rows of one message; None where there is no array, or they are NaN."""
+    """Rows of one message; None if missing or NaN."""
     return None if values is None or np.isnan(values[rows]).any() else values[rows]
 
 
 @dataclass(frozen=True)
 class WorldStreams:
-    """The streams of a team, the true landmark positions (None: not known), and the name of their
-    source.
+    """Streams of a team, true landmark positions (None: unknown), and source name.
 
-    landmark_ids ascend; without positions they are empty.
+    landmark_ids ascend; empty without positions.
     """
 
     streams: tuple[RobotStream, ...]
@@ -295,16 +289,15 @@ class WorldStreams:
 
     @property
     def spans_ns(self) -> dict[str, tuple[int, int]]:
-        """The times of each robot's first and last measurement."""
+        """Times of each robot's first and last measurement."""
         return {
             each.robot: (int(each.stamps_ns[0]), int(each.stamps_ns[-1])) for each in self.streams
         }
 
     def order(self) -> tuple[Int64[np.ndarray, " A"], Int64[np.ndarray, " A"]]:
-        """All measurements of the team by (stamp, stream, counter): their stream indices and
-        counters.
+        """Stream indices and counters of all measurements by (stamp, stream, counter).
 
-        Restricted to one stream the counters ascend, since its stamps never decrease.
+        Within one stream the counters ascend, since its stamps never decrease.
         """
         lengths = [len(stream) for stream in self.streams]
         stream = np.repeat(np.arange(len(lengths), dtype=np.int64), lengths)
@@ -322,7 +315,7 @@ def grouped(
     points: Float[np.ndarray, "R 2"] | None = None,
     covariances: Float[np.ndarray, "R 3"] | None = None,
 ) -> Detections:
-    """Measurements in order of time → one message per stamp, and per form."""
+    """Group ordered measurements into one message per stamp and form."""
     bare = np.zeros(len(stamps_ns), np.bool_)
     polar = bare if points is None else np.isnan(points[:, 0])
     unclaimed = bare if covariances is None else np.isnan(covariances[:, 0])
@@ -347,6 +340,6 @@ def moved(
     increments: Float[np.ndarray, "I 3"],
     covariances: Float[np.ndarray, "I 3 3"] | None = None,
 ) -> Intervals:
-    """Odometry intervals that measure motions on SE(2)."""
+    """Odometry intervals that measure SE(2) motions."""
     untold = np.zeros(len(end_ns))
     return Intervals(end_ns, duration_ns, untold, untold, False, increments, covariances)

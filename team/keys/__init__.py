@@ -1,1 +1,1 @@
-"""Certificates: the members of a team, and the credentials of each process."""
+"""Certificates and credentials of a team's processes."""

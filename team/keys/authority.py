@@ -1,9 +1,8 @@
-"""A team's certificate authority: its certificate and key, and the certificates that it issues.
+"""A team's certificate authority and the certificates that it issues.
 
-Keys are on the curve P-256. A certificate names its node (CN) and its team (O), the router's also
-the host names under which it is reached. A node's certificate is for clients alone, so that no
-robot can pose as the router. It is valid from an hour before its creation, since robots' clocks
-differ.
+Keys are on curve P-256. A certificate names node (CN) and team (O), the router's also its host
+names. Node certificates are for clients only, so no robot can pose as the router. Validity begins
+an hour early, since robot clocks differ.
 """
 
 import os
@@ -33,12 +32,12 @@ CA_KEY = "ca.key"
 AUTHORITY_DAYS = 3650
 SKEW = timedelta(hours=1)
 LOCAL = ("localhost", "127.0.0.1", "::1")
-"""Hosts for which every router's certificate is valid."""
+"""Hosts valid in every router certificate."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """The nodes with new certificates, those left unchanged, and the revoked ones."""
+    """Nodes with new, unchanged and revoked certificates."""
 
     roster: Roster
     made: tuple[str, ...]
@@ -58,13 +57,11 @@ def make_keys(
     revoke: Sequence[str] = (),
     now: datetime | None = None,
 ) -> Made:
-    """Creates an authority in the folder if there is none, and the missing certificates.
+    """Create a missing authority and missing certificates in the folder.
 
-    nodes: the nodes of the team.
-    renew: nodes that get a new key and certificate under the same name.
-    revoke: nodes whose name the router no longer accepts; a certificate that is issued for one
-        later has another name, so that the old one stays invalid.
-    Raises KeysError.
+    renew: nodes that get a new key and certificate under the same name. revoke: nodes whose name
+    the router no longer accepts; a later certificate has another name, so the old one stays
+    invalid. Raises KeysError.
     """
     now = now or datetime.now(UTC)
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -101,7 +98,7 @@ _Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 
 def _authority(folder: Path, team: str, now: datetime) -> _Authority:
-    """The folder's authority, or a new one where there is none."""
+    """Load or create the folder's authority."""
     paths = folder / CA, folder / CA_KEY
     if all(path.exists() for path in paths):
         certificate = x509.load_pem_x509_certificate(paths[0].read_bytes())
@@ -222,7 +219,7 @@ def _write_pair(
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Writes the file atomically, readable by its owner only."""
+    """Write the file atomically, readable by its owner only."""
     new = path.with_name(f".{path.name}.new")
     new.unlink(missing_ok=True)
     with os.fdopen(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file:

@@ -1,8 +1,7 @@
-"""The credentials of one process: the authority's certificate, its own, and its key, all checked.
+"""Checked credentials of a process: authority's certificate, own certificate, key.
 
-Zenoh does not report to a refused client why it was refused. Everything that can be checked without
-the router is therefore checked before: that the files exist and fit each other, to which node and
-team they belong, and when they are valid.
+Zenoh gives refused clients no reason. So files, their match, node, team and validity are checked
+before connecting.
 """
 
 import re
@@ -20,13 +19,13 @@ from team.keys.roster import KeysError
 
 CA = "ca.pem"
 SOON = timedelta(days=7)
-"""A certificate that expires within this time leads to a warning."""
+"""Remaining validity that causes a warning."""
 _REMEDY = "make new ones by `teamslam keys` and copy them"
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """The checked files of one node; name: the certificate's common name; ends: when it expires."""
+    """Checked files of a node; name: common name; ends: expiry."""
 
     node: str
     name: str
@@ -38,14 +37,14 @@ class Credentials:
     readable_by_others: bool = False
 
     def context(self) -> ssl.SSLContext:
-        """A TLS client context of the standard library with these files."""
+        """TLS client context of the standard library."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(self.authority)
         context.load_cert_chain(self.certificate, self.key)
         return context
 
     def warnings(self, now: datetime | None = None) -> list[str]:
-        """Warnings: the certificate expires soon, or other users can read the key."""
+        """Warnings of near expiry or a key readable by others."""
         found = []
         if self.ends - (now or datetime.now(UTC)) < SOON:
             found.append(
@@ -60,9 +59,9 @@ class Credentials:
 def credentials_of(
     folder: Path, node: str, team: str | None = None, now: datetime | None = None
 ) -> Credentials:
-    """Loads and checks a node's files in a folder; raises KeysError with the defect and its remedy.
+    """Load and check a node's files; raises KeysError with defect and remedy.
 
-    team: the team that they must belong to; None: any.
+    team: required team; None: any.
     """
     paths = folder / CA, folder / f"{node}.pem", folder / f"{node}.key"
     for path in paths:
@@ -78,13 +77,13 @@ def credentials_of(
         if found.not_valid_after_utc <= now:
             raise KeysError(
                 f"{path}: expired at {found.not_valid_after_utc:%Y-%m-%d %H:%M} UTC "
-                f"(this machine's clock says {now:%Y-%m-%d %H:%M}): renew it by "
+                f"(this machine's clock reads {now:%Y-%m-%d %H:%M}): renew it by "
                 f"`teamslam keys TEAM -o DIR --renew {node}` and copy it, or put the clock right"
             )
         if found.not_valid_before_utc > now:
             raise KeysError(
                 f"{path}: not valid before {found.not_valid_before_utc:%Y-%m-%d %H:%M} UTC; this "
-                f"machine's clock says {now:%Y-%m-%d %H:%M}: put the clock right"
+                f"machine's clock reads {now:%Y-%m-%d %H:%M}: put the clock right"
             )
     common, owner = _named(certificate)
     if not re.fullmatch(rf"{re.escape(node)}(\.\d+)?", common):
@@ -125,7 +124,7 @@ def _check_fit(
 
 
 def _named(certificate: x509.Certificate) -> tuple[str, str]:
-    """The common name and the team; empty where the certificate has none."""
+    """Common name and team; may be empty."""
     found = []
     for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME):
         values = certificate.subject.get_attributes_for_oid(oid)

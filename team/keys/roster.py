@@ -1,8 +1,8 @@
-"""The roster of a team: the nodes with a certificate, and their common names.
+"""Roster of a team: nodes with a certificate, and their common names.
 
 A node is one sender: `robot-<name>`, `source-<name>` (the driver of a robot's sensors), `central`,
-`world`, `recorder`, `viewer`, `operator` (the commands of a person: `launch`, `withdraw`),
-`router`, and `replay`, which may publish on every key and is created on request only.
+`world`, `recorder`, `viewer`, `operator` (commands such as `launch`, `withdraw`), `router`, and
+`replay`, which may publish on every key and is created on request only.
 """
 
 import re
@@ -14,33 +14,28 @@ import msgspec
 
 ROSTER = "roster.json"
 STANDING = ("central", "operator", "recorder", "router", "viewer", "world")
-"""The nodes that every team has."""
+"""Nodes of every team."""
 REPLAY = "replay"
 TEAM = re.compile("[A-Za-z0-9._-]{1,64}")
 ROBOT = re.compile("[a-z][a-z0-9_]{0,31}")
 
 
 class KeysError(RuntimeError):
-    """Keys are missing, do not fit, or can not be created; the text says which, and gives the
-    remedy.
-    """
+    """Keys are missing, mismatched or cannot be created; the text has the remedy."""
 
 
 class Issued(NamedTuple):
-    """A certificate that the authority has issued: its generation, and the Unix time of its end
-    [ns].
-    """
+    """Issued certificate: generation, and Unix time of its end [ns]."""
 
     generation: int
     ends_ns: int
 
 
 class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The roster as its file contains it.
+    """Contents of the roster file.
 
-    nodes: the generation of each node's certificate.
-    hosts: host names under which the router is reached.
-    revoked: the last revoked generation of each node; a later one has another name.
+    nodes: certificate generation by node. hosts: host names of the router. revoked: last revoked
+    generation by node.
     """
 
     team: str
@@ -49,28 +44,28 @@ class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     revoked: dict[str, int] = msgspec.field(default_factory=dict)
 
     def common_name(self, node: str) -> str:
-        """The name under which the router knows the node: after a revocation with a number."""
+        """Node name at the router; numbered after a revocation."""
         return common_name(node, self.nodes[node])
 
     @property
     def robots(self) -> list[str]:
-        """The names of the robots, in order."""
+        """Robot names in order."""
         return sorted(n.removeprefix("robot-") for n in self.nodes if n.startswith("robot-"))
 
 
 def common_name(node: str, generation: int) -> str:
-    """`robot-r1`; its second generation is `robot-r1.2`."""
+    """Format `robot-r1`; its second generation is `robot-r1.2`."""
     return node if generation == 1 else f"{node}.{generation}"
 
 
 def nodes_of(robots: Iterable[str]) -> list[str]:
-    """Every node of a team with these robots."""
+    """Nodes of a team with these robots."""
     names = list(robots)
     return [*STANDING, *(f"{kind}-{name}" for name in names for kind in ("robot", "source"))]
 
 
 def is_node(text: str) -> bool:
-    """Whether this is a valid name of a node."""
+    """Whether this is a valid node name."""
     kind, dash, name = text.partition("-")
     if not dash:
         return text in (*STANDING, REPLAY)
@@ -78,7 +73,7 @@ def is_node(text: str) -> bool:
 
 
 def load_roster(folder: Path) -> Roster:
-    """The roster in a folder of keys; raises KeysError."""
+    """Load the roster of a key folder; raises KeysError."""
     path = folder / ROSTER
     try:
         roster = msgspec.json.decode(path.read_bytes(), type=Roster)
@@ -96,12 +91,12 @@ def load_roster(folder: Path) -> Roster:
 
 
 def roster_bytes(roster: Roster) -> bytes:
-    """The contents of the roster's file."""
+    """Contents of the roster file."""
     return msgspec.json.format(msgspec.json.encode(roster, order="deterministic"), indent=2) + b"\n"
 
 
 def chosen(nodes: Sequence[str], roster: Roster) -> list[str]:
-    """The named nodes, `all` for every one; raises KeysError for one without a certificate."""
+    """Select named nodes, or `all`; raises KeysError for one without a certificate."""
     if "all" in nodes:
         return sorted(roster.nodes)
     for node in nodes:

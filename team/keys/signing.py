@@ -1,10 +1,8 @@
-"""Signatures by a node's own key: any peer can relay a robot's message, and all can verify it.
+"""Signatures with a node's key: peers relay robots' messages, and all can verify them.
 
 ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member; verified
-with the node's certificate, which the team's authority has issued. A node may have had several
-certificates: each renewal issues one of the same generation, and the first one after a revocation
-begins the next generation. The proof of a certificate does not depend on the time of the
-check.
+with the node's certificate. A node may have had several certificates: renewals keep the generation,
+and the first after a revocation begins the next. Verification does not depend on the time.
 """
 
 import re
@@ -23,10 +21,10 @@ _ALGORITHM = ec.ECDSA(hashes.SHA256())
 
 
 class Signer:
-    """Signs as one node, and verifies certificates that the team's authority has issued.
+    """Sign as one node, and verify certificates issued by the team's authority.
 
-    certificate: the node's own, DER. Revocations are read from a roster beside the node's files,
-    where there is one. Raises KeysError for a key of another kind, or an unusable roster.
+    certificate: the node's own, DER. Revocations are read from a roster beside the node's files.
+    Raises KeysError for a key of another kind, or an unusable roster.
     """
 
     def __init__(self, own: Credentials) -> None:
@@ -50,23 +48,21 @@ class Signer:
             self._revoked = roster.revoked
 
     def sign(self, named: bytes) -> bytes:
-        """The signature of the member with this name."""
+        """Sign the member of this name."""
         return self._key.sign(self._team.encode() + b"\0" + named, _ALGORITHM)
 
     def issued(self, node: str, certificate: bytes) -> Issued | str:
-        """The generation and the end of a certificate that the authority has issued for the node;
-        otherwise why it is none, in words.
+        """Generation and end of an issued certificate of the node, or the reason why it is
+        invalid.
         """
         return _issued(self._authority, self._team, node, certificate)
 
     def revoked(self, node: str) -> int:
-        """The last generation of the node's certificates that the roster names as revoked; 0:
-        none.
-        """
+        """Last revoked generation of the node; 0: none."""
         return self._revoked.get(node, 0)
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
-        """Whether the signature of this name was made with the key of the certificate."""
+        """Verify a signature of this name against a certificate."""
         key = _public_key(certificate)
         if key is None:
             return False

@@ -1,1 +1,1 @@
-"""MCAP logs: the only folder that imports `mcap`; it stores the wire's bytes unchanged."""
+"""MCAP logs of the wire's unchanged bytes; the only folder that imports `mcap`."""

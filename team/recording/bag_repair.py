@@ -1,6 +1,4 @@
-"""Repair an MCAP file of another program, such as a ROS 2 bag whose recorder was killed: copy its
-undamaged chunks to a new, complete file.
-"""
+"""Repair another program's MCAP file, such as a ROS 2 bag whose recorder was killed."""
 
 import struct
 from collections.abc import Iterator
@@ -18,16 +16,16 @@ _FAULTS = (McapError, ValueError, struct.error, RuntimeError, MemoryError, Overf
 
 
 class BagReport(NamedTuple):
-    """The result of a repair: messages copied, and the damage in words."""
+    """Number of messages copied, and the damage as text."""
 
     messages: int
     damaged: tuple[str, ...]
 
 
 def repair_bag(path: Path, out: Path) -> BagReport:
-    """Copy every message of an MCAP file's whole chunks to a new file with an index.
+    """Copy the messages of an MCAP file's whole chunks to a new file with an index.
 
-    Raises LogError where `path` is no MCAP file or has no whole message; then there is no new file.
+    Raises LogError, without a new file, if `path` is no MCAP file or has no whole message.
     """
     damaged: list[str] = []
     messages = 0
@@ -71,7 +69,7 @@ def repair_bag(path: Path, out: Path) -> BagReport:
 
 
 def _records(reader: StreamReader, damaged: list[str]) -> Iterator[McapRecord]:
-    """The records in order, those of chunks too; unreadable parts are noted in `damaged`."""
+    """Records in order, including those in chunks; damage is noted in `damaged`."""
     records = reader.records
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Check a log: whether it is whole, complete and sound; each finding is one line."""
+"""Check that a log is whole, complete and valid; one line per finding."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -19,11 +19,11 @@ from team.wire.bus import Sample, opened
 from team.wire.codec import WireError
 
 FILE = "file"
-"""The place of a finding that belongs to no key."""
+"""Place of a finding without a key."""
 
 
 class Finding(NamedTuple):
-    """A defect of a log, and its place: a key, or `FILE`."""
+    """Defect of a log and its place: a key, or `FILE`."""
 
     where: str
     what: str
@@ -33,12 +33,11 @@ class Finding(NamedTuple):
 
 
 def check_log(log: Log) -> list[Finding]:
-    """All defects of a log: of the file, its schemas, counters and messages; none if the log is
-    sound.
+    """Find all defects of file, schemas, counters and messages.
 
-    Missing messages are recognised by the numbers of measurements and submaps, the ends of the
-    streams, the counters of each key, and the totals that processes publish when they end
-    (`holes`). Memory: 16 bytes a message, and one chunk.
+    Missing messages are detected by measurement and submap numbers, stream ends, key counters, and
+    the totals that processes publish at their end (`holes`). Memory: 16 bytes a message, and one
+    chunk.
     """
     found = _of_file(log)
     evidence = _evidence(log)
@@ -65,11 +64,9 @@ def check_log(log: Log) -> list[Finding]:
 
 
 def holes(log: Log) -> list[Finding]:
-    """The messages that a log lacks or has twice, and whether its recorder finished it; empty for
-    a complete log.
+    """Find missing and duplicate messages, and an unfinished recording.
 
-    Liveliness and the recorder's own messages are not published on a counted key: their counters
-    are ignored.
+    Liveliness and the recorder's own messages have no counted key.
     """
     evidence = _evidence(log)
     damaged = [] if log.complete else [Finding(FILE, UNFINISHED)]
@@ -84,10 +81,10 @@ def holes(log: Log) -> list[Finding]:
 
 @dataclass
 class _Evidence:
-    """The evidence about missing samples in the samples of a log.
+    """Evidence about missing samples.
 
-    part: it is a cut of another log. repaired: it was made of one that its recorder did not finish.
-    totals: by key, the final number of publications of each process, by the process's beginning.
+    part: the log is a cut. repaired: it was made from an unfinished log. totals: by key, each
+    process's final number of publications, by the process's start.
     """
 
     part: bool
@@ -121,9 +118,7 @@ class _Evidence:
                 self.totals[key][message.since_ns] = count
 
     def findings(self) -> Iterator[Finding]:
-        """The findings by key; for a part of a log only the gaps between two messages of a
-        publisher.
-        """
+        """Findings by key; for a cut only gaps between two messages of a publisher."""
         for key in sorted(self.counters.keys() | self.totals.keys()):
             row = ch.channel_of(key)
             if row is not None and (row[0] is ch.ALIVE or row[1] == "recorder"):
@@ -155,7 +150,7 @@ class _Evidence:
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
-"""Channels whose publisher has received the end of the streams."""
+"""Channels published after the end of the streams."""
 NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
 NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"
@@ -178,7 +173,7 @@ def _evidence(log: Log) -> _Evidence:
 
 def _unsound(sample: Sample) -> str | None:
     if ch.channel_of(sample.key) is None:
-        return None  # a viewer's, or a key that `misdeclared` names
+        return None  # a viewer's, or reported by `misdeclared`
     try:
         message = opened(sample)[2]
     except WireError as error:
@@ -189,5 +184,5 @@ def _unsound(sample: Sample) -> str | None:
 
 
 def _noted(log: Log, note: str) -> bool:
-    """Whether the metadata has this note, for the log or for one that it was merged from."""
+    """Whether the metadata has this note, for this log or a merged one."""
     return any(name.partition("@")[0] == note for name in log.metadata)

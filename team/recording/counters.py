@@ -1,10 +1,9 @@
-"""The counters of one key: the publications that a log lacks or has twice.
+"""Counters of one key: missing and duplicate publications of a log.
 
-A publisher counts its publications on a key from 0. Where it is started again, the next process
-counts from 0 once more: a life of the publisher is the publications of one process. Counters do not
-name their life. It follows from the order by wall clock or, where the clock was set while the team
-ran, from the order of arrival. A reply has no counter (`NO_COUNTER`): it is one of the
-publications, and which one is unknown.
+A publisher counts its publications on a key from 0; a restarted process counts from 0 again. A life
+is the publications of one process. Counters do not name their life: it follows from the wall clock,
+or from order of arrival if the clock was set during the run. A reply has no counter (`NO_COUNTER`):
+it repeats an unknown publication.
 """
 
 from array import array
@@ -18,13 +17,11 @@ from team.wire.bus import NO_COUNTER, Sample
 from team.wire.intervals import Interval, IntervalSet
 
 Life = Int64[np.ndarray, "_"]
-"""The places of one life's publications, in the order of their counters."""
+"""Positions of one life's publications, by counter."""
 
 
 class Counters:
-    """The counters and wall clocks [ns] of one key's samples in the order of the file: 16 B
-    each.
-    """
+    """Counters and wall clocks [ns] of one key's samples in file order: 16 B each."""
 
     def __init__(self) -> None:
         self._counters = array("q")
@@ -32,7 +29,7 @@ class Counters:
         self._replies = 0
 
     def take(self, sample: Sample) -> None:
-        """Add the counter of one more sample."""
+        """Add a sample's counter."""
         if sample.counter == NO_COUNTER:
             self._replies += 1
             return
@@ -42,12 +39,11 @@ class Counters:
     def findings(
         self, *, part: bool, numbered: bool = False, totals: Sequence[int] = ()
     ) -> list[str]:
-        """The defects, one line each; empty for a sound key.
+        """Find defects, one line each.
 
-        part: the log is a cut, so that publications before its beginning are not missing.
-        numbered: the messages have numbers of their own, by which missing ones are recognised.
-        totals: the final numbers of publications of its publishers. Order is not checked: what
-            was requested arrives late.
+        part: the log is a cut, so earlier publications are not missing. numbered: messages have
+        their own numbers, which reveal missing ones. totals: publishers' final publication counts.
+        Order is not checked, since requested messages arrive late.
         """
         counters, walls = (np.frombuffer(each, np.int64) for each in (self._counters, self._walls))
         order = np.lexsort((walls, counters))
@@ -74,11 +70,11 @@ class Counters:
 
 
 def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"]) -> list[Life]:
-    """Split publications, given in the order of their arrival, into the lives of their publisher.
+    """Split publications, in order of arrival, into lives of their publisher.
 
-    Two orders show lives: that of the wall clock, in which a step back, or of zero, begins one, and
-    that of arrival. The one with fewer lives is taken, and of equals the one with fewer gaps: a
-    clock that was set adds lives and gaps to the first, what arrived late to the second.
+    Two orders show lives: wall clock, where a step back or of zero begins one, and arrival. The
+    order with fewer lives is used, then with fewer gaps: a set clock adds lives and gaps to the
+    first, late arrivals to the second.
     """
     if not len(counters):
         return []
@@ -95,8 +91,8 @@ def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"
 
 
 def _by_arrival(counters: Int64[np.ndarray, " n"]) -> list[Life]:
-    """The lives by arrival: a counter that the newest life has is late, of an earlier life that
-    lacks it, or begins the next one.
+    """Lives by arrival: a counter that the newest life already has belongs to an earlier life that
+    lacks it, or begins the next.
     """
     present = [IntervalSet()]
     places: list[list[int]] = [[]]
@@ -119,10 +115,10 @@ def _lacks(present: IntervalSet, counter: int) -> bool:
 
 
 def match_totals(published: Sequence[int], totals: Sequence[int]) -> list[tuple[int, int | None]]:
-    """Match the total that each process published at its end to a life; None: to no life.
+    """Match each process's published total to a life, or to None.
 
-    Equal numbers first; of the other totals each takes the life with the most publications, of
-    those that have fewer. A life without a total is that of a process that was killed.
+    Equal numbers first; then each total takes the largest remaining life with fewer publications. A
+    life without total belongs to a killed process.
     """
     free = dict(enumerate(published))
     found: list[tuple[int, int | None]] = []
@@ -144,7 +140,7 @@ def match_totals(published: Sequence[int], totals: Sequence[int]) -> list[tuple[
 
 
 def _gaps(counters: Int64[np.ndarray, " n"], *, part: bool) -> list[Interval]:
-    """The missing intervals of one life's counters, given in ascending order."""
+    """Missing intervals of one life's ascending counters."""
     before = np.concatenate([counters[:1] - 1 if part else [-1], counters[:-1]])
     missing = counters > before + 1
     pairs = zip(before[missing] + 1, counters[missing] - 1, strict=True)

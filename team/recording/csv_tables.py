@@ -1,6 +1,6 @@
-"""Export a log as CSV: one table per channel, with numbers that can be read back exactly.
+"""Export a log as CSV: one table per channel, with exactly readable numbers.
 
-An array is a list of numbers separated by spaces, a digest hexadecimal, a list or a table JSON.
+Arrays are space-separated numbers, digests hexadecimal, lists and tables JSON.
 """
 
 import csv
@@ -19,14 +19,14 @@ from team.wire.messages import Digest, Message
 
 
 def export_csv(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
-    """Write `<channel>.csv` for each of the channels (None: all) that has a message into `folder`.
+    """Write `<channel>.csv` for each non-empty channel (None: all) into `folder`.
 
-    Raises `LogError` for a damaged log, OSError where the folder can not be written.
+    Raises `LogError` for a damaged log, OSError for an unwritable folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     exported = Exported()
     with ExitStack() as files:
-        writers: dict[str, tuple[Path, Any]] = {}  # csv keeps its writer's type to itself
+        writers: dict[str, tuple[Path, Any]] = {}  # csv does not export its writer's type
         for sample, channel, message in exported.messages(log, channels):
             name = table_of(channel, message)
             if name not in writers:

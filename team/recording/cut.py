@@ -1,4 +1,4 @@
-"""Cut an interval of team time, or some channels, out of a log, into a log of its own."""
+"""Cut an interval of team time, or some channels, into a new log."""
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -10,12 +10,12 @@ from team.wire import channels as ch
 from team.wire.bus import Sample
 
 CUT = "cut"
-"""Name of the metadata that marks a log as a part of another one, and names that one."""
+"""Metadata name that marks a cut, with the original log."""
 STANDING = frozenset(
     channel.name
     for channel in (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.WORLD_CONFIG, ch.TRUTH_LANDMARKS)
 )
-"""Channels whose messages stay valid: a cut contains those from before its beginning, too."""
+"""Channels whose messages stay valid, so a cut includes earlier ones."""
 
 
 def cut(
@@ -25,13 +25,12 @@ def cut(
     to_s: float | None = None,
     channels: Collection[ch.Channel] | None = None,
 ) -> int:
-    """Write the samples of [from_s, to_s) on these channels to a new log `out`; returns their
-    number.
+    """Write the samples of [from_s, to_s) on these channels to a new log; returns their number.
 
     Times are seconds of team time since the first measurement; None: no bound. Adjacent cuts
-    therefore partition a log. Messages of `STANDING` channels from before from_s are written, too.
-    The metadata is copied, with a note of the cut. Raises `LogError` when no sample is left or the
-    log is damaged, before `out` is created, and `RecorderError` when `out` exists.
+    partition a log. Earlier messages of `STANDING` channels are included; metadata is copied with a
+    note of the cut. Raises `LogError`, before creating `out`, for an empty result or a damaged log;
+    `RecorderError` if `out` exists.
     """
     summary = summarise_log(log)
     if summary.damaged:

@@ -1,4 +1,4 @@
-"""The channels that a log declares: the encoding and the schema of each key."""
+"""Declared channels of a log: encoding and schema of each key."""
 
 import json
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from team.wire.messages import Message, tag_of
 
 
 class Declared(NamedTuple):
-    """A key's declaration in a log; the schema's name is empty where it has none."""
+    """A key's declaration; the schema name may be empty."""
 
     key: str
     encoding: str
@@ -35,9 +35,7 @@ class Declared(NamedTuple):
 
 
 def read_declarations(log: Log) -> dict[str, Declared]:
-    """The declaration of each key, the last one where there are several; damaged parts are left
-    out.
-    """
+    """Last declaration of each key; damaged parts are skipped."""
     found: dict[str, Declared] = {}
     for each in log.files:
         _declared_in(each.path, log.team, found)
@@ -62,10 +60,9 @@ def _declared_in(path: Path, team: str, found: dict[str, Declared]) -> None:
 
 
 def find_misdeclaration(of: Declared) -> str | None:
-    """The defect of a key's declaration; None for a sound one.
+    """Defect of a key's declaration, or None.
 
-    A later version of the program may append fields: the shorter of two field lists has to be the
-    beginning of the longer one.
+    Later program versions may append fields: the shorter field list must be a prefix of the longer.
     """
     row = channel_of(of.key)
     if row is None:
@@ -82,7 +79,7 @@ def find_misdeclaration(of: Declared) -> str | None:
 
 
 def _fields(text: bytes, kind: type[Message]) -> list[Any]:
-    """The types of a schema's fields in order; empty where it is no schema of this message."""
+    """Field types of a schema in order; empty if it is not a schema of this message."""
     try:
         fields = json.loads(text)["$defs"][kind.__name__]["prefixItems"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -91,7 +88,7 @@ def _fields(text: bytes, kind: type[Message]) -> list[Any]:
 
 
 def _declarations(path: Path) -> Iterator[Frame]:
-    """The schema and channel records, in chunks or in the index behind them."""
+    """Schema and channel records, in chunks or in the index."""
     opcodes = (Opcode.SCHEMA, Opcode.CHANNEL)
     with path.open("rb") as file:
         try:

@@ -1,9 +1,8 @@
-"""The numbered streams of a log: numbers present and numbers missing.
+"""Numbered streams of a log: present and missing numbers.
 
-A robot's measurements are numbered by their source across all sensor channels, its submaps by the
-robot; `world/end`, or each driver's head, gives the total number of measurements, `progress` and
-`done` a lower bound. Missing numbers are therefore known at the end of a stream, too, and where a
-stream is missing altogether.
+A source numbers measurements across all of its robot's sensor channels; the robot numbers submaps.
+`world/end` or each driver's head gives the total, `progress` and `done` a lower bound. So missing
+numbers are detected at a stream's end, too, and for a missing stream.
 """
 
 import zlib
@@ -21,11 +20,11 @@ from team.wire.bus import NO_COUNTER, Sample, opened
 from team.wire.codec import WireError
 
 MISSING = "missing: "
-"""Beginning of the recorder's last note, which lists what it lacks."""
-_HEAD = 128  # bytes of a message: its tag, stamp, robot, incarnation and number are within
+"""Prefix of the recorder's last note, which lists missing messages."""
+_HEAD = 128  # covers a message's tag, stamp, robot, incarnation and number [bytes]
 Kind = Literal["measurements", "submaps"]
 _ASKED_FOR = (ch.SIGHTING_FACTOR, *ch.REPLIES[ch.KEPT])
-"""Channels without numbers whose messages are sent as replies."""
+"""Channels without numbers, sent as replies."""
 
 
 class NumberedStream(NamedTuple):
@@ -38,10 +37,9 @@ class NumberedStream(NamedTuple):
 
 @dataclass
 class Numbered:
-    """The numbers of a stream that are present, each with a check sum of its payload.
+    """Present numbers of a stream, each with a payload checksum.
 
-    newest: the last number that is known. Memory is needed for present numbers only: 4 bytes for a
-        number without a gap before it, somewhat more for the others.
+    newest: last known number. Memory: 4 bytes per number without a gap before it, more for others.
     """
 
     newest: int = -1
@@ -52,11 +50,11 @@ class Numbered:
 
     @property
     def whole(self) -> int:
-        """The number up to which, exclusively, all numbers are present."""
+        """First missing number: all smaller ones are present."""
         return len(self._sums)
 
     def take(self, number: int, payload: bytes) -> bool:
-        """Add a payload; returns False if it is present already, with the same content."""
+        """Add a payload; returns False if present with the same content."""
         found = zlib.crc32(payload)
         there = self._sums[number] if number < self.whole else self._beyond.get(number)
         if there is not None:
@@ -70,12 +68,12 @@ class Numbered:
         return True
 
     def note_number(self, newest: int) -> None:
-        """Note a number that a message names."""
+        """Register a number named by a message."""
         self.newest = max(self.newest, newest)
 
     @property
     def missing(self) -> list[tuple[int, int]]:
-        """The intervals of numbers that are known and missing."""
+        """Intervals of known, missing numbers."""
         here = sorted(self._beyond)
         begins = [self.whole, *(number + 1 for number in here)]
         ends = [*(number - 1 for number in here), self.newest]
@@ -84,9 +82,9 @@ class Numbered:
 
 @dataclass
 class Inventory:
-    """The numbered streams of a log, sample by sample.
+    """Numbered streams of a log, sample by sample.
 
-    has_earlier_parts: whether the log has earlier parts, whose messages may be repeated.
+    has_earlier_parts: earlier parts exist, whose messages may be repeated.
     """
 
     has_earlier_parts: bool = False
@@ -96,15 +94,13 @@ class Inventory:
     _contents: set[int] = field(default_factory=set, init=False)
 
     def remember(self, sample: Sample) -> None:
-        """Add a sample of an earlier part of the log, which may be repeated."""
+        """Add a sample of an earlier part, which may be repeated."""
         self._earlier.add(_name(sample))
         self.received.take(sample)
         self.take(sample)
 
     def is_new(self, sample: Sample) -> bool:
-        """Add a sample; returns False where it is in the log already, or in an earlier part of
-        it.
-        """
+        """Add a sample; returns False if this log or an earlier part has it."""
         self.received.take(sample)
         if self.has_earlier_parts:
             name = _name(sample)
@@ -114,12 +110,12 @@ class Inventory:
         return self.take(sample)
 
     def take(self, sample: Sample) -> bool:
-        """Add a sample; returns False where its stream contains it already."""
+        """Add a sample; returns False if its stream has it."""
         found = ch.channel_of(sample.key)
         if found is None:
             return True
         channel, robot = found
-        if channel in _ASKED_FOR:  # come once more where they are asked for
+        if channel in _ASKED_FOR:  # repeated on request
             name = hash((sample.key, sample.payload))
             known = name in self._contents
             self._contents.add(name)
@@ -141,7 +137,7 @@ class Inventory:
         try:
             message = opened(sample)[2]
         except WireError:
-            return  # the reader of the message reports it
+            return  # reported by the message's reader
         match message:
             case m.Progress() | m.Done():
                 self._of("measurements", message.robot, message.incarnation).note_number(
@@ -163,7 +159,7 @@ class Inventory:
                 pass
 
     def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
-        """The numbers of measurements and submaps present, by (robot, incarnation)."""
+        """Present measurements and submaps by (robot, incarnation)."""
         found: dict[tuple[str, int], tuple[int, int]] = {}
         for (kind, robot, incarnation), each in self.streams.items():
             measurements, submaps = found.get((robot, incarnation), (0, 0))
@@ -173,20 +169,18 @@ class Inventory:
 
     @property
     def gaps(self) -> dict[NumberedStream, int]:
-        """The first missing number of each incomplete stream."""
+        """First missing number of each incomplete stream."""
         return {
             name: each.whole for name, each in self.streams.items() if each.newest >= each.whole
         }
 
     def span(self, stream: NumberedStream) -> tuple[int, int]:
-        """The first and the last missing number of an incomplete stream."""
+        """First and last missing number of an incomplete stream."""
         missing = self.streams[stream].missing
         return missing[0][0], missing[-1][1]
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """Missing numbers, and numbers that are present twice with different contents: key and
-        description.
-        """
+        """Missing numbers, and numbers with different contents: key and description."""
         for (kind, robot, incarnation), found in sorted(self.streams.items()):
             key = ch.SUBMAP.key(robot) if kind == "submaps" else f"source/{robot}"
             of = f"of {incarnation_named(incarnation)}"
@@ -194,7 +188,7 @@ class Inventory:
                 lost = sum(last - first + 1 for first, last in missing)
                 yield key, f"{lost} {kind} {of} missing: {intervals(missing)}"
             if found.contradicted:
-                yield key, f"{found.contradicted} {kind} {of} there twice, and not the same"
+                yield key, f"{found.contradicted} {kind} {of} present twice with different contents"
 
 
 def _name(sample: Sample) -> int:
@@ -202,24 +196,22 @@ def _name(sample: Sample) -> int:
 
 
 def incarnation_named(incarnation: int) -> str:
-    """An incarnation in words."""
+    """Incarnation as text."""
     return f"incarnation {incarnation}"
 
 
 SHOWN = 3
-"""Number of intervals that a finding lists; it counts the others."""
+"""Intervals that a finding lists; it counts the others."""
 
 
 def intervals(of: list[tuple[int, int]]) -> str:
-    """Intervals of numbers in words."""
+    """Number intervals as text."""
     named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in of[:SHOWN])
     return named + (f" and {len(of) - SHOWN} more gaps" if len(of) > SHOWN else "")
 
 
 def numbered_in(payload: bytes) -> tuple[int, int] | None:
-    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …]; None for
-    others.
-    """
+    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …], or None."""
     unpacker = msgpack.Unpacker()
     unpacker.feed(payload[:_HEAD])
     try:
@@ -229,6 +221,6 @@ def numbered_in(payload: bytes) -> tuple[int, int] | None:
             unpacker.skip()
         incarnation, number = unpacker.unpack(), unpacker.unpack()
     except (ValueError, msgpack.UnpackException):
-        return None  # recorded unchanged; the reader of the message reports it
+        return None  # recorded unchanged; reported by the message's reader
     sound = all(isinstance(n, int) and n >= 0 for n in (incarnation, number))
     return (incarnation, number) if sound else None

@@ -1,9 +1,8 @@
-"""Find the processes of a log that ended without announcing it, so that messages may be missing.
+"""Find processes that ended unannounced, so that messages may be missing.
 
-A process counts its publications and publishes the totals when it ends (`Tally`). A process that
-was killed does not: its last publications may never have left its machine, and no received counter
-shows that. Each process counts its statuses from 0, which separates the lives of a restarted
-process.
+A process publishes the totals of its publications at its end (`Tally`). A killed process does not,
+and its last publications may never have left its machine, unnoticed by counters. Status counters
+start at 0, which separates the lives of a restarted process.
 """
 
 from collections import defaultdict
@@ -20,31 +19,31 @@ from team.wire.messages import Tally
 
 @dataclass
 class LastWords:
-    """The statuses and final totals of each process of a log; 24 bytes a status and more."""
+    """Statuses and final totals of each process; 24 bytes a status and more."""
 
     _statuses: dict[str, list[tuple[int, int, int]]] = field(
         default_factory=lambda: defaultdict(list)
     )
-    """By node, in the order of arrival: counter, wall clock [ns], team time [ns]."""
+    """By node, in order of arrival: counter, wall clock [ns], team time [ns]."""
     _totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
-    """By node, the numbers of statuses in its processes' final totals, by their beginnings."""
+    """By node, status counts in its processes' final totals, by process start."""
 
     def take_status(self, node: str, sample: Sample) -> None:
-        """Add a status of a node."""
+        """Add a node's status."""
         if sample.counter != NO_COUNTER:
             status = sample.counter, min(sample.wall_ns, 2**63 - 1), sample.stamp_ns
             self._statuses[node].append(status)
 
     def take_tally(self, tally: Tally) -> None:
-        """Add the final totals of a process."""
+        """Add a process's final totals."""
         totals = dict(zip(tally.keys, tally.counts, strict=True))
         count = totals.get(ch.STATUS.key(tally.node), 0)
         self._totals[tally.node][tally.since_ns] = count
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """A key, and the gap in the record of its process; empty where no process published totals.
+        """Keys and gaps in the record of their processes; empty if no process published totals.
 
-        A log of nodes in memory has no such totals.
+        Logs of nodes in memory have no totals.
         """
         if not self._totals:
             return

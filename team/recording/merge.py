@@ -1,4 +1,4 @@
-"""Merge the logs of several robots, or the parts of one log, into one log."""
+"""Merge logs of several robots, or parts of one log."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -12,25 +12,24 @@ from team.wire.channels import SENSORS, SIGHTING_FACTOR, SUBMAP, channel_of
 
 _BY_CONTENT = (*SENSORS, SUBMAP, SIGHTING_FACTOR)
 MERGED = "merged"
-"""Name of the metadata that lists the logs that a log was merged from."""
+"""Metadata name that lists the merged logs."""
 
 
 class Merged(NamedTuple):
-    """Number of messages in the new log, and of duplicates that were left out."""
+    """Numbers of written messages and of omitted duplicates."""
 
     messages: int
     duplicates: int
 
 
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
-    """Write each sample of the logs once to a new log `out`, in the order of team time.
+    """Write each sample once to a new log `out`, in order of team time.
 
-    Equal stamps stay in the order of the logs and of each file. Samples of equal key, counter, wall
-    clock and payload are one publication that several recorders wrote; a restarted robot announces
-    the same configuration once more. Measurements, submaps and inter-robot measurements are
-    identified by their content, since one recorder may have requested what another one received.
-    All samples are in memory at once. Raises `LogError` where the logs are of different teams or
-    one is damaged, before `out` is created, and `RecorderError` when `out` exists.
+    Equal stamps keep the order of logs and files. Samples of equal key, counter, wall clock and
+    payload are one publication, as is a restarted robot's repeated configuration. Measurements,
+    submaps and inter-robot measurements are identified by content, since one recorder may have
+    requested them. All samples are in memory at once. Raises `LogError`, before creating `out`, for
+    logs of different teams or a damaged one; `RecorderError` if `out` exists.
     """
     first = logs[0]
     for log in logs[1:]:
@@ -45,9 +44,8 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
 
 
 def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
-    """The entries on which all logs that have them agree; the others as `name@file` for each log.
-
-    Logs of equal file names are numbered: `name@1:file`.
+    """Entries on which all logs agree; the others as `name@file`, or `name@1:file` for equal file
+    names.
     """
     files = [log.path.name for log in logs]
     if len(set(files)) < len(files):

@@ -1,4 +1,4 @@
-"""Open one file of a log: the run that it is of, and whether its recorder finished it."""
+"""Open one file of a log."""
 
 import os
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from team.recording.records import FOOTER_SIZE, MALFORMED, LogError, read_frames
 
 @dataclass(frozen=True)
 class LogFile:
-    """One file of a log, as `Log` is of all; `complete`: whether it has its index."""
+    """One file of a log; `complete`: it has its index."""
 
     path: Path
     team: str
@@ -26,7 +26,7 @@ class LogFile:
 
 
 def open_file(path: Path) -> LogFile:
-    """One file of a log, without further parts; raises `LogError` when it is none."""
+    """Open one file, without further parts; raises `LogError`."""
     try:
         with path.open("rb") as file:
             return _opened(file, path)

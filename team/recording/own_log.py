@@ -1,4 +1,4 @@
-"""A process' own log: its publications and received samples, independent of the team's recorder."""
+"""A process's own log of sent and received samples, independent of the recorder."""
 
 import logging
 from collections.abc import Iterator
@@ -12,14 +12,14 @@ from team.recording.recorder import Recorder, RecorderError
 from team.wire.bus import Sample
 
 OWN = "own_log"
-"""Name of the metadata that marks a log as the samples of a single process."""
+"""Metadata name that marks a single process's log."""
 _LOG = logging.getLogger("teamslam")
 
 
 class OwnLog:
-    """Write samples to a log, each once, and list the messages lost in a crash: a bus's `Tap`.
+    """Write samples once each, and list messages lost in a crash: a bus's `Tap`.
 
-    failed: whether the log could not be written any more, which was reported.
+    failed: writing failed and was reported.
     """
 
     def __init__(self, recorder: Recorder, inventory: Inventory) -> None:
@@ -28,7 +28,7 @@ class OwnLog:
         self.failed = False
 
     def __call__(self, samples: list[Sample]) -> None:
-        """Write those samples that are new."""
+        """Write the new samples."""
         if self.failed:
             return
         try:
@@ -38,11 +38,10 @@ class OwnLog:
             _LOG.error("its own log is not written any more: %s", error)
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Measurements of a robot that are known and not in the log: incarnation, first, last
-        number.
+        """Known measurements of a robot missing from the log: incarnation, first, last number.
 
-        A killed process loses what it had not flushed; its robot may have used these measurements,
-        and then does not request them again.
+        A killed process loses unflushed measurements that its robot may have used and will not
+        request again.
         """
         if self.failed:
             return []
@@ -56,10 +55,10 @@ class OwnLog:
 
 @contextmanager
 def own_log(path: Path, team: str) -> Iterator[OwnLog]:
-    """A context that writes samples to the log; after a restart it continues in a further part.
+    """Write samples to a log within a context; after a restart, to a further part.
 
-    A log that can not be written any more is reported and abandoned: the process goes on. Raises
-    `RecorderError` where no log can be created at `path`.
+    A write error is reported and the log abandoned; the process continues. Raises `RecorderError`
+    if no log can be created at `path`.
     """
     recorder, inventory = next_part(path, team, {**provenance(), OWN: path.name})
     own = OwnLog(recorder, inventory)

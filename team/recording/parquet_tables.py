@@ -1,7 +1,7 @@
-"""Export a log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and the like.
+"""Export a log as Parquet: one typed table per channel, for pandas, Polars, DuckDB and others.
 
-Arrays are lists of numbers, a digest is hexadecimal, a list or a table of parts JSON. pyarrow is
-the extra `parquet`: only this module imports it, and only when it is called.
+Arrays are lists of numbers, digests hexadecimal, lists and tables of parts JSON. Only this module
+imports pyarrow (extra `parquet`), on call.
 """
 
 import json
@@ -19,13 +19,11 @@ from team.wire.messages import Digest, Message
 
 GROUP_ROWS = 20_000
 GROUP_BYTES = 32 * 2**20
-"""Payload bytes of the messages in a row group; a group is also written when its rows are
-complete.
-"""
+"""Payload bytes per row group."""
 
 
 class _Table:
-    """One channel's file: rows are collected by column and written as row groups."""
+    """One channel's file, collected by column and written by row group."""
 
     def __init__(self, path: Path, kind: type[Message]) -> None:
         import pyarrow as pa
@@ -68,10 +66,10 @@ class _Table:
 
 
 def export_parquet(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
-    """Write `<channel>.parquet` of each channel (of all without) that has a message into `folder`.
+    """Write `<channel>.parquet` for each non-empty channel (None: all) into `folder`.
 
-    Memory is bounded by a row group per channel. Raises `LogError` for a damaged log, OSError where
-    the folder can not be written, ImportError without pyarrow.
+    Memory is bounded by a row group per channel. Raises `LogError` for a damaged log, OSError for
+    an unwritable folder, ImportError without pyarrow.
     """
     folder.mkdir(parents=True, exist_ok=True)
     exported = Exported()
@@ -90,7 +88,7 @@ def export_parquet(log: Log, folder: Path, channels: Collection[Channel] | None 
 
 
 def _arrow_type(pa: Any, name: str, kind: object) -> Any:
-    """The column type of a field, by the class under its annotation's bounds."""
+    """Column type of a field, by the class under its annotation's bounds."""
     of = getattr(kind, "__origin__", kind)
     if of is bytes and kind != Digest:
         return pa.list_(pa.from_numpy_dtype(type_of_numbers(name)))

@@ -1,8 +1,7 @@
-"""The files of a log: a recorder that is started again writes a further part.
+"""Files of a log: a restarted recorder writes a further part.
 
-`log.part2.mcap` is the second part of `log.mcap`. Parts of one log have one LOG_ID in their
-metadata. A log that was joined of parts names the last of them in JOINED: parts up to this number
-are in it, and files of them that a crash has left are not read.
+`log.part2.mcap` is the second part of `log.mcap`. Parts share a LOG_ID in their metadata. A joined
+log names its last part in JOINED; leftover files up to that part are not read.
 """
 
 from contextlib import suppress
@@ -12,21 +11,18 @@ from team.recording.opening import LogFile, open_file
 from team.recording.records import LogError
 
 LOG_ID = "log_id"
-"""Name of the metadata that all parts of one log share."""
+"""Metadata name of the identifier shared by all parts."""
 JOINED = "joined"
-"""Name of the metadata with the number of the last part that was joined into a log."""
+"""Metadata name of the last part joined into a log."""
 
 
 def part_of(path: Path, number: int) -> Path:
-    """The path of a part of the log at `path`; the first is the log itself."""
+    """Path of a part; the first is the log itself."""
     return path if number == 1 else path.with_name(f"{path.stem}.part{number}{path.suffix}")
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The existing files of the log at `path`, in order; without those that were joined into it.
-
-    A file of a part's name that belongs to another log is not among them.
-    """
+    """Existing files of a log in order, without joined parts and parts of another log."""
     numbered = _numbered_parts(path)
     opened = {number: open_part(part) for number, part in numbered.items()}
     first = next((log for log in opened.values() if log is not None), None)
@@ -39,13 +35,13 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def next_number(path: Path) -> int:
-    """The number of the next part of the log at `path`: larger than that of each earlier one."""
+    """Number of the next part, above all earlier ones."""
     numbered = _numbered_parts(path)
     return max((_joined(open_part(path)), *numbered)) + 1 if numbered else 1
 
 
 def joined_leftovers(path: Path) -> list[Path]:
-    """The files of parts that were joined into the log at `path` and that a crash has left."""
+    """Leftover files of joined parts."""
     first = open_part(path)
     return [
         part
@@ -55,9 +51,9 @@ def joined_leftovers(path: Path) -> list[Path]:
 
 
 def _numbered_parts(path: Path) -> dict[int, Path]:
-    """The files that have the name of the log, or of a part of it, by their number.
+    """Files named like the log or its parts, by number.
 
-    None where there is no first one: parts without it are another log's, which was moved.
+    None without a first file: the parts belong to another, moved log.
     """
     if not path.exists():
         return {}
@@ -71,13 +67,13 @@ def _numbered_parts(path: Path) -> dict[int, Path]:
 
 
 def _joined(log: LogFile | None) -> int:
-    """The number of the last part that is in the first file of a log."""
+    """Number of the last part in a log's first file."""
     number = "" if log is None else log.metadata.get(JOINED, "")
     return int(number) if number.isascii() and number.isdigit() else 1
 
 
 def _is_of(first: LogFile | None, log: LogFile | None, path: Path) -> bool:
-    """Whether the part at `path` is of the same log as the first file; an empty one may be.
+    """Whether a part belongs to the first file's log; an empty one may.
 
     Logs of earlier versions have no LOG_ID: their team and scenario are compared.
     """
@@ -90,7 +86,7 @@ def _is_of(first: LogFile | None, log: LogFile | None, path: Path) -> bool:
 
 
 def open_part(path: Path) -> LogFile | None:
-    """One file as a log; None where it is none, as of a recorder that ended before it began."""
+    """Open one file as a log; None if invalid, as after an early end of its recorder."""
     with suppress(LogError):
         return open_file(path)
     return None

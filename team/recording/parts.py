@@ -1,10 +1,9 @@
 """A log in parts: a restarted recorder continues in a further file.
 
-`log.mcap` is the first part, `log.part2.mcap` the second; readers take them as one log
-(`team.recording.reader`). When the run has ended they are joined, in the order of arrival, and
-`log.mcap` is the complete log; where the disk has no room for that the parts remain. The joined log
-is written under another name and takes the place of the first part in one step, so that a crash at
-any moment loses nothing and adds nothing, and joining can be begun again.
+Readers treat `log.mcap`, `log.part2.mcap`, … as one log (`team.recording.reader`). At the end of a
+run they are joined into `log.mcap` in order of arrival, unless the disk is full. The joined log
+replaces the first part in one step, so a crash at any time neither loses nor repeats samples, and
+joining can restart.
 """
 
 import os
@@ -33,20 +32,20 @@ from team.wall_clock import wall_clock, was_set_since
 from team.wire.channels import FINAL_MAP, TEAM_FINAL
 
 LONGEST_AWAY_S = 3600.0
-"""Time [s] after which a recorder does not continue a log: it is then taken for another run's."""
+"""Age [s] beyond which a log belongs to another run."""
 ROOM = 16 * 2**20
-"""Bytes that must remain free on the disk."""
+"""Bytes to keep free on the disk."""
 JOINING = ".joining"
 
 
 def check_continues(
     path: Path, team: str, metadata: Mapping[str, str], *, same_run: bool = False
 ) -> bool:
-    """Whether the run of the log at `path` goes on; False: it has ended, and only `join` is left.
+    """Whether the run of the log continues; False: it has ended and only `join` remains.
 
-    The same run has the same team and scenario, and wrote to the log's last part within the hour,
-    or before the wall clock was set. same_run: it is this run's, however old. Raises `LogError` for
-    any other log, and for one that is finished and joined, unless it is of this run.
+    The same run has the same team and scenario and wrote within the hour, or before the wall clock
+    was set. same_run: skips the age test. Raises `LogError` for any other log, and for a finished
+    and joined one unless of this run.
     """
     parts = parts_of(path)
     remedy = "choose another name or remove it"
@@ -76,7 +75,7 @@ def check_continues(
 
 
 def _is_over(log: Log) -> bool:
-    """Whether a log was finished behind the final map."""
+    """Whether a log was finished after the final map."""
     with suppress(LogError):
         if log.complete:
             chunks = log.chunks([FINAL_MAP, TEAM_FINAL])
@@ -85,9 +84,9 @@ def _is_over(log: Log) -> bool:
 
 
 def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recorder, Inventory]:
-    """A recorder for the next part, and the inventory of the earlier ones.
+    """Recorder for the next part, and inventory of the earlier ones.
 
-    Raises `RecorderError` where the disk is full or the file can not be created.
+    Raises `RecorderError` for a full disk or an uncreatable file.
     """
     for each in joined_leftovers(path):
         each.unlink()
@@ -101,14 +100,14 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
     try:
         recorder = Recorder(part, team, {**metadata, **wall_clock(), **named})
     except RecorderError:
-        if earlier:  # not a log of somebody else: the name was free
+        if earlier:  # the name was free, so the log is ours
             part.unlink(missing_ok=True)
         raise
     return recorder, inventory_of(earlier)
 
 
 def inventory_of(parts: Sequence[Path]) -> Inventory:
-    """The inventory of these parts; damaged chunks are left out."""
+    """Inventory of these parts without damaged chunks."""
     inventory = Inventory(has_earlier_parts=bool(parts))
     for part in parts:
         file = open_part(part)
@@ -120,10 +119,10 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
 
 
 def join(path: Path) -> list[Path]:
-    """Join the parts of a log to one; returns the parts that remain, a single one on success.
+    """Join a log's parts; returns the remaining files, one on success.
 
-    Their undamaged chunks are copied in the order of arrival. Where the disk is full nothing
-    changes. To be called again after a crash: what is joined already is not joined twice.
+    Undamaged chunks are copied in order of arrival. A full disk changes nothing. After a crash,
+    joining resumes without repeating parts.
     """
     for each in joined_leftovers(path):
         each.unlink()
@@ -157,7 +156,7 @@ def join(path: Path) -> list[Path]:
 
 
 def _write_through(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk: power may fail."""
+    """Wait until a file, or a folder's names, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,6 +1,4 @@
-"""The provenance of a log: everything that has to be equal for the same bits to be computed
-again.
-"""
+"""Provenance of a log: everything that must be equal to recompute the same bits."""
 
 import hashlib
 import subprocess
@@ -16,7 +14,7 @@ _PACKAGES = ("teamslam", "numpy", "scipy", "numba", "llvmlite", "eclipse-zenoh",
 
 
 def provenance() -> dict[str, str]:
-    """Versions, BLAS, CPU and kernels of this process, as they are stored in a log's metadata."""
+    """Versions, BLAS, CPU and kernels of this process for a log's metadata."""
     cpu_name, cpu_features, blas = _computer()
     versions = {f"version.{package}": _version(package) for package in _PACKAGES}
     return {
@@ -34,9 +32,7 @@ def provenance() -> dict[str, str]:
 
 
 def kernel_fingerprint() -> str:
-    """SHA-256 of the core's build and of all sources of `team.estimation`, in the order of their
-    paths; 16 hex digits.
-    """
+    """SHA-256 of the core's build and all `team.estimation` sources in path order; 16 hex digits."""
     digest = hashlib.sha256(core.digest.encode())
     for source in sorted(ESTIMATION.rglob("*.py")):
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
@@ -45,16 +41,15 @@ def kernel_fingerprint() -> str:
 
 
 def arithmetic() -> str:
-    """The platform on which the bits depend beside the program and its libraries; the same on every
-    processor of an architecture.
+    """Platform on which the bits depend, besides program and libraries.
 
-    The C library's logarithm is in the tails of NumPy's normal numbers.
+    The C library's logarithm affects the tails of NumPy's normal numbers.
     """
     return " ".join((machine(), *libc_ver())).strip()
 
 
 def git_commit() -> str:
-    """The commit of the checkout that this program runs from, "+" when changed; else "unknown"."""
+    """Commit of the running checkout, "+" if changed; else "unknown"."""
     root = ESTIMATION.parents[1]
     if not (root / ".git").exists():
         return "unknown"
@@ -70,7 +65,7 @@ def git_commit() -> str:
 
 
 def computer() -> tuple[str, str, str]:
-    """The processor and its features, as the kernels' compiler names them, and NumPy's BLAS."""
+    """Processor and features, as named by the kernel compiler, and NumPy's BLAS."""
     import numpy as np
     from llvmlite import binding  # type: ignore[import-untyped] # llvmlite ships no types
 
@@ -81,8 +76,8 @@ def computer() -> tuple[str, str, str]:
 
 
 def _computer() -> tuple[str, str, str]:
-    """Determined in a separate process, unless this one has the compiler: it takes 110 MB, and
-    NumPy 14.
+    """Determine it in a separate process unless the compiler is loaded: it takes 110 MB, NumPy
+    14.
     """
     if "llvmlite.binding" in sys.modules:
         return computer()

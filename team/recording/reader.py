@@ -1,4 +1,4 @@
-"""Read the samples of a log, also of one in several parts or whose recorder was killed."""
+"""Read a log's samples, also in parts or from a killed recorder."""
 
 import struct
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -35,19 +35,18 @@ from team.wire.channels import VIEW, Channel, channel_of
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "log_file", "open_log"]
 
 IN_FOLDER = "log.mcap"
-"""The log in the folder of a run."""
+"""The log in a run's folder."""
 _MESSAGE = struct.Struct("<HIQQ")
 _OF_MESSAGE = int(Opcode.MESSAGE)
-"""As a plain number: to compare with an enum's member takes a tenth of the time of reading."""
+"""Plain number: comparing enum members takes a tenth of the reading time."""
 
 
 @dataclass(frozen=True)
 class Log:
-    """A log on disk. `complete` is False when the recorder of its last part did not finish it.
+    """A log on disk. `complete` is False if its last recorder did not finish.
 
-    `metadata` is its provenance, `team` the team's name. `files`: its parts, one after another. An
-    incomplete file is read up to its last whole chunk. `reading` is told by every pass over the log
-    which share of it is read.
+    `metadata`: provenance. `team`: the team's name. `files`: consecutive parts. An incomplete file
+    is read up to its last whole chunk. `reading` receives the share read in every pass.
     """
 
     path: Path
@@ -58,10 +57,9 @@ class Log:
     reading: Callable[[float], None] = field(default=lambda _: None, repr=False, compare=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
-        """The samples of the given channels (None: all) in the order of the file; raises
-        `LogError`.
+        """Samples of the channels (None: all) in file order; raises `LogError`.
 
-        A counter is returned modulo 2³², a stamp before zero with its true value.
+        Counters are modulo 2³²; stamps before zero have their true value.
         """
         for chunk in self.chunks(channels):
             if isinstance(chunk, DamagedChunkError):
@@ -69,7 +67,7 @@ class Log:
             yield from chunk
 
     def counts(self) -> dict[str, Count]:
-        """Messages and payload bytes of each key, by reading the whole log."""
+        """Count messages and payload bytes of each key by reading the whole log."""
         counts: dict[str, Count] = {}
         for sample in self.samples():
             messages, size = counts.get(sample.key, Count(0, 0))
@@ -79,7 +77,7 @@ class Log:
     def chunks(
         self, channels: Collection[Channel] | None = None
     ) -> Iterator[list[Sample] | DamagedChunkError]:
-        """The samples chunk by chunk; in the place of a damaged chunk, its error."""
+        """Samples chunk by chunk, with an error in place of a damaged chunk."""
         names = None if channels is None else {channel.name for channel in channels}
         sizes = [each.path.stat().st_size for each in self.files]
         before, whole = 0, max(sum(sizes), 1)
@@ -91,7 +89,7 @@ class Log:
         self, part: LogFile, names: set[str] | None, before: int, whole: int
     ) -> Iterator[list[Sample] | DamagedChunkError]:
         with part.path.open("rb") as file:
-            # The index repeats the channels: a chunk that introduced one may be damaged.
+            # The index repeats the channels, since a chunk that introduced one may be damaged.
             keys = self._indexed(file, part.path, names) if part.complete else {}
             for frame in read_frames(file, part.path):
                 if frame.opcode == Opcode.CHUNK:
@@ -110,7 +108,7 @@ class Log:
         self, file: IO[bytes], path: Path, names: set[str] | None
     ) -> dict[int, str | None]:
         keys: dict[int, str | None] = {}
-        with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels themselves
+        with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels
             for frame in read_index(file, path):
                 if frame.opcode == Opcode.CHANNEL:
                     self._introduce(frame.body, names, keys)
@@ -123,9 +121,7 @@ class Log:
     def samples_in(
         self, frame: Frame, keys: dict[int, str | None], names: set[str] | None = None
     ) -> list[Sample]:
-        """The samples of a chunk, on channels of these names; channels that it declares are added
-        to `keys`.
-        """
+        """Samples of a chunk on these channels; its declarations are added to `keys`."""
         samples, data, size = [], expand_chunk(frame.body), _MESSAGE.size
         unpack = _MESSAGE.unpack_from
         for opcode, start, end in locate_records(data):
@@ -134,7 +130,7 @@ class Log:
                     raise ValueError("a message without its times")
                 number, sequence, log_time, wall_ns = unpack(data, start)
                 if number not in keys:
-                    raise ValueError(f"message on channel {number}, which nothing describes")
+                    raise ValueError(f"message on undeclared channel {number}")
                 if (key := keys[number]) is not None:
                     payload = data[start + size : end]
                     stamp_ns = log_time or _stamp_in(payload)
@@ -153,15 +149,12 @@ class Log:
 
 
 def log_file(path: Path) -> Path:
-    """The path of a log; of a run's folder, that of the log in it."""
+    """Path of a log, or of the log in a run's folder."""
     return path / IN_FOLDER if path.is_dir() else path
 
 
 def open_log(path: str | Path) -> Log:
-    """The log at `path`, or in the run's folder there; raises `LogError` when there is none.
-
-    Its parts are read as one log.
-    """
+    """Open the log at `path` or in that run's folder, with all parts; raises `LogError`."""
     path = log_file(Path(path))
     opened = [file for part in parts_of(path)[1:] if (file := open_part(part)) is not None]
     try:
@@ -174,19 +167,19 @@ def open_log(path: str | Path) -> Log:
 
 
 def log_of(files: Sequence[LogFile]) -> Log:
-    """The log of these files, one after another."""
+    """Log of consecutive files."""
     first, last = files[0], files[-1]
     return Log(first.path, first.team, last.complete, first.metadata, tuple(files))
 
 
 def _stamp_in(payload: bytes) -> int:
-    """The stamp in a message whose log time is zero: MCAP's times can not be negative."""
+    """Stamp of a message logged at zero: MCAP times cannot be negative."""
     unpacker = msgpack.Unpacker()
-    unpacker.feed(payload[:128])  # the tag and the stamp are within
+    unpacker.feed(payload[:128])  # tag and stamp are within
     try:
         unpacker.read_array_header()
         unpacker.skip()
         stamp = unpacker.unpack()
     except (ValueError, msgpack.UnpackException):
-        return 0  # not a message of ours: there is no stamp to restore
+        return 0  # a foreign message without stamp
     return stamp if isinstance(stamp, int) else 0

@@ -1,7 +1,7 @@
-"""Count a recorder's samples of each key, separately for each process that publishes on it.
+"""Count a recorder's samples of each key, by publishing process.
 
-A process counts its publications on a key from 0, so a process that was started again begins anew.
-Consecutive samples are one run; a gap that is filled later is a run of its own.
+A restarted process counts its publications from 0 again. Consecutive samples form a run; a gap
+filled later is another run.
 """
 
 from collections import defaultdict
@@ -12,12 +12,12 @@ from team.wire import messages as m
 from team.wire.bus import NO_COUNTER, Sample
 
 NUMBERED = (*ch.SENSORS, ch.SUBMAP)
-"""Channels whose messages have numbers of their own, which the recorder reports as progress."""
+"""Channels with numbered messages, which the recorder reports as progress."""
 
 
 @dataclass
 class _Run:
-    """Samples with the counters first … end − 1, whose wall clocks [ns] are first_ns … last_ns."""
+    """Samples with counters first … end − 1 and wall clocks [ns] first_ns … last_ns."""
 
     first: int
     end: int
@@ -26,13 +26,13 @@ class _Run:
 
 
 class Received:
-    """The samples of each key that is cached by its publisher, by their counters."""
+    """Received counters of each key that its publisher caches."""
 
     def __init__(self) -> None:
         self._runs: dict[str, list[_Run]] = defaultdict(list)
 
     def take(self, sample: Sample) -> None:
-        """Note a sample; one that came before changes nothing."""
+        """Register a sample; a repetition changes nothing."""
         found = ch.channel_of(sample.key)
         if sample.counter == NO_COUNTER or found is None or not _is_acknowledged(found[0]):
             return
@@ -48,15 +48,15 @@ class Received:
             runs.append(_Run(counter, counter + 1, wall_ns, wall_ns))
 
     def of_process(self, key: str, since_ns: int) -> tuple[int, int]:
-        """The number of samples on a key of the process that began then, and its next counter."""
+        """Number of samples of the process that began then, and its next counter."""
         runs = [run for run in self._runs.get(key, ()) if run.first_ns >= since_ns]
         return sum(run.end - run.first for run in runs), max((run.end for run in runs), default=0)
 
     def lacking(self, tally: m.Tally, awaited: set[str]) -> dict[str, int]:
-        """The keys of a process of which samples are lacking, each with the number that is there.
+        """Keys of a process with missing samples, each with the number received.
 
-        awaited: keys with samples that their publisher may still have. For other keys the
-        newest sample is enough: earlier ones are gone.
+        awaited: keys whose publisher may still have samples. Other keys need only the newest
+        sample.
         """
         found = {}
         for key, count in zip(tally.keys, tally.counts, strict=True):

@@ -1,10 +1,9 @@
-"""Write samples into an MCAP file, with their payload bytes unchanged.
+"""Write samples into an MCAP file with unchanged payload bytes.
 
-Channel: the full key, encoding `msgpack`, the JSON Schema of its message; for a view, encoding and
-    schema of the tools that draw it. Log time: team time. Publish time: the publisher's wall clock.
-    Sequence: its counter modulo 2³². MCAP's times are unsigned: a stamp before zero is logged at
-    zero; the reader takes its true value from the payload. The metadata record "teamslam" describes
-    the run and the program that wrote the log.
+Channel: full key, encoding `msgpack`, JSON Schema of its message; views use the encoding and schema
+of their viewers. Log time: team time. Publish time: publisher's wall clock. Sequence: counter
+modulo 2³². MCAP times are unsigned: a stamp before zero is logged at zero, and the reader restores
+it from the payload. The metadata record "teamslam" describes run and program.
 """
 
 import threading
@@ -26,32 +25,30 @@ from team.wire.messages import tag_of
 
 METADATA = "teamslam"
 CHUNK_NS = 500_000_000
-"""Largest span of recorded time (the publishers' wall clocks) in one chunk, since a flipped bit
-costs a chunk …
-"""
+"""Largest span of wall time in a chunk, since a flipped bit costs a chunk …"""
 CHUNK_LEAST = 16
 """… unless the chunk has fewer messages than this."""
 MOST_CHANNELS = 60_000
-"""Number of keys in a log; MCAP numbers them by 16 bits."""
+"""Most keys of a log; MCAP numbers them with 16 bits."""
 FLUSH_S = 0.5
-"""Seconds between flushes: what a killed recorder can lose."""
+"""Seconds between flushes: the loss of a killed recorder."""
 
 
 class RecorderError(RuntimeError):
-    """The log can not be written: the file exists, the folder does not, the disk is full."""
+    """The log cannot be written: existing file, missing folder, full disk."""
 
 
 class Count(NamedTuple):
-    """Number and bytes of the messages of one key in the log."""
+    """Number and bytes of a key's messages."""
 
     messages: int
     bytes: int
 
 
 class Recorder:
-    """Write one log, on a thread of its own, whose errors are raised by the next call.
+    """Write one log on a thread, whose errors are raised by the next call.
 
-    Raises `RecorderError` when the file can not be created; it never overwrites one.
+    Raises `RecorderError` if the file cannot be created or exists.
     """
 
     def __init__(self, path: str | Path, team: str, metadata: Mapping[str, str]) -> None:
@@ -66,7 +63,7 @@ class Recorder:
         self._span = (2**63, 0)
         self._closed = False
         self.dropped = 0
-        """Number of samples that were not written, since the log has MOST_CHANNELS keys already."""
+        """Number of samples dropped beyond MOST_CHANNELS keys."""
         try:
             self._file: IO[bytes] = self.path.open("xb")
             self._writer = _opened_writer(self._file, {**metadata, "team": team})
@@ -74,7 +71,7 @@ class Recorder:
             raise RecorderError(f"{self.path} exists: choose another name or remove it") from None
         except OSError as error:
             raise RecorderError(f"{self.path}: {error.strerror}; choose another place") from error
-        # A daemon: a program that dies without `close` must end, and loses half a second at most.
+        # Daemon: a program that dies without `close` must end; it loses half a second at most.
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -85,7 +82,7 @@ class Recorder:
         self.close()
 
     def write(self, samples: Iterable[Sample]) -> None:
-        """Queue samples for the writing thread; raises `RecorderError` once that has failed."""
+        """Queue samples for the thread; raises `RecorderError` after its failure."""
         self._check()
         if self._closed:
             raise RecorderError(f"{self.path} is closed")
@@ -93,15 +90,15 @@ class Recorder:
             self._queue.put(sample)
 
     def counts(self) -> dict[str, Count]:
-        """Messages and payload bytes written so far, by relative key."""
+        """Messages and bytes written so far, by relative key."""
         return dict(self._counts)
 
     def waiting(self) -> int:
-        """Number of samples that are queued and not written yet."""
+        """Number of queued samples."""
         return self._queue.qsize()
 
     def close(self) -> None:
-        """Write the queued samples, then the index; raises `RecorderError` if that failed."""
+        """Write queued samples, then the index; raises `RecorderError` on failure."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)
@@ -141,10 +138,9 @@ class Recorder:
                 flushed, unflushed = time.monotonic(), False
 
     def _bound_chunk(self, sample: Sample) -> None:
-        """End the chunk before it spans more than CHUNK_NS of recorded time.
+        """End the chunk before it spans more than CHUNK_NS of wall time.
 
-        A flipped bit costs a chunk. Late samples, out of their order, may make a chunk of
-        CHUNK_LEAST messages span more.
+        Late samples may make a chunk of CHUNK_LEAST messages span more.
         """
         first, last = self._span
         first, last = min(first, sample.wall_ns), max(last, sample.wall_ns)
@@ -174,8 +170,8 @@ class Recorder:
         self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
     def _tag(self, sample: Sample) -> str:
-        """The tag of the message, on a key with several types of messages: each type is
-        declared. A tag that is none of the channel's counts as that of its first type.
+        """Tag of a message on a key with several types, each declared; an unknown tag counts as the
+        first type.
         """
         found = channel_of(sample.key)
         if found is None or not found[0].alternatives:
@@ -184,7 +180,7 @@ class Recorder:
 
     def _register(self, key: str, tag: str) -> int:
         declaration = declaration_of(key, tag)
-        if declaration is None:  # of no row: kept as it is, verified by nobody
+        if declaration is None:  # undeclared key: kept unchanged, unverified
             return self._writer.register_channel(self._prefix + key, "", 0)
         if declaration.schema not in self._schemas:
             number = self._writer.register_schema(
@@ -196,16 +192,14 @@ class Recorder:
 
 
 def _opened_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:
-    """A writer that has written its header and the metadata, so that a log whose recorder is killed
-    has them.
-    """
+    """Open a writer and write header and metadata first, for a log whose recorder is killed."""
     writer = Writer(file)
     try:
         writer.start(profile="teamslam")
         writer.add_metadata(METADATA, metadata)
         _flush(writer)
     except OSError:
-        with suppress(OSError):  # the same error once more, from what is still buffered
+        with suppress(OSError):  # the same error again, from buffered data
             file.close()
         raise
     return writer

@@ -1,7 +1,7 @@
-"""Read the records of an MCAP file, one after another, as untrusted input.
+"""Read an MCAP file's records as untrusted input.
 
-Every length and every chunk's CRC is checked before use, and a chunk that claims a larger expanded
-size than a recorder can have written is refused before it is expanded.
+Every length and chunk CRC is checked before use; a chunk that claims an impossible expanded size is
+refused.
 """
 
 import os
@@ -22,40 +22,32 @@ from mcap.writer import MCAP0_MAGIC
 from team.wire.codec import LARGEST_PAYLOAD
 
 LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
-"""Largest size in bytes of an expanded chunk: the largest message behind a chunk that was almost
-full.
-"""
+"""Largest expanded chunk [bytes]: the largest message behind an almost full chunk."""
 LARGEST_RATIO = 10_000
-"""Largest ratio of expanded to compressed bytes; a map of zeros reaches a thousand, a decompression
-bomb ten thousands.
+"""Largest expansion ratio; a map of zeros reaches a thousand, a decompression bomb ten
+thousands.
 """
 MOST_RECORDS = 250_000
-"""Largest number of records of a chunk: a recorder's chunk of one MiB has 34 000 of the smallest
-messages.
-"""
+"""Most records of a chunk: a recorder's 1 MiB chunk has 34 000 of the smallest messages."""
 _FRAME = struct.Struct("<BQ")
 _BLOCK = 2**20
 _AHEAD = 4096
 _OPCODES = frozenset((*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)))
 _LENGTHS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
-"""Sizes of the records at the end of a file: a flipped bit can turn a chunk's opcode into one of
-them.
-"""
+"""Record sizes at a file's end: a flipped bit can turn a chunk's opcode into one of them."""
 _COMPRESSION = b"\x04\0\0\0zstd"
-"""Bytes in the head of each chunk that our recorder writes …"""
+"""Bytes in the head of each chunk of our recorder …"""
 _TO_COMPRESSION = _FRAME.size + 28
-"""… and their distance from its beginning: opcode, length, two times, size and checksum."""
+"""… and their offset: opcode, length, two times, size and checksum."""
 FRAME_SIZE = _FRAME.size
 FOOTER_SIZE = FRAME_SIZE + 20
 MALFORMED = (McapError, UnicodeDecodeError, OverflowError, struct.error)
-"""The exceptions of mcap for a record whose content does not fit its opcode."""
+"""mcap's exceptions for a record that does not fit its opcode."""
 REPAIR = "`teamslam repair` saves the rest"
 
 
 class LogError(ValueError):
-    """A file that is no log of ours, or a damaged one: gives the file, the defect and the
-    remedy.
-    """
+    """A foreign or damaged file; the text has file, defect and remedy."""
 
     def __init__(self, path: Path, what: str, remedy: str) -> None:
         super().__init__(f"{path}: {what}; {remedy}")
@@ -65,11 +57,11 @@ class LogError(ValueError):
 
 
 class DamagedChunkError(LogError):
-    """One chunk can not be read; later ones can, by `Log.chunks`."""
+    """Unreadable chunk; `Log.chunks` continues after it."""
 
 
 class Frame(NamedTuple):
-    """One record: its position, its opcode and its bytes."""
+    """Record: position, opcode, bytes."""
 
     offset: int
     opcode: int
@@ -77,14 +69,14 @@ class Frame(NamedTuple):
 
 
 def read_index(file: IO[bytes], path: Path) -> Iterator[Frame]:
-    """The records of the summary section, which begins where the footer says (0: there is none)."""
+    """Records of the summary section, located by the footer (0: none)."""
     file.seek(_FRAME.size - FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
     (start,) = struct.unpack("<Q", file.read(8))
     return read_frames(file, path, start) if start else iter(())
 
 
 def check_index(file: IO[bytes]) -> str | None:
-    """The defect of a complete file's index; None when its CRC fits its bytes.
+    """Defect of a complete file's index; None if its CRC fits.
 
     The CRC spans the summary section and the footer up to the CRC itself; 0: none was written.
     """
@@ -104,10 +96,10 @@ def check_index(file: IO[bytes]) -> str | None:
 
 
 def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
-    """The whole records of the file from `start`; a record that is cut off ends it.
+    """Whole records of the file from `start`, up to a truncated one.
 
-    Where the bytes at a record's place are no record, its length or the one before it is damaged:
-    reading continues at the next chunk that can be found.
+    Invalid bytes mean that their length or the one before is damaged: reading continues at the next
+    chunk found.
     """
     size = os.fstat(file.fileno()).st_size
     if start > size:
@@ -132,7 +124,7 @@ def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> I
 
 
 def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
-    """Position of the next chunk record, recognised by the bytes of its head."""
+    """Position of the next chunk record, recognised by its head."""
     file.seek(start)
     tail, begin, ahead = b"", start, _AHEAD
     while block := file.read(ahead):
@@ -152,19 +144,16 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
 
 
 def read_records(data: bytes) -> Iterator[Frame]:
-    """The records of an expanded chunk; raises ValueError where one exceeds it or there are too
-    many.
+    """Records of an expanded chunk; raises ValueError if one exceeds it or there are too many.
 
-    Small records take many times their size as Python objects, so their number is bounded as well.
+    The number is bounded because small records grow many times as Python objects.
     """
     for opcode, start, end in locate_records(data):
         yield Frame(start - FRAME_SIZE, opcode, data[start:end])
 
 
 def locate_records(data: bytes) -> list[tuple[int, int, int]]:
-    """The opcode of each record of an expanded chunk, and its first and last byte; raises as
-    `read_records`.
-    """
+    """Opcode, first and last byte of each record of an expanded chunk; raises as `read_records`."""
     found: list[tuple[int, int, int]] = []
     offset, size, head = 0, len(data), _FRAME.size
     unpack, most = _FRAME.unpack_from, MOST_RECORDS
@@ -181,10 +170,10 @@ def locate_records(data: bytes) -> list[tuple[int, int, int]]:
 
 
 def expand_chunk(body: bytes) -> bytes:
-    """The records in a chunk record's body.
+    """Expand a chunk record's body.
 
-    Raises ValueError, before anything is expanded, for a body that our recorder can not have
-    written; one of `MALFORMED` where it is no chunk; `ZstdError` where it is damaged.
+    Raises ValueError, before expansion, for a body that our recorder cannot have written; one of
+    `MALFORMED` if it is no chunk; `ZstdError` if damaged.
     """
     chunk = cast(Chunk, Chunk.read(ReadDataStream(BytesIO(body))))
     size, packed = chunk.uncompressed_size, len(chunk.data)

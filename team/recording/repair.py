@@ -1,6 +1,4 @@
-"""Repair a log: copies the undamaged chunks of a damaged or unfinished log to a new, complete
-one.
-"""
+"""Copy the undamaged chunks of a damaged or unfinished log to a complete one."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,13 +9,11 @@ from team.recording.recorder import Recorder
 from team.wire.bus import Sample
 
 REPAIRED = "repaired"
-"""Name of the metadata that marks a log as made of an unfinished one, and names that one."""
+"""Metadata name that marks a repaired log, with the original."""
 
 
 class Report(NamedTuple):
-    """The result of a repair: messages copied, newest team time among them [ns], chunks that were
-    lost.
-    """
+    """Messages copied, their newest team time [ns], and lost chunks."""
 
     messages: int
     until_ns: int | None
@@ -25,20 +21,18 @@ class Report(NamedTuple):
 
 
 def read_undamaged(log: Log) -> Iterator[list[Sample] | LogError]:
-    """The samples of every undamaged chunk; in the place of a damaged one its error, which is not
-    raised.
-    """
+    """Samples of every undamaged chunk; a damaged one yields its error."""
     try:
         yield from log.chunks()
-    except LogError as error:  # nothing behind this place can be found any more
+    except LogError as error:  # nothing further can be located
         yield error
 
 
 def repair_log(path: str | Path, out: str | Path) -> Report:
-    """Copy every undamaged chunk of the log at `path` to a new, complete log `out`.
+    """Copy every undamaged chunk of a log to a new, complete log `out`.
 
-    The metadata is copied; of a log that its recorder did not finish with a note. Raises `LogError`
-    when `path` is no log, `RecorderError` when `out` exists.
+    Metadata is copied, with a note for an unfinished log. Raises `LogError` if `path` is no log,
+    `RecorderError` if `out` exists.
     """
     log = open_log(path)
     messages, until_ns = 0, None

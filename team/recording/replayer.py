@@ -1,4 +1,4 @@
-"""The times at which a log's samples are published again: a function of their stamps alone."""
+"""Replay schedule of a log's samples: a function of their stamps alone."""
 
 from collections.abc import Iterable, Iterator
 
@@ -8,9 +8,9 @@ from team.wire.bus import Sample
 def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:
     """(delay [s] after the previous one, sample), in the given order, at `speed` × team time.
 
-    delay = max(0, t − newest stamp so far)/speed: a sample that is older than an earlier one is
-    published at once, and the delays add up to the team time that has passed. The first one is
-    published at once. At infinite speed there is no delay. Raises ValueError unless speed > 0.
+    delay = max(0, t − newest stamp so far)/speed: late samples and the first one are published at
+    once, and delays sum to the elapsed team time. Infinite speed has no delay. Raises ValueError
+    unless speed > 0.
     """
     if not speed > 0.0:
         raise ValueError(f"out of bounds: speed {speed} is not positive")

@@ -1,7 +1,7 @@
-"""JSON Schemas of the messages, so that any MCAP viewer can interpret a log.
+"""JSON Schemas of the messages, for any MCAP viewer.
 
-A schema describes the MessagePack array position by position. Fields with `contentEncoding: base64`
-are encoded as MessagePack `bin`: little-endian numbers, see docs/wire.md.
+A schema describes the MessagePack array by position. Fields with `contentEncoding: base64` are
+MessagePack `bin` of little-endian numbers, see docs/wire.md.
 """
 
 import json
@@ -15,12 +15,12 @@ from team.wire.views import json_schema, view_of
 
 
 def schema_of(message: type[Message]) -> bytes:
-    """The JSON Schema of one message as UTF-8 bytes, the same for the same class."""
+    """JSON Schema of a message as UTF-8 bytes, deterministic."""
     return json.dumps(msgspec.json.schema(message), sort_keys=True).encode()
 
 
 class Declaration(NamedTuple):
-    """How a log declares a key: the encoding of its payloads, and their schema's name and text."""
+    """A key's payload encoding, schema name and text."""
 
     encoding: str
     schema: str
@@ -29,9 +29,9 @@ class Declaration(NamedTuple):
 
 
 def declaration_of(key: str, tag: str = "") -> Declaration | None:
-    """The declaration of a relative key of the team; None for a key without a row in the table.
+    """Declaration of a relative key; None for a key without a row in the table.
 
-    tag: of the message, where the key carries more than one type.
+    tag: the message's, if the key has several types.
     """
     found = channel_of(key)
     if found is not None:
@@ -41,7 +41,7 @@ def declaration_of(key: str, tag: str = "") -> Declaration | None:
     if view is None:
         return None
     if isinstance(view.schema, str):
-        import foxglove.messages  # 50 ms that a log without views does not need
+        import foxglove.messages  # 50 ms, needed for views only
 
         kind_there = getattr(foxglove.messages, view.schema.removeprefix("foxglove."))
         schema = kind_there.get_schema()

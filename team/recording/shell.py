@@ -1,4 +1,4 @@
-"""The processes `record` and `replay`: a bus and a clock around the recorder and the reader."""
+"""Processes `record` and `replay`: bus and clock around recorder and reader."""
 
 import logging
 import threading
@@ -52,11 +52,11 @@ from team.wire.patience import Patience
 
 NODE = "recorder"
 PROGRESS_EVERY = 256
-"""Number of measurements of a robot between two progress reports while the queue is busy."""
-_FAR_BEHIND = 20_000  # samples: the disk takes half a second for as many
+"""Measurements of a robot between progress reports under load."""
+_FAR_BEHIND = 20_000  # samples that the disk writes in half a second
 _WAIT_S = 0.05
 _PACE_S = 0.01
-"""What comes is taken by turns of this length: a turn for each message costs a third more CPU."""
+"""Length of a receive turn; a turn per message costs a third more CPU."""
 _QUIET_S = 0.5
 _STATUS_S = 1.0
 _REMIND_S = 10.0
@@ -65,19 +65,16 @@ _LOG = logging.getLogger("teamslam")
 
 
 More = Callable[[], tuple[Recorder, Inventory]]
-"""Opens a further part of a log, with the inventory of the earlier ones. Raises `RecorderError`."""
+"""Opens a further part of a log, with the earlier inventory. Raises `RecorderError`."""
 
 
 class RecordLoop:
-    """Writes each sample from a bus once, requests missing ones, and reports progress.
+    """Write each bus sample once, request missing ones, and report progress.
 
-    The log also receives the recorder's own observations: `Liveliness` of the others, at the newest
-    team time seen, and its own status.
-    inventory: of the earlier parts of the log.
-    more: opens the next part of a log that could not be written any more; without it the error is
-        raised.
-    peers: of a team whose robots are peers, these: it ends where each of them has concluded, but
-        for those that an operator has given up or withdrawn. Any team ends with its centre's map.
+    The log also receives the recorder's observations: `Liveliness` of the others, at the newest
+    team time, and its own status. inventory: of earlier parts. more: opens the next part after a
+    write error; without it the error is raised. peers: recording ends when each has concluded, or
+    was given up or withdrawn. The centre's final map ends any team.
     """
 
     def __init__(
@@ -113,18 +110,18 @@ class RecordLoop:
         orders = tuple(channel.name for channel in ORDERS if channel.recorded)
         bus.request(
             KEPT, "", KeptRequest(stamp_ns=0, channels=orders)
-        )  # who gave them may have left
+        )  # their publisher may have left
         bus.watch_alive()
         bus.declare_alive(NODE)
 
     @property
     def written(self) -> int:
-        """Number of messages written to the log."""
+        """Number of messages written."""
         return self._messages + self._statuses
 
     @property
     def finished(self) -> bool:
-        """Whether the final map is in the log and no other process is present."""
+        """Whether the final map is logged and no other process is present."""
         return self._has_ended and not self._alive
 
     @property
@@ -132,11 +129,10 @@ class RecordLoop:
         return self._has_map or (self._are_peers and not self._unconcluded)
 
     def take(self, samples: list[Sample]) -> None:
-        """Write these samples; report the progress of the robots that are due, or of all where
-        there are no samples.
+        """Write samples; report progress of due robots, or of all without samples.
 
-        A new submap is reported at once: its robot does not leave before it is in the log. Progress
-        is credit: while the writing thread is far behind, nothing is reported.
+        A new submap is reported at once, since its robot stays until then. Progress is credit: a
+        writing thread far behind stops the reports.
         """
         noted = [(each, self._noted(each)) for each in samples if row_of(each.key) is not None]
         self._dropped += len(samples) - len(noted)
@@ -166,7 +162,7 @@ class RecordLoop:
         return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
 
     def _noted_tally(self, sample: Sample) -> Tally | None:
-        """Store the totals of a leaving process; None for other samples."""
+        """Store a leaving process's totals; None for other samples."""
         if TALLY.owner(sample.key) is None:
             return None
         with suppress(WireError):
@@ -177,13 +173,13 @@ class RecordLoop:
         return None
 
     def _report_lacking(self, tally: Tally) -> None:
-        """Report to a leaving process the messages of it that the log lacks."""
+        """Report to a leaving process its messages that the log lacks."""
         found = self._inventory.received.lacking(tally, self._bus.awaited())
         has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
         self._bus.publish(Outgoing(RECORDED, tally.node, has))
 
     def _write(self, samples: list[Sample]) -> None:
-        """Write to the log where that is possible; the run continues without it."""
+        """Write to the log if possible; the run continues otherwise."""
         if self._recorder is None:
             return
         try:
@@ -201,9 +197,7 @@ class RecordLoop:
         self._retry_s = time.monotonic() + _RETRY_S
 
     def _go_on(self, now_s: float) -> None:
-        """Open a new part of a log that could not be written; the samples missed meanwhile are
-        requested.
-        """
+        """Open a new part after a write error; missed samples are requested."""
         if self._recorder is not None or self._more is None or now_s < self._retry_s:
             return
         self._retry_s = now_s + _RETRY_S
@@ -218,12 +212,12 @@ class RecordLoop:
         _LOG.warning("recording goes on in %s", self._recorder.path)
 
     def write_scenario(self, scenario: Sequence[Configuration]) -> None:
-        """Write the configurations of a team without a world, which a world would publish."""
+        """Write configurations in place of an absent world."""
         announced = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
         self._write([each for each in announced if self._inventory.is_new(each)])
 
     def close(self) -> None:
-        """Complete the log; raises `RecorderError` if it can not be written."""
+        """Complete the log; raises `RecorderError`."""
         try:
             if self._recorder is not None:
                 self._recorder.close()
@@ -233,9 +227,7 @@ class RecordLoop:
             raise self._failure
 
     def request_missing(self, now_s: float) -> None:
-        """Request the messages that have been missing for a while from sources and robots, without
-        waiting for replies.
-        """
+        """Request long-missing messages from sources and robots, without blocking."""
         self._go_on(now_s)
         for stream in self._patience.due(self._inventory.gaps, now_s):
             kind, robot, incarnation = stream
@@ -262,7 +254,7 @@ class RecordLoop:
 
     @property
     def lacking(self) -> list[str]:
-        """The messages that the log lacks, in words."""
+        """Missing messages, as text."""
         numbered = [f"{key}: {what}" for key, what in self._inventory.findings()]
         others = [
             f"{key}: {intervals(lost)}"
@@ -289,7 +281,7 @@ class RecordLoop:
     def _noted_alive(self, sample: Sample, node: str) -> Sample:
         try:
             came = _is_alive(sample.payload)
-        except WireError as error:  # a name of no node: recorded unchanged
+        except WireError as error:  # not a node name: recorded unchanged
             _LOG.warning("%.80s: %s", sample.key, error)
             return msgspec.structs.replace(sample, stamp_ns=self._newest_ns)
         (self._alive.add if came else self._alive.discard)(node)
@@ -300,7 +292,7 @@ class RecordLoop:
         return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
     def check_end(self, end: TheEnd) -> None:
-        """Request an end that was missed, and remove processes that left unannounced."""
+        """Request a missed end, and remove processes that left unannounced."""
         missed = end.missed()
         if missed and not self._has_ended:
             self.take(missed)
@@ -308,9 +300,7 @@ class RecordLoop:
             self._alive = {node for node in self._alive if self._bus.is_alive(node)}
 
     def status(self, *, last: bool = False) -> Status:
-        """Publish and log the recorder's status; the last one lists the messages that the log
-        lacks.
-        """
+        """Publish and log the recorder's status; the last one lists missing messages."""
         for tally in [] if last or self._is_far_behind else self._leaving.values():
             self._report_lacking(tally)
         waiting = 0 if self._recorder is None else self._recorder.waiting()
@@ -346,16 +336,11 @@ def record(
     scenario: Sequence[Configuration] = (),
     peers: Collection[str] = (),
 ) -> int:
-    """Record until the final map is present and all other nodes have left, or until `stop`; then
-    closes.
+    """Record until the final map is present and all nodes have left, or until `stop`; then close.
 
-    Returns the number of messages written.
-    expected: nodes whose absence is a warning in the status.
-    inventory, more: the inventory of earlier parts of the log, and the function that opens the next
-        one when this one can not be written.
-    scenario: for a team without a world, the configurations that stand in its place in the log.
-    peers: as `RecordLoop`.
-    Raises `RecorderError` when the log can not be written: at once without `more`, else at the end.
+    Returns the number of messages written. expected: nodes whose absence is a warning. inventory,
+    more, peers: as `RecordLoop`. scenario: configurations logged for a team without a world. Raises
+    `RecorderError` on a write error: at once without `more`, else at the end.
     """
     stop = threading.Event() if stop is None else stop
     loop = RecordLoop(bus, recorder, expected, inventory, more, peers)
@@ -366,7 +351,7 @@ def record(
         end = TheEnd(bus, NODE, ENDS if peers else (FINAL_MAP,))
         while not stop.is_set():
             if loop.finished:
-                # A token has a higher priority than data: overtaken messages still arrive.
+                # A token has priority over data: overtaken messages still arrive.
                 if not (samples := bus.receive(_QUIET_S)):
                     break
                 loop.take(samples)
@@ -390,10 +375,10 @@ def record(
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:
-    """Publish samples again, with the same bytes, at `speed` × team time; returns their number.
+    """Publish samples, bytes unchanged, at `speed` × team time until done or `stop`; returns their
+    number.
 
-    Each sample is due at a time relative to the first one, so that delays do not accumulate. Ends
-    when `stop` is set.
+    Due times are relative to the first sample, so delays do not accumulate.
     """
     due = time.monotonic()
     published = 0

@@ -1,6 +1,4 @@
-"""Summarise a log: messages, bytes, rates and times of each key, and the span of its
-measurements.
-"""
+"""Summarise a log: messages, bytes, rates and times by key, and the measurement span."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,12 +9,12 @@ from team.wire.bus import Sample
 from team.wire.channels import SENSORS, VIEW, channel_of
 
 FOREIGN = "(no channel)"
-"""The channel of a key without a row in the table."""
+"""Channel of a key without a row in the table."""
 
 
 @dataclass
 class KeySummary:
-    """Messages, payload bytes and team times [ns] of one key; first_ns ≤ last_ns."""
+    """Messages, payload bytes and team times [ns] of a key; first_ns ≤ last_ns."""
 
     key: str
     channel: str
@@ -33,7 +31,7 @@ class KeySummary:
         return (self.messages - 1) * 1e9 / (self.last_ns - self.first_ns)
 
     def take(self, sample: Sample) -> None:
-        """Count one more sample."""
+        """Count a sample."""
         self.messages += 1
         self.bytes += len(sample.payload)
         self.first_ns = min(self.first_ns, sample.stamp_ns)
@@ -41,16 +39,15 @@ class KeySummary:
 
 
 class Summary(NamedTuple):
-    """The keys in the order of their first message, and the defects of the log."""
+    """Keys by first message, and defects of the log."""
 
     keys: tuple[KeySummary, ...]
     damaged: tuple[str, ...]
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Team time of the first and the last measurement; of any message where there is no
-        measurement.
+        """Team time of the first and last measurement, else of any message.
 
-        A configuration is announced at team time zero, long before the measurements of a data set.
+        Configurations are stamped zero, long before a data set's measurements.
         """
         sensors = {channel.name for channel in SENSORS}
         chosen = [each for each in self.keys if each.channel in sensors] or self.keys
@@ -60,7 +57,7 @@ class Summary(NamedTuple):
 
 
 def summarise_log(log: Log) -> Summary:
-    """Summarise every whole chunk of a log, damaged or not, in one pass."""
+    """Summarise every whole chunk of a possibly damaged log in one pass."""
     found: dict[str, KeySummary] = {}
     damaged = []
     for chunk in read_undamaged(log):

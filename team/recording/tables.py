@@ -1,6 +1,6 @@
-"""A log as tables: one per channel, one row per message, whatever the file format.
+"""A log as tables: one per channel, one row per message, in any file format.
 
-Columns: key, counter, wall_ns, then the message's fields by name.
+Columns: key, counter, wall_ns, then the message's fields.
 """
 
 from collections.abc import Callable, Collection, Iterator
@@ -32,12 +32,12 @@ _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "signature": octets,
     "sha256": octets,
 }
-"""The decoder of a field's bytes, by the field's name; all other fields are floats."""
+"""Decoder of a field's bytes by name; other fields are floats."""
 
 
 @dataclass
 class Exported:
-    """The number of rows of each written file, and of unsound messages, which are in no file."""
+    """Rows of each written file, and number of invalid messages, which are omitted."""
 
     rows: dict[Path, int] = field(default_factory=dict)
     unsound: int = 0
@@ -45,10 +45,7 @@ class Exported:
     def messages(
         self, log: Log, channels: Collection[Channel] | None
     ) -> Iterator[tuple[Sample, Channel, Message]]:
-        """Every sound message of the given channels (None: all); the others are counted.
-
-        Views have no fields of the team's messages and are left out.
-        """
+        """Valid messages of the channels (None: all), without views; others are counted."""
         for sample in log.samples(channels):
             if channel_of(sample.key) is None:
                 continue
@@ -61,16 +58,16 @@ class Exported:
 
 
 def table_of(channel: Channel, message: Message) -> str:
-    """The table's name: the channel's; of an alternative message on its key, the message's."""
+    """Table name: the channel's, or an alternative message's."""
     kind = type(message)
     return channel.name if kind is channel.message else tag_of(kind).partition("/")[0]
 
 
 def numbers_of(name: str, value: bytes) -> NDArray[Any]:
-    """The numbers in the bytes of a message's field."""
+    """Numbers in a field's bytes."""
     return _ARRAYS.get(name, floats)(value, name)
 
 
 def type_of_numbers(name: str) -> str:
-    """The type of these numbers, in NumPy's notation."""
+    """NumPy type of a field's numbers."""
     return str(numbers_of(name, b"").dtype)

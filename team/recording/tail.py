@@ -1,4 +1,4 @@
-"""Follow a log: its samples while its recorder writes them, chunk by chunk."""
+"""Follow a log while it is written, chunk by chunk."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,16 +11,14 @@ from team.recording.records import FRAME_SIZE, MALFORMED, read_frames
 from team.wire.bus import Sample
 
 MOST = 20_000
-"""Number of samples that one call returns at most, about."""
+"""Approximate limit on samples per call."""
 
 
 @dataclass
 class Tail:
-    """Read a log that may still grow, or does not exist yet; no sample is returned twice.
+    """Read a log that may grow or not exist yet; each sample is returned once.
 
-    log: once it exists.
-    ended: whether its recorder has finished it, and all of it is read.
-    damaged: number of chunks that could not be read.
+    log: set once it exists. ended: finished and fully read. damaged: number of unreadable chunks.
     """
 
     path: Path
@@ -31,9 +29,7 @@ class Tail:
     _keys: dict[int, str | None] = field(default_factory=dict)
 
     def more(self) -> list[Sample]:
-        """The samples of whole chunks written since; at most about MOST. Raises `LogError` for no
-        log.
-        """
+        """Newly written samples of whole chunks, about MOST at most. Raises `LogError`."""
         if self.ended or (self.log is None and not self._opened()):
             return []
         assert self.log is not None
@@ -56,7 +52,7 @@ class Tail:
         return found
 
     def _opened(self) -> bool:
-        """Whether the log exists; its recorder writes its header at once."""
+        """Whether the log exists; its header is written at once."""
         if not self.path.exists() or self.path.stat().st_size == 0:
             return False
         try:
@@ -69,4 +65,4 @@ class Tail:
 
 
 _HEAD = 65_536
-"""Size in bytes above which a file that is no log will not become one."""
+"""File size [bytes] from which an invalid file cannot become a log."""

@@ -384,7 +384,7 @@ def test_a_driver_of_a_team_that_is_not_there_names_those_that_are(tmp_path, cap
         status = CliRunner().invoke(
             app, ["status", "--team", "lap2", "--connect", endpoint, "--seconds", "0.5"]
         )
-        assert f"nobody of the team lap2 is at {endpoint}, but of lab, lap:" in status.output
+        assert f"no node of the team lap2 is at {endpoint}, but of lab, lap:" in status.output
         mistaken.close()
         there.close()
     assert "r1: nobody" not in caplog.text

@@ -138,7 +138,7 @@ FOUND: dict[str, tuple[list[Sample], list[str]]] = {
     ),
     "a measurement twice, with other contents": (
         [*ONE, OTHER],
-        ["source/alpha: 1 measurements of incarnation 1 there twice, and not the same"],
+        ["source/alpha: 1 measurements of incarnation 1 present twice with different contents"],
     ),
     "the last words of the recorder": (
         [*ONE, status(0, node="recorder", warnings=("missing: robot/alpha/team/pose: 7",))],

@@ -101,7 +101,7 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
     assert result["given_up"] == ["robot-r1"]
     assert result["restarts"] == {"robot-r1": FRUITLESS - 1}, launch.said()
     texts = "\n".join(result["failures"])
-    assert "it died 5 times without getting any further, and is given up" in texts
+    assert "it died 5 times without progress, and is given up" in texts
     assert "the final map is provisional: r1 lost, and not wholly in it" in texts
     exits = {name: process["exit"] for name, process in result["processes"].items()}
     assert exits == {
@@ -128,7 +128,7 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
     os.kill(pid, signal.SIGSTOP)
     assert await launch.ended() == 0, launch.said()
     await team.none_left(0.0)
-    assert f"world (pid {pid}) is stopped (SIGSTOP?) and has said nothing for" in launch.said()
+    assert f"world (pid {pid}) is stopped (SIGSTOP?) and has sent no message for" in launch.said()
     assert json.loads((team.folder / "result.json").read_text())["restarts"] == {"world": 1}
     samples = open_log(folder / "log.mcap").samples([ch.FINAL_MAP])
     assert final_map([(s.key, s.payload) for s in samples]) == map_in_memory(

@@ -1,8 +1,8 @@
-"""Scores data association by labels that no estimator has seen.
+"""Score data association with labels that no estimator receives.
 
-A landmark's label is that of the majority of its *labelled* detections; unlabelled detections do
-not count. Pairs are counted by detections: two of one label in one landmark are a right pair, two
-of one label in two landmarks a missed one, two of two labels in one a wrong one.
+A landmark takes the majority label of its *labelled* detections; unlabelled ones do not count.
+Pairs of detections: same label and landmark is right, same label in two landmarks is missed, two
+labels in one landmark is wrong.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -18,15 +18,13 @@ from team.wire import messages as m
 from team.wire.arrays import ids, stamps
 
 Place = tuple[str, int, int, int]
-"""Robot, incarnation, sequence of the submap, number of the landmark in it."""
+"""Robot, incarnation, sequence of the submap, landmark number in it."""
 UNKNOWN = int(m.NO_LABEL)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """Pairwise precision and recall over labelled detections, and the number of wrong
-    detections.
-    """
+    """Pairwise precision and recall over labelled detections, and the number of wrong ones."""
 
     right: int
     wrong: int
@@ -36,39 +34,37 @@ class Pairs:
 
     @property
     def precision(self) -> float | None:
-        """The share of right pairs among the associated ones."""
+        """Share of right pairs among associated pairs."""
         associated = self.right + self.wrong
         return self.right / associated if associated else None
 
     @property
     def recall(self) -> float | None:
-        """The share of associated pairs among those of one label."""
+        """Share of associated pairs among pairs of one label."""
         real = self.right + self.missed
         return self.right / real if real else None
 
     @property
     def f1(self) -> float | None:
-        """The harmonic mean of both."""
+        """Harmonic mean of precision and recall."""
         total = 2 * self.right + self.wrong + self.missed
         return 2.0 * self.right / total if total else None
 
     @property
     def wrong_percent(self) -> float | None:
-        """Detections whose label is not that of their landmark, of all labelled ones."""
+        """Percentage of labelled detections whose label is not their landmark's."""
         return 100.0 * self.wrong_detections / self.detections if self.detections else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class AssociationResult:
-    """The scores of a run: between all its detections, inside windows, and of the map.
+    """Association scores of a run: over all detections, inside windows, and of the map.
 
-    label_of: the label of each of the map's unnamed landmarks; UNKNOWN where there is none.
-    duplicates: landmarks beyond the first of a label; confirmed: those of them with at least two
-    submaps, and all of an estimator without submaps; shown: those of them that the final map has.
-    merges_right, merges_wrong: pairs of robots
-    that share landmarks in the map, by whether at least half of those that have labels from both
-    are one; merges_refused: attempts that wait. left_out: labelled detections that are in no
-    submap. clutter_in_map: others that are in one.
+    label_of: label of each unnamed landmark, UNKNOWN without one. duplicates: landmarks beyond the
+    first of a label; confirmed: with at least two submaps, or all for an estimator without submaps;
+    shown: in the final map. merges_right, merges_wrong: pairs of robots that share landmarks, by
+    whether at least half of those labelled by both agree. merges_refused: pending attempts.
+    left_out: labelled detections in no submap. clutter_in_map: unlabelled ones in a submap.
     """
 
     pairs: Pairs
@@ -86,13 +82,13 @@ class AssociationResult:
 
 
 def association_result(log: Collected) -> AssociationResult | None:
-    """The scores of a run; None where all detections had identities, or none was labelled."""
+    """Association scores; None if all detections had identities or none was labelled."""
     labels = _labels(log)
     if all(label == UNKNOWN for label in labels.values()):
         return None
     detections = list(_detections(log, labels))
     places = [place for _, place, _ in detections]
-    # Without submaps a place's number is that of the estimator's own map.
+    # Without submaps, a place's number is that of the estimator's own map.
     identity = _identities(log) or {place: place[3] for place in places if place is not None}
     label = np.array([each[0] for each in detections], np.int64)
     windows = [each[2] for each in detections]
@@ -132,7 +128,7 @@ def _beyond_the_first(numbers: Collection[int], label_of: Mapping[int, int]) -> 
 
 
 def association_json(result: AssociationResult) -> dict[str, object]:
-    """The scores under the names that machines read."""
+    """Scores under their JSON names."""
     pairs, inside = result.pairs, result.inside
     return {
         "precision": pairs.precision,
@@ -159,12 +155,10 @@ def association_json(result: AssociationResult) -> dict[str, object]:
 
 
 def _robots(log: Collected, channel: ch.Channel) -> list[str]:
-    """The robots with messages on a channel."""
     return sorted(name for key in log.samples if (name := channel.owner(key)) is not None)
 
 
 def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
-    """The labels by robot, stamp of the scan and row in it."""
     found: dict[tuple[str, int, int], int] = {}
     for robot in _robots(log, ch.TRUTH_LABELS):
         for message in log.messages(ch.TRUTH_LABELS, robot):
@@ -201,7 +195,7 @@ def _detections(
 
 
 def _identities(log: Collected) -> dict[Place, int]:
-    """The number in the final map of each local landmark."""
+    """Number in the final map of each local landmark."""
     final = log.sound(log.last(ch.FINAL_MAP))
     found: dict[Place, int] = {}
     if not isinstance(final, m.FusedMap):
@@ -215,7 +209,7 @@ def _identities(log: Collected) -> dict[Place, int]:
 
 
 def _numbered(values: Sequence[object]) -> Int64[np.ndarray, " n"]:
-    """Equal values have equal numbers from 0 on; None has −1."""
+    """Number equal values alike, from 0; None has −1."""
     numbers: dict[object, int] = {}
     return np.array(
         [-1 if v is None else numbers.setdefault(v, len(numbers)) for v in values], np.int64
@@ -227,7 +221,7 @@ def _pairs(
     landmark: Int64[np.ndarray, " n"],
     window: Int64[np.ndarray, " n"] | None = None,
 ) -> Pairs:
-    """The pairs of labelled detections; with windows, those inside one."""
+    """Count pairs of labelled detections; with windows, only inside one window."""
     window = np.zeros(len(label), np.int64) if window is None else window
     used = landmark >= 0
     real = _choose_two(np.column_stack((window, label)))
@@ -249,7 +243,6 @@ def _pairs(
 
 
 def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
-    """The number of pairs of equal rows."""
     if not len(rows):
         return 0
     _, counts = np.unique(rows, axis=0, return_counts=True)
@@ -259,7 +252,7 @@ def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
 def _majorities(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[dict[int, int], dict[int, set[Place]]]:
-    """The label of each of the map's landmarks, and the submaps that it is in."""
+    """Majority label and submaps of each landmark of the map."""
     votes: dict[int, dict[int, int]] = {}
     submaps: dict[int, set[Place]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
@@ -280,7 +273,7 @@ def _majorities(
 def _merges(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[int, int]:
-    """The numbers of pairs of robots that share landmarks, rightly and wrongly."""
+    """Numbers of robot pairs that share landmarks, right and wrong."""
     votes: dict[int, dict[str, dict[int, int]]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
         number = None if place is None else identity.get(place)

@@ -1,12 +1,12 @@
-"""Estimate by how much a robot's detections are stamped late against its odometry, without truth.
+"""Estimate the time offset of a robot's detections against its odometry, without truth.
 
-A landmark that is measured at t_i and again at t_j is at the points b_i and b_j of the robot's
-base. With the motion D(τ) by odometry from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise: where
-the speeds at t_i and t_j differ, D depends on τ. Neither a map nor the true path is needed.
+A landmark measured at t_i and t_j is at points b_i, b_j in the base frame. With the odometry motion
+D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise; D depends on τ if the speeds at t_i and
+t_j differ. Neither map nor true path is needed.
 
-Causes that could be taken for τ are estimated with it: the sensor's mount, an offset of the range,
-and the scales and the drift of odometry. The variance is the sandwich over stretches of time (Liang
-and Zeger 1986), so errors may be correlated within a stretch.
+Effects similar to τ are estimated jointly: sensor mount, range offset, odometry scales and drift.
+The variance is the sandwich over stretches of time (Liang and Zeger 1986), which allows for
+correlation within a stretch.
 """
 
 import math
@@ -26,40 +26,36 @@ from team.wire import messages as m
 from team.wire.arrays import floats
 
 APART_NS = 2_000_000_000
-"""Greatest time between two measurements of a landmark that are compared."""
+"""Greatest time between two compared measurements of a landmark."""
 STRETCH_NS = 5_000_000_000
 LEAST_STRETCHES = 12
-"""Least effective number of stretches, 1/Σ share² of the information on τ, from which a variance is
-computed: where few turns carry all of it, the variance is too uncertain.
-"""
+"""Least effective number of stretches, 1/Σ share² of the information on τ, for a variance."""
 STEP_NS = 250_000_000
-"""Step of the derivative by τ: over it the noise of single intervals averages out. It is central,
-so that the noise in the derivative is uncorrelated with that of D.
+"""Step of the central derivative by τ: averages interval noise, and keeps the derivative's noise
+uncorrelated with that of D.
 """
 HUBER = 2.0
-"""The loss is linear beyond this number of standard deviations."""
 ROUNDS = 20
 SETTLED_NS = 1_000_000
 LEAST_SLOPE = 0.2
-"""Least share of the derivative that is motion rather than noise of odometry."""
+"""Least share of the derivative that is motion rather than odometry noise."""
 LARGEST_NS = 2_000_000_000
-"""A greater offset is not a clock's."""
+"""Largest plausible clock offset."""
 NEAR_M = 1.0
-"""Errors of points grow with their distance beyond this one [m]."""
+"""Point errors grow with distance beyond this [m]."""
 BEYOND_DOUBT = 5.0
-"""Number of standard deviations from which an offset is reported."""
+"""Offset, in standard deviations, from which it is reported."""
 LEAST_S = 0.02
-"""A smaller offset [s] is not reported."""
+"""Smallest reported offset [s]."""
 UNIX_S = 1e9
-"""Times [s] from here on are Unix times."""
 
 
 @dataclass
 class Timed:
-    """The stamps, motions and measurements of named landmarks of one stream, in any order.
+    """Stamps, motions and measurements of named landmarks of one stream, in any order.
 
-    motions: (forward [m/s], left [m/s], turn [rad/s]) of each interval, or (wheel speed [m/s],
-    steering [rad], –) where `steered`. seen: (range [m], bearing [rad]) of each measurement.
+    motions: (forward [m/s], left [m/s], turn [rad/s]) per interval, or (wheel speed [m/s], steering
+    [rad], –) if `steered`. seen: (range [m], bearing [rad]) per measurement.
     """
 
     ends_ns: "array[int]" = field(default_factory=lambda: array("q"))
@@ -71,14 +67,14 @@ class Timed:
     seen: "array[float]" = field(default_factory=lambda: array("d"))
 
     def span_ns(self, clock_offset_s: float) -> tuple[int, int] | None:
-        """The team times of the first and the last measurement; None without one."""
+        """Team times of the first and last measurement."""
         ends = np.array(self.ends_ns, np.int64) + round(1e9 * clock_offset_s)
         begins = ends - np.array(self.durations_ns, np.int64)
         stamps = np.concatenate([begins, ends, np.array(self.stamps_ns, np.int64)])
         return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
     def take(self, message: m.AnyOdometry | m.AnyScan) -> None:
-        """Add an interval of odometry or the measurements of a scan."""
+        """Add an odometry interval or a scan."""
         if isinstance(message, m.AnyScan):
             scan = translate.scan_of(message)
             self.stamps_ns.extend([message.stamp_ns] * len(scan.ids))
@@ -92,7 +88,6 @@ class Timed:
 
 
 def _speeds(message: m.AnyOdometry) -> tuple[float, float, float]:
-    """The row of `Timed.motions` of an interval."""
     match message:
         case m.Odometry():
             return message.forward, 0.0, message.yaw_rate
@@ -107,19 +102,19 @@ def _speeds(message: m.AnyOdometry) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Late:
-    """The time by which detections are stamped late against odometry, and its σ [s]."""
+    """Delay of the detections against odometry, and its σ [s]."""
 
     offset_s: float
     sigma_s: float
 
     @property
     def is_beyond_doubt(self) -> bool:
-        """Whether the offset is to be reported."""
+        """Whether the offset is significant."""
         return abs(self.offset_s) > max(LEAST_S, BEYOND_DOUBT * self.sigma_s)
 
 
 def clock_warning(robot: str, timed: Timed, config: RobotConfig) -> str | None:
-    """The warning about a robot whose clocks differ beyond doubt; None without one."""
+    """Warning about a robot with significantly different clocks, or None."""
     found = lateness(timed, config)
     if found is None or not found.is_beyond_doubt:
         return None
@@ -133,10 +128,10 @@ def clock_warning(robot: str, timed: Timed, config: RobotConfig) -> str | None:
 
 
 def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | None:
-    """The warning about robots that no other robot's time of measurement overlaps with, directly or
-    by a chain of others; None without one.
+    """Warning about robots whose measurement times overlap with no other robot's, directly or
+    through a chain; or None.
 
-    spans_ns: by robot, the times of its first and its last measurement.
+    spans_ns: first and last measurement time by robot.
     """
     groups: list[list[str]] = []
     until_ns = 0
@@ -162,7 +157,7 @@ def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | Non
 
 
 def _time(stamp_ns: int) -> str:
-    """A time in seconds; as date and time where it is Unix time."""
+    """Time in seconds, or date and time for Unix time."""
     seconds = 1e-9 * stamp_ns
     if seconds < UNIX_S:
         return f"{seconds:,.0f} s"
@@ -170,11 +165,10 @@ def _time(stamp_ns: int) -> str:
 
 
 def lateness(timed: Timed, config: RobotConfig) -> Late | None:
-    """The time by which a robot's detections are late, beyond its `clock_offset_s`; None where the
-    measurements do not determine it.
+    """Delay of a robot's detections beyond its `clock_offset_s`; None if undetermined.
 
-    Gauss–Newton iterations under Huber's loss. Noise in the derivative makes a step too short by
-    the slope of the step in τ, and σ is divided by it.
+    Gauss–Newton under Huber's loss. Derivative noise shortens a step by the slope of the step in τ,
+    and σ is divided by that slope.
     """
     if not timed.ends_ns or not timed.ids:
         return None
@@ -199,9 +193,7 @@ def lateness(timed: Timed, config: RobotConfig) -> Late | None:
 
 @dataclass(frozen=True)
 class _DeadReckoning:
-    """The path by odometry alone: the pose at the start of each interval, and its twist per
-    second.
-    """
+    """Path by odometry alone: pose at the start of each interval, and twist per second."""
 
     starts_ns: Int64[np.ndarray, " n"]
     ends_ns: Int64[np.ndarray, " n"]
@@ -209,7 +201,7 @@ class _DeadReckoning:
     poses: Float[np.ndarray, "n 3"]
 
     def at(self, stamps_ns: Int64[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
-        """The poses at these times; between two intervals the robot stands."""
+        """Poses at these times; constant between intervals."""
         k = np.maximum(np.searchsorted(self.starts_ns, stamps_ns, "right") - 1, 0)
         seconds = 1e-9 * (np.minimum(stamps_ns, self.ends_ns[k]) - self.starts_ns[k])
         return _after(self.poses[k], self.rates[k] * np.maximum(seconds, 0.0)[:, np.newaxis])
@@ -217,8 +209,8 @@ class _DeadReckoning:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Two measurements each of one landmark, at the points b_i and b_j of the base; stretch: the
-    stretch of time of each pair.
+    """Pairs of measurements of one landmark, at base points b_i and b_j; stretch: time stretch of
+    each pair.
     """
 
     path: _DeadReckoning
@@ -229,7 +221,7 @@ class _Pairs:
     stretch: Int64[np.ndarray, " k"]
 
     def step(self, late_ns: int) -> tuple[float, float]:
-        """The further time [s] by which the detections are late, and its σ; NaN: undetermined."""
+        """Further delay of the detections [s] and its σ; NaN if undetermined."""
         d, turn = self._motion(late_ns)
         q, way = _turned(self.b_i - d, -turn), _turned(d, -turn)
         before, after = (self._again(late_ns + by) for by in (-STEP_NS, STEP_NS))
@@ -256,13 +248,12 @@ class _Pairs:
         return _turned(two[:, :2] - one[:, :2], -one[:, 2]), two[:, 2] - one[:, 2]
 
     def _again(self, late_ns: int) -> Float[np.ndarray, "k 2"]:
-        """D(τ)⁻¹ b_i."""
         d, turn = self._motion(late_ns)
         return _turned(self.b_i - d, -turn)
 
 
 def _pairs(timed: Timed, config: RobotConfig) -> _Pairs | None:
-    """The pairs of subsequent measurements of a landmark; None where there are too few."""
+    """Pairs of subsequent measurements of a landmark; None if too few."""
     path = _dead_reckoning(timed, config)
     stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
     order = np.lexsort((stamps, names))
@@ -280,7 +271,7 @@ def _pairs(timed: Timed, config: RobotConfig) -> _Pairs | None:
 
 
 def _dead_reckoning(timed: Timed, config: RobotConfig) -> _DeadReckoning:
-    """The path from the origin by a robot's odometry, on the detections' clock."""
+    """Dead-reckoned path from the origin, on the detections' clock."""
     ends = np.array(timed.ends_ns, np.int64) + round(1e9 * config.clock_offset_s)
     rates = np.array(timed.motions).reshape(-1, 3)
     for k in np.flatnonzero(np.array(timed.steered)).tolist():
@@ -298,7 +289,7 @@ def _dead_reckoning(timed: Timed, config: RobotConfig) -> _DeadReckoning:
 
 
 def _on_base(seen: Float[np.ndarray, "k 2"], sensor: Sensor) -> Float[np.ndarray, "k 2"]:
-    """The measured points in the frame of the base, by the sensor's calibration and mount."""
+    """Measured points in the base frame, with the sensor's calibration and mount."""
     x, y, heading = sensor.mount
     ranges = (seen[:, 0] - sensor.range_offset) / sensor.range_scale
     angles = seen[:, 1] - sensor.bearing_offset + heading
@@ -308,7 +299,7 @@ def _on_base(seen: Float[np.ndarray, "k 2"], sensor: Sensor) -> Float[np.ndarray
 def _after(
     poses: Float[np.ndarray, "k 3"], twists: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """The poses after the motions Exp(twist), whose chord is at half the turn."""
+    """Poses after Exp(twist), whose chord points at half the turn."""
     half = 0.5 * twists[:, 2]
     chord = np.sinc(half / math.pi)[:, np.newaxis] * twists[:, :2]
     places = poses[:, :2] + _turned(chord, poses[:, 2] + half)
@@ -318,14 +309,12 @@ def _after(
 def _turned(
     points: Float[np.ndarray, "k 2"], angles: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k 2"]:
-    """The points rotated by the angles."""
     c, s = np.cos(angles), np.sin(angles)
     x, y = points.T
     return np.column_stack([c * x - s * y, s * x + c * y])
 
 
 def _across(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
-    """The points rotated by a quarter turn to the left."""
     return np.column_stack([-points[:, 1], points[:, 0]])
 
 
@@ -334,12 +323,11 @@ def _first_of_fit(
     J: Float[np.ndarray, "k 2 p"],
     stretch: Int64[np.ndarray, " k"],
 ) -> tuple[float, float]:
-    """The first component of the p that minimises Huber's loss of e + J p, and its σ; NaN where
-    it is not determined.
+    """First component of argmin_p of Huber's loss of e + J p, and its σ; NaN if undetermined.
 
-    Iteratively reweighted least squares; the scale of the errors is their median's. σ² = Σ (s/(1 −
-    h))² over stretches, with the influence s of a stretch and its share h of the information: about
-    the jackknife's (Bell and McCaffrey 2002).
+    Iteratively reweighted least squares, scaled by the median error. σ² = Σ (s/(1 − h))² over
+    stretches, with a stretch's influence s and share h of the information: approximately the
+    jackknife (Bell and McCaffrey 2002).
     """
     errors, rows = e.reshape(-1), J.reshape(len(e) * 2, -1)
     norms = np.linalg.norm(rows, axis=0)

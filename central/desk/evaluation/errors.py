@@ -1,4 +1,4 @@
-"""Errors against the truth: positions as distances, headings on the circle, NEES, alignment."""
+"""Errors against the truth: distances, headings on the circle, NEES, alignment."""
 
 from dataclasses import dataclass
 
@@ -12,28 +12,28 @@ from team.estimation.geometry import between
 from team.estimation.map_joining.alignment import NEEDED, procrustes
 
 TRUTH_GAP_NS = 1_000_000_000
-"""Truth is interpolated between samples that are at most this far apart."""
+"""Largest gap between truth samples that is interpolated."""
 BAND = 0.95
 
 
 @dataclass(frozen=True)
 class Path:
-    """Poses (x [m], y [m], theta [rad]) by stamp, ascending; the true path or an estimated one."""
+    """Poses (x [m], y [m], theta [rad]) by ascending stamp, true or estimated."""
 
     stamps_ns: Int64[np.ndarray, " K"]
     poses: Float[np.ndarray, "K 3"]
 
 
 SMALL_TURN = 1e-6
-"""Below this [rad] (δ/2) cot(δ/2) is 1 to the last bit."""
+"""Below this [rad], (δ/2) cot(δ/2) is 1 to the last bit."""
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Estimate − truth of the K poses that have truth, in (x [m], y [m], theta [rad]).
+    """Estimate − truth of the K poses with truth, (x [m], y [m], theta [rad]).
 
-    sigmas: the estimator's standard deviations. nees: eᵀ P⁻¹ e, 3 degrees of freedom each.
-    motion_nees: the same of the rigid motion of the frame that carries the estimate to the truth.
+    sigmas: estimated standard deviations. nees: eᵀ P⁻¹ e with 3 degrees of freedom. motion_nees:
+    the same for the rigid motion that carries the estimate to the truth.
     """
 
     stamps_ns: Int64[np.ndarray, " K"]
@@ -44,35 +44,34 @@ class PoseErrors:
 
     @property
     def position_rmse_m(self) -> float:
-        """√(mean of the squared distances) [m]."""
+        """RMS position error [m]."""
         return rms(np.hypot(self.errors[:, 0], self.errors[:, 1]))
 
     @property
     def heading_rmse_rad(self) -> float:
-        """√(mean of the squared heading errors) [rad]."""
+        """RMS heading error [rad]."""
         return rms(self.errors[:, 2])
 
     @property
     def nees_per_dof(self) -> float:
-        """The mean of NEES/3; 1 where the covariances are right."""
+        """Mean NEES/3; 1 if the covariances are right."""
         return float(self.nees.mean()) / 3.0
 
     @property
     def coverage(self) -> float:
-        """The share of poses within their own 95 % ellipsoid; 0.95 where they are right."""
+        """Share of poses within their 95 % ellipsoid."""
         return coverage(self.nees, np.full(len(self.nees), 3.0), BAND)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapErrors:
-    """A map's errors against the true positions of the same landmarks.
+    """Map errors against the true positions of the same landmarks.
 
-    rmse_m, aligned_rmse_m: 2-D distances, as the map lies and after truth_from_map, the rigid
-    motion of least squares (None below two landmarks). nees_per_dof: of the joint covariance, in
-    the frame as the map lies; `band` is the 95 % interval of a single run with 2L degrees of
-    freedom. shape: the part of the error that no rigid motion explains, which does not depend on
-    the initial poses (None where aligned_rmse_m is). coverage: the share of landmarks in their own
-    95 % ellipse, as the map lies.
+    rmse_m, aligned_rmse_m: 2-D distances without alignment, and after truth_from_map, the
+    least-squares rigid motion (None below two landmarks). nees_per_dof: joint, unaligned; `band`:
+    its 95 % interval for one run with 2L degrees of freedom. shape: non-rigid part of the error,
+    independent of initial poses (None like aligned_rmse_m). coverage: share of landmarks in their
+    95 % ellipse, unaligned.
     """
 
     count: int
@@ -92,10 +91,10 @@ class MapErrors:
 
 @dataclass(frozen=True)
 class ShapeErrors:
-    """A map's errors without their rigid part, with the covariance of that part removed, too.
+    """Map errors without their rigid part, with that part's covariance removed.
 
-    nees_per_landmark: NEES of the remaining 2L − 3 degrees of freedom, scaled to 2 per landmark: 2
-    is right. coverage: the share of landmarks whose remaining error lies in its 95 % ellipse.
+    nees_per_landmark: NEES of the 2L − 3 remaining degrees of freedom, scaled to an expectation of
+    2 per landmark. coverage: share of landmarks whose remaining error lies in its 95 % ellipse.
     """
 
     nees_per_landmark: float
@@ -108,7 +107,7 @@ def rms(values: Float[np.ndarray, " n"]) -> float:
 
 
 def on_circle(angles: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """The same directions in (−π, π]."""
+    """Wrap angles to (−π, π]."""
     wrapped: Float[np.ndarray, "*n"] = angles + 2.0 * np.pi * np.floor(
         (np.pi - angles) / (2.0 * np.pi)
     )
@@ -120,7 +119,7 @@ def map_errors(
     covariance: Float[np.ndarray, "m m"],
     truth: Float[np.ndarray, "L 2"],
 ) -> MapErrors:
-    """The errors of L ≥ 1 landmarks with their joint 2L × 2L covariance."""
+    """Compute the errors of L ≥ 1 landmarks with joint covariance 2L × 2L."""
     count = len(means)
     difference = means - truth
     motion = rigid_alignment(truth, means)
@@ -144,7 +143,7 @@ def _shape_errors(
     truth: Float[np.ndarray, "L 2"],
     truth_from_map: Float[np.ndarray, "3"],
 ) -> ShapeErrors:
-    """The errors after alignment, in the map's frame.
+    """Compute the errors after alignment, in the map frame.
 
     With G = ∂(positions moved by x, y, θ)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g); the
     covariance of the remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
@@ -167,10 +166,10 @@ def _shape_errors(
 
 
 def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m m"]) -> float:
-    """The share of points whose error lies in the 95 % ellipse of their own 2 × 2 covariance."""
+    """Share of points in the 95 % ellipse of their own 2 × 2 covariance."""
     count = len(errors)
     blocks = covariance.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count), :]
-    # The shape of two landmarks has one number, so their blocks are singular.
+    # Two landmarks have a one-dimensional shape, so their blocks are singular.
     inverses = np.linalg.pinv(blocks, hermitian=True)
     squared = np.einsum("ki,kij,kj->k", errors, inverses, errors)
     return coverage(squared, np.linalg.matrix_rank(blocks, hermitian=True).astype(float), BAND)
@@ -179,9 +178,9 @@ def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m 
 def rigid_alignment(
     truth: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3"] | None:
-    """truth_from_points of least squares, without scale (Kabsch 1976; Umeyama 1991).
+    """truth_from_points by least squares without scale (Kabsch 1976; Umeyama 1991).
 
-    None where it is not determined: fewer than two points, or all in one place.
+    None if undetermined: fewer than two distinct points.
     """
     if len(points) < NEEDED or np.ptp(points, axis=0).max() == 0.0:
         return None
@@ -191,7 +190,7 @@ def rigid_alignment(
 def transform_points(
     a_from_b: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """The points of b in a."""
+    """Transform points from frame b to a."""
     c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
     turned: Float[np.ndarray, "n 2"] = points @ np.array([[c, s], [-s, c]])
     turned += a_from_b[:2]
@@ -199,7 +198,7 @@ def transform_points(
 
 
 def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> float:
-    """RMS of the distances between points of the same row [m]."""
+    """RMS distance between corresponding rows [m]."""
     difference = a - b
     return rms(np.hypot(difference[:, 0], difference[:, 1]))
 
@@ -207,10 +206,11 @@ def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> f
 def interpolate_truth(
     truth: Path, stamps_ns: Int64[np.ndarray, " K"]
 ) -> tuple[Float[np.ndarray, "K 3"], Bool[np.ndarray, " K"]]:
-    """The true poses at the stamps, and which of them are known (the others are zero).
+    """Interpolate the true poses at the stamps; returns poses and a mask of known rows (others
+    zero).
 
-    Positions linearly, headings along the shorter arc; never beyond the truth's ends, nor inside a
-    gap of more than TRUTH_GAP_NS. A stamp that is the truth's own is always known.
+    Positions linear, headings along the shorter arc; no extrapolation, no gap above TRUTH_GAP_NS. A
+    truth sample's own stamp is always known.
     """
     poses = np.zeros((len(stamps_ns), 3))
     if not len(truth.stamps_ns):
@@ -234,7 +234,7 @@ def interpolate_truth(
 def pose_errors(
     path: Path, covariances: Float[np.ndarray, "K 3 3"], truth: Path
 ) -> PoseErrors | None:
-    """The errors of a path's poses where the truth is known; None where it nowhere is."""
+    """Compute a path's errors at poses with truth; None if there is none."""
     true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None
@@ -254,11 +254,11 @@ def pose_errors(
 def _motion_nees(
     poses: Float[np.ndarray, "K 3"], truth: Float[np.ndarray, "K 3"], P: Float[np.ndarray, "K 3 3"]
 ) -> Float[np.ndarray, " K"]:
-    """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, which allows for a rotation about a far point.
+    """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, which allows for rotation about a far point.
 
-    If the map rotates about its origin by δ, a pose at distance d errs by d δ²/2 along its radius,
-    which an ellipse in (x, y, θ) does not allow for. ξ = (V⁻¹ (p' − R p), δ) with the V of the
-    exponential on SE(2); to first order (dx, dy, dθ) → ξ is A = [1 0 y; 0 1 −x; 0 0 1].
+    If the map rotates about its origin by δ, a pose at distance d errs by d δ²/2 radially, which an
+    ellipse in (x, y, θ) does not cover. ξ = (V⁻¹ (p' − R p), δ) with V of the SE(2) exponential; to
+    first order (dx, dy, dθ) → ξ is A = [1 0 y; 0 1 −x; 0 0 1].
     """
     turn = on_circle(truth[:, 2] - poses[:, 2])
     p = poses[:, 0] + 1j * poses[:, 1]

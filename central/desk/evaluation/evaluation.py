@@ -1,7 +1,7 @@
-"""Evaluate a run: every figure from the samples of its log alone, against the truth in it.
+"""Evaluate a run from its log: every figure, against the recorded truth.
 
-A figure that can not be computed (no truth, no such message) is None. Errors are in metres and
-radians; NEES is per degree of freedom, 1 where the covariance is right.
+A figure without its inputs is None. Metres and radians; NEES per degree of freedom, 1 if the
+covariance is right.
 """
 
 import hashlib
@@ -60,19 +60,18 @@ UPLINK = {
     "own/map": (ch.OWN_MAP,),
     "measurements": ch.SENSORS,
 }
-"""The channels of each name in `PAIRS`."""
+"""Channels of each uplink name in `PAIRS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapResult:
-    """The final map: L landmarks by id, their joint covariance (blocks only unless `joint`).
+    """Final map: L landmarks by id and their joint covariance (blocks unless `joint`).
 
-    truth: the true positions, rows without truth zero; known: which rows have it. errors: of those.
-    payload_sha256: of the message's bytes. cost_per_dof: χ² of the join per degree of freedom.
-    covariance_scale: the factor by which the submaps' covariances should be multiplied; None:
-    unknown. withdrawn: robots left out of the map. lost: robots that are not completely in it.
-    gospa: of all landmarks against all true ones, after truth_from_map; None without it. matching:
-    how the landmarks without identities have got their true positions; None: by identity or label.
+    truth: true positions, zero without truth; known: rows with truth; errors: of those.
+    cost_per_dof: χ² of the join. covariance_scale: factor by which the submap covariances should be
+    multiplied; None: unknown. withdrawn: robots left out. lost: incomplete robots. gospa: of all
+    landmarks after truth_from_map. matching: how unnamed landmarks got true positions; None: by
+    identity or label.
     """
 
     rule: str
@@ -97,24 +96,22 @@ class MapResult:
 
 
 PACKED = (".zip", ".mcap", ".db3")
-"""Endings of data sets that are one file."""
 USUAL = ("hybrid", "join")
-"""The estimator and the rule that are taken where none is chosen."""
+"""Default estimator and rule."""
 TeamMotion = tuple[Float[np.ndarray, "3"], str]
-"""A rigid motion from the map to the truth, and what it aligns best."""
+"""Rigid motion from map to truth, and what it aligns."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotResult:
     """One robot: its measurements, their dispositions, and its poses against the truth.
 
-    smoothed: the final map's poses at the ends of the submaps. online: the poses that the robot
-    published, given the team's map (`online_channel`: "team/pose"), or by its own measurements
-    alone where it never had that. aligned_rmse_m, online_aligned_rmse_m: of the smoothed and of the
-    online positions after the rigid motion that aligns the map (`alignment`: "map"), or where no
-    true landmark is known the smoothed paths of all robots ("paths"), or where there is no map the
-    robot's own ("trajectory"). own_map: of the robot's last own map, as it lies. outside: its
-    running poses are not in the team's frame; it has no online path then.
+    smoothed: final map's poses at submap ends. online: poses published during the run, given the
+    team map (`online_channel`: "team/pose"), or from own measurements if never in the team's frame.
+    aligned_rmse_m, online_aligned_rmse_m: after the rigid motion that aligns the map (`alignment`:
+    "map"), or without true landmarks all smoothed paths ("paths"), or without a map the robot's own
+    path ("trajectory"). own_map: last own map, unaligned. outside: running poses are not in the
+    team's frame, so there is no online path.
     """
 
     consumption: Consumption
@@ -134,23 +131,21 @@ class RobotResult:
 
     @property
     def uplink_bytes_per_step(self) -> float | None:
-        """Bytes on the channel that the rule consumes, per odometry interval."""
+        """Uplink bytes of the rule's channel per odometry interval."""
         steps = self.consumption.steps
         return None if self.uplink_bytes is None or not steps else self.uplink_bytes / steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """A run: its scenario (None: it is not in the log), its map, its robots and its traffic.
+    """A run: scenario (None: not in the log), map, robots and traffic.
 
-    true_landmarks: all of them, measured or not. notes: the world's remarks on its data, and
-    messages set aside. faults: number of messages set aside. unsound: number of invalid samples.
-    arbitrary_frame: the map contains no robot with a known initial pose, so its frame is not the
-    truth's, and only aligned errors are meaningful. decisions: closures and merges by landmarks
-    without identities, from the final map. verdicts: an operator's on such landmarks, in words.
-    states: of every robot of the team in the final map. data_set: the name of its folder or file;
-    empty for a simulated world. clocks: the robots whose detections are late or early beyond doubt,
-    and those whose times do not overlap, in words.
+    true_landmarks: all, measured or not. notes: remarks of the world, and messages set aside.
+    faults: number of messages set aside. unsound: number of invalid samples. arbitrary_frame: no
+    mapped robot has a known initial pose, so only aligned errors are meaningful. decisions:
+    closures and merges by unnamed landmarks. verdicts: an operator's, as text. states: of every
+    robot in the final map. data_set: folder or file name; empty for a simulated world. clocks:
+    clock offsets and separate measurement times, as text.
     """
 
     scenario: TeamConfig | None
@@ -176,8 +171,8 @@ class Evaluation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings about a run's result, for every command that shows it: robots that are not
-        in the map, the map's own, and clocks that are off.
+        """Warnings for every command that shows the result: robots missing from the map, the map's
+        own warnings, clock offsets.
         """
         reasons = () if self.map is None else self.map.reasons
         of_map = (short(each) for each in reasons if not any(not_joined([each])))
@@ -185,14 +180,14 @@ class Evaluation:
 
     @property
     def title(self) -> str:
-        """The name of the data set; of a simulated world the scenario and its seed."""
+        """Data set name, or scenario and seed."""
         if self.scenario is None:
             return "a run whose scenario is not known"
         return self.data_set or f"{self.scenario.name}, seed {self.scenario.seed}"
 
     @property
     def method(self) -> str:
-        """Estimator and rule; empty for a data set where they are the usual ones."""
+        """Estimator and rule; empty for a data set with the defaults."""
         if self.scenario is None:
             return ""
         chosen = self.scenario.estimator, self.scenario.fusion
@@ -200,12 +195,12 @@ class Evaluation:
 
     @property
     def matched_by(self) -> str:
-        """How landmarks without identities were matched to true ones; empty where none were."""
+        """Method that matched unnamed landmarks to true ones; may be empty."""
         return "" if self.map is None or self.map.matching is None else str(self.map.matching)
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
-    """Compute the figures of one run, from its log's samples in the order of the log."""
+    """Evaluate one run from its samples in log order."""
     log = collect_log(samples)
     scenario = _scenario(log)
     truth = log.sound(log.last(ch.TRUTH_LANDMARKS))
@@ -279,7 +274,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
 
 
 def _clocks(log: Collected) -> tuple[str, ...]:
-    """The warnings about the robots' clocks, each by its incarnation with most measurements."""
+    """Clock warnings of each robot, from its incarnation with most measurements."""
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
     configs = {robot: _config(log, robot) for robot, _ in log.timed}
@@ -295,7 +290,6 @@ def _clocks(log: Collected) -> tuple[str, ...]:
 
 
 def _config(log: Collected, robot: str) -> RobotConfig:
-    """The configuration that a robot announced; the default one where the log has none."""
     announced = log.sound(log.latest.get(ch.ROBOT_CONFIG.key(robot)))
     if isinstance(announced, m.Configuration):
         with suppress(msgspec.MsgspecError):
@@ -305,7 +299,6 @@ def _config(log: Collected, robot: str) -> RobotConfig:
 
 
 def _frames(log: Collected) -> TruthFrames:
-    """The frames that the initial poses in the log fix."""
     frames = TruthFrames()
     for start in (each for robot in log.robots for each in log.messages(ch.START, robot)):
         if isinstance(start, m.InitialPose):
@@ -314,14 +307,14 @@ def _frames(log: Collected) -> TruthFrames:
 
 
 def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
-    """Whether no known initial pose fixes the final map's frame; without a map, any at all."""
+    """Whether no known initial pose fixes the final map's frame (or any frame, without a map)."""
     if fused is None or not fused.members:
         return frames.none_is_known
     return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
 
 
 def _never_came(log: Collected) -> list[str]:
-    """The robots whose driver lacks messages that were published, by the driver's last status."""
+    """Robots whose driver missed published messages, by its last status."""
     warnings = []
     for robot in log.robots:
         status = log.sound(log.latest.get(ch.STATUS.key(ch.source_node(robot))))
@@ -330,13 +323,13 @@ def _never_came(log: Collected) -> list[str]:
         if lost and math.isfinite(lost):
             warnings.append(
                 f"{robot}: {lost:,.0f} messages of its topics are not in its stream, beside "
-                f"{figures.get('messages', 0.0):,.0f} that are; its driver's warnings say why"
+                f"{figures.get('messages', 0.0):,.0f} that are; see its driver's warnings"
             )
     return warnings
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
-    """The messages that each node set aside, and the first exception, in words."""
+    """Messages that each node set aside, and the first exception, as text."""
     by_node: dict[str, list[m.Fault]] = {}
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
@@ -348,7 +341,7 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
 
 
 def _by_robot(log: Collected, name: str) -> dict[str, float]:
-    """The last values of the centre's figure of this name, by robot."""
+    """Last values of the centre's figure of this name, by robot."""
     status = log.sound(log.latest.get(ch.STATUS.key("central")))
     if not isinstance(status, m.Status):
         return {}
@@ -356,13 +349,13 @@ def _by_robot(log: Collected, name: str) -> dict[str, float]:
 
 
 def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
-    """The evaluation with a note for every gap of its log."""
+    """Add a note for every gap of the log."""
     lost = tuple(f"the log is not whole, {finding}" for finding in holes(log))
     return replace(evaluation, notes=(*evaluation.notes, *lost))
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The figures under the names that machines read; `extra` replaces or adds figures."""
+    """Figures under their JSON names; `extra` replaces or adds figures."""
     scenario, fused = evaluation.scenario, evaluation.map
     errors = None if fused is None else fused.errors
     shape = None if errors is None else errors.shape
@@ -477,13 +470,12 @@ class _Place(msgspec.Struct):
 
 
 class _World(msgspec.Struct):
-    """The part of a scenario in which a data set is named."""
+    """Part of a scenario that names a data set."""
 
     world: _Place
 
 
 def _data_set(log: Collected) -> str:
-    """The name of the folder or file that the measurements are from; empty where there is none."""
     message = log.sound(log.last(ch.WORLD_CONFIG))
     if not isinstance(message, m.Configuration):
         return ""
@@ -495,7 +487,7 @@ def _data_set(log: Collected) -> str:
 
 
 def _uplink(team: TeamConfig) -> tuple[ch.Channel, ...] | None:
-    """The channels that the team's rule consumes; None for an impossible pair."""
+    """Channels that the team's rule consumes; None for an invalid pair."""
     named = PAIRS.get((team.estimator, team.fusion))
     return None if named is None else UPLINK[named]
 
@@ -515,10 +507,10 @@ def _map_result(
     label_of: Mapping[int, int],
     truth_from_map: Float[np.ndarray, "3"] | None,
 ) -> MapResult:
-    """The final map and its errors.
+    """Final map and its errors.
 
-    truth_from_map: the motion after which landmarks without identities and labels are matched to
-    the nearest true ones; None: unknown.
+    truth_from_map: motion after which landmarks without identity or label are matched to the
+    nearest true ones; None: unknown.
     """
     sample = log.last(ch.FINAL_MAP)
     assert sample is not None
@@ -555,8 +547,8 @@ def _map_result(
 
 
 def _is_refuted(reason: str, errors: MapErrors | None) -> bool:
-    """Whether the true landmarks contradict a warning that covariances are too large: an error that
-    all submaps share, as of a late clock, does not show in their differences.
+    """Whether the truth refutes a too-large-covariance warning: an error common to all submaps,
+    such as a late clock, does not show in their differences.
     """
     return TOO_LARGE in reason and errors is not None and errors.nees_per_dof > 1.0
 
@@ -569,9 +561,7 @@ def _match_unnamed(
     truth: Float[np.ndarray, "L 2"],
     known: Bool[np.ndarray, " L"],
 ) -> Matching | None:
-    """Fill in the true positions of landmarks without identities from the nearest true landmarks
-    that no identity names; None where there are none of either.
-    """
+    """Fill in true positions of unnamed landmarks from the nearest unidentified true landmarks."""
     unnamed = np.flatnonzero((ids >= UNNAMED) & ~known)
     free = positions[~np.isin(true_ids, ids)]
     found = nearest(means[unnamed], free) if len(unnamed) else None
@@ -599,7 +589,6 @@ def _own_map(
     true_ids: UInt32[np.ndarray, " T"],
     positions: Float[np.ndarray, "T 2"],
 ) -> MapErrors | None:
-    """The errors of the robot's last own map."""
     message = log.sound(log.latest.get(ch.OWN_MAP.key(robot)))
     if not isinstance(message, m.MapEstimate):
         return None
@@ -613,7 +602,7 @@ def _truth_of(
     true_ids: UInt32[np.ndarray, " T"],
     positions: Float[np.ndarray, "T 2"],
 ) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
-    """The true positions of these landmarks (zero where unknown), and which are known."""
+    """True positions of the landmarks (zero where unknown) and a mask of known ones."""
     truth = np.zeros((len(ids), 2))
     known = np.isin(ids, true_ids)
     truth[known] = positions[np.searchsorted(true_ids, ids[known])]
@@ -626,7 +615,6 @@ def _errors(
     truth: Float[np.ndarray, "L 2"],
     known: Bool[np.ndarray, " L"],
 ) -> MapErrors | None:
-    """The errors of the landmarks with truth, if there are any."""
     rows = np.flatnonzero(np.repeat(known, 2))
     if not known.any():
         return None
@@ -667,7 +655,6 @@ def _robot_result(
 
 
 def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> float | None:
-    """RMSE of a path's positions after a rigid motion, where the truth is known."""
     true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None
@@ -675,7 +662,7 @@ def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> floa
 
 
 def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotion | None:
-    """The rigid motion of the team's map onto the truth, and its source; None without a map."""
+    """Rigid motion of the team's map onto the truth, and its source."""
     if fused is None:
         return None
     if fused.errors is not None and fused.errors.truth_from_map is not None:
@@ -685,7 +672,7 @@ def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotio
 
 
 def _motion(logs: Iterable[RobotLog]) -> Float[np.ndarray, "3"] | None:
-    """The rigid motion that aligns smoothed positions with true ones, where these are known."""
+    """Rigid motion that aligns smoothed with true positions."""
     true_places, places = [np.empty((0, 2))], [np.empty((0, 2))]
     for log in logs:
         truth, known = interpolate_truth(log.truth, log.smoothed.stamps_ns)

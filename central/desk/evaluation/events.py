@@ -1,6 +1,4 @@
-"""Detect the events of a team, in words: robots that join, are lost or refused, and nodes'
-warnings.
-"""
+"""Detect a team's events: robots that join, are lost or refused, and node warnings."""
 
 import re
 from dataclasses import dataclass, field
@@ -24,9 +22,8 @@ Kind = Literal[
     "done",
 ]
 MOST = 2000
-"""Most events of a run; a node with a new warning every second stays below it."""
+"""Most events of a run, above the rate of one new warning per node and second."""
 FIRST = 1
-"""The incarnation with which every stream begins."""
 _NUMBER = re.compile(r"\d+\.\d+")
 _AWAITED = (
     "waiting for ",
@@ -34,12 +31,12 @@ _AWAITED = (
     "no measurements of this team yet",
     "no measurements of this team yet",
 )
-"""States of a node at its start, which are no events."""
+"""Start-up states of a node, which are no events."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """An event: team time [ns], kind, node, and a description."""
+    """Event: team time [ns], kind, node, description."""
 
     stamp_ns: int
     kind: Kind
@@ -48,13 +45,13 @@ class Event:
 
     @property
     def of(self) -> str:
-        """The robot's name, or the node's where it is no robot's."""
+        """Robot name, or the node's name."""
         return self.node.removeprefix("robot/")
 
 
 @dataclass
 class EventDetector:
-    """Turns the messages of a run, in their order, into events, each once."""
+    """Convert a run's ordered messages into events, each once."""
 
     _alive: dict[str, bool] = field(default_factory=dict)
     _incarnations: dict[str, int] = field(default_factory=dict)
@@ -70,7 +67,7 @@ class EventDetector:
     _ended: bool = False
 
     def take(self, message: m.Message, now_ns: int) -> list[Event]:
-        """The events that a message brings; `now_ns` is the team time."""
+        """Events caused by a message at team time `now_ns`."""
         match message:
             case m.Liveliness():
                 return self._liveliness(message, now_ns)
@@ -117,7 +114,6 @@ class EventDetector:
         return [Event(now_ns, "lost", node, f"{name} was lost")]
 
     def _configured(self, message: m.Configuration, now_ns: int) -> list[Event]:
-        """A robot's announced configuration, once per process."""
         if self._alive.get(message.node) is not False or not message.node.startswith("robot/"):
             return []
         name = message.node.removeprefix("robot/")
@@ -132,7 +128,7 @@ class EventDetector:
         return [Event(now_ns, "restarted", robot_node(start.robot), text)]
 
     def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        """Changes in the robots that a map contains."""
+        """Changes in the set of mapped robots."""
         apart = {
             name: f"{who} not joined: {why}"
             for who, why in not_joined(fused.reasons)
@@ -175,7 +171,7 @@ class EventDetector:
         return events
 
     def _decisions(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        """Closures and merges that are accepted or undone, each once; not the waiting ones."""
+        """Accepted and undone closures and merges, each once; pending ones are left out."""
         events = []
         for each in fused.decisions:
             name = (each.stamp_ns, each.kind, each.about)
@@ -187,7 +183,7 @@ class EventDetector:
         return events
 
     def _status(self, status: m.Status, now_ns: int) -> list[Event]:
-        """A warning, once whatever its decimals; that a node is awaited is no event."""
+        """Warnings, once regardless of decimals; start-up waits are no events."""
         events = []
         refused = int(status.figures.get("refused", 0.0))
         if refused > self._refused and status.node == "central":
@@ -206,7 +202,7 @@ class EventDetector:
 
 
 def decision_words(decision: m.AssociationDecision) -> str:
-    """A closure or a merge with its figures, and why it was undone."""
+    """Closure or merge with its figures and the reason for its undoing."""
     figures = (
         f"{decision.pairs} landmarks, log-likelihood ratio {decision.llr:.0f} against "
         f"{decision.rival_llr:.0f}, share {decision.share:.2f}, {decision.absent} absent"
@@ -220,10 +216,10 @@ def decision_words(decision: m.AssociationDecision) -> str:
 
 
 def _is_apart(reason: str) -> bool:
-    """Whether a warning repeats a robot's reason for not being joined, which the map gives once."""
+    """Whether a warning repeats the map's reason for an unjoined robot."""
     return any(not_joined([reason]))
 
 
 def without_decimals(text: str) -> str:
-    """The text without decimals: the same finding with other figures is no new event."""
+    """Mask decimals: the same finding with other figures is no new event."""
     return _NUMBER.sub("#", text)

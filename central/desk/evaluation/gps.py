@@ -1,6 +1,4 @@
-"""Compare a path with the positions of another sensor, such as a GPS, whose frame and clock
-differ.
-"""
+"""Compare a path with positions of another sensor, such as GPS, in another frame and clock."""
 
 from collections.abc import Mapping
 
@@ -14,9 +12,8 @@ from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 
 LEAST = 10
-"""Least number of positions for a comparison."""
 GAP_NS = 1_500_000_000
-"""Positions are interpolated between fixes that are at most this far apart."""
+"""Largest gap between fixes that is interpolated."""
 SHIFTS_S = np.arange(-1.0, 1.01, 0.25)
 ROUNDS = 20
 NEAREST_M = 0.1
@@ -26,10 +23,10 @@ Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
 
 
 def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
-    """The median distance [m] of the smoothed poses from the other sensor's positions.
+    """Median distance [m] of smoothed poses from the other sensor's positions, or None.
 
-    One rigid motion, lever arm and time shift are fitted for the team, by least absolute distances
-    (iterated weights 1/d), since fixes may be wrong by metres. None without such positions.
+    One rigid motion, lever arm and time shift per team, by least absolute distances (iterated
+    weights 1/d), since fixes may be wrong by metres.
     """
     fixes = {robot: found for robot in paths if (found := _fixes(log, robot)) is not None}
     if not fixes:

@@ -1,7 +1,6 @@
-"""A run over its team time: consistency, traffic, latency and events, from one pass over its log.
+"""History of a run over team time: consistency, traffic, latency, events, in one pass.
 
-`evaluation` has the figures at the end, this module their history. Only the plotted numbers of each
-message are kept, some tens of bytes.
+`evaluation` has the figures at the end. Only the plotted numbers of each message are kept.
 """
 
 from array import array
@@ -33,7 +32,7 @@ _COST = "joint_cost_per_dof."
 
 @dataclass(frozen=True)
 class Series:
-    """Values over team time [ns], ascending; equal times in the order of the log."""
+    """Values by ascending team time [ns]; equal times in log order."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     values: Float[np.ndarray, " n"]
@@ -41,7 +40,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Innovations:
-    """Σ νᵀ S⁻¹ ν of one robot's windows and their degrees of freedom, at the windows' ends."""
+    """Σ νᵀ S⁻¹ ν of one robot's windows and degrees of freedom, at window ends."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     squared: Float[np.ndarray, " n"]
@@ -49,18 +48,17 @@ class Innovations:
 
     @property
     def per_dof(self) -> float | None:
-        """NIS per degree of freedom over the whole run; None where nothing was predicted."""
+        """NIS per degree of freedom over the run."""
         total = int(self.dof.sum())
         return float(self.squared.sum()) / total if total else None
 
 
 @dataclass(frozen=True)
 class Latencies:
-    """Latencies of one robot's submaps that some map used: wall time [s] from a measurement to the
-    first map.
+    """Latencies of one robot's used submaps: wall time [s] from measurement to first map.
 
-    stamps_ns: team time of the submap's end. first, last: from its first and its last measurement's
-    publication to the map's. A measurement waits for its window to close, so `first` is the longer.
+    stamps_ns: submap end. first, last: from publication of its first and last measurement. `first`
+    is longer, since a measurement waits for its window to close.
     """
 
     stamps_ns: Int64[np.ndarray, " n"]
@@ -70,7 +68,7 @@ class Latencies:
 
 @dataclass(frozen=True)
 class Traffic:
-    """The messages of one key: team time [ns] and payload bytes of each."""
+    """Messages of one key: team time [ns] and payload bytes."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     sizes: Int64[np.ndarray, " n"]
@@ -78,11 +76,11 @@ class Traffic:
 
 @dataclass(frozen=True, kw_only=True)
 class History:
-    """The history of a run, by team time.
+    """History of a run by team time.
 
-    start_ns, end_ns: the span of the measurements, or of everything where there are none. map_nees:
-    of every fused map, NEES per dof of its landmarks in their own blocks; empty without truth.
-    map_cost: of every fused map; robot_cost: from the centre's status.
+    start_ns, end_ns: span of the measurements, else of all messages. map_nees: landmark-block NEES
+    per degree of freedom of every fused map, empty without truth. map_cost: of every fused map;
+    robot_cost: from the centre's status.
     """
 
     start_ns: int
@@ -96,14 +94,14 @@ class History:
     events: tuple[Event, ...]
 
     def seconds(self, stamps_ns: Int64[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Team time since the first measurement [s]; 0 for earlier times."""
+        """Team time since the first measurement [s], at least 0."""
         elapsed: Float[np.ndarray, " n"] = np.maximum(stamps_ns - self.start_ns, 0) * 1e-9
         return elapsed
 
 
 @dataclass
 class _Column:
-    """Growing pairs of a stamp and a number."""
+    """Growing (stamp, number) pairs."""
 
     stamps: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
@@ -120,16 +118,13 @@ class _Column:
 
 
 class _Clocks:
-    """The wall clocks [ns] of a stream's measurements, 16 bytes each; one out of order is
-    left out.
-    """
+    """Wall clocks [ns] of a stream's measurements, in order; 16 bytes each."""
 
     def __init__(self) -> None:
         self._measurements = array("q")
         self._clocks = array("q")
 
     def take(self, measurement: int, wall_ns: int) -> None:
-        """Note the wall clock of one measurement."""
         if abs(measurement) < 2**63 and (
             not self._measurements or measurement > self._measurements[-1]
         ):
@@ -137,7 +132,6 @@ class _Clocks:
             self._clocks.append(min(wall_ns, 2**63 - 1))
 
     def of(self, measurement: int) -> int | None:
-        """The wall clock of a measurement; None where it is not known."""
         k = bisect_left(self._measurements, measurement)
         known = k < len(self._measurements) and self._measurements[k] == measurement
         return self._clocks[k] if known else None
@@ -145,7 +139,7 @@ class _Clocks:
 
 @dataclass
 class _Submap:
-    """A submap that no map has used yet, with the clocks of its measurements."""
+    """Submap that no map has used, with the clocks of its measurements."""
 
     end_ns: int
     first_measurement: int
@@ -154,8 +148,6 @@ class _Submap:
 
 @dataclass
 class _Gathering:
-    """The pass over a log."""
-
     traffic: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
     innovations: dict[str, list[m.Innovation]] = field(default_factory=lambda: defaultdict(list))
     map_nees: _Column = field(default_factory=_Column)
@@ -181,13 +173,13 @@ class _Gathering:
         self.take_contents(sample, channel)
 
     def take_contents(self, sample: Sample, channel: ch.Channel | None) -> None:
-        """Take the contents of a message of any channel."""
+        """Process a message of any channel."""
         if channel not in _CHANNELS:
             return
         try:
             _, name, message = opened(sample)
         except WireError:
-            return  # the evaluation counts it
+            return  # counted by the evaluation
         self.events += self.detector.take(message, sample.stamp_ns)
         del self.events[MOST:]
         match message:
@@ -236,13 +228,13 @@ class _Gathering:
         clocks = self.published[robot, incarnation]
         first_ns, last_ns = clocks.of(submap.first_measurement), clocks.of(submap.last_measurement)
         if first_ns is None or last_ns is None:
-            return  # a part of a log: the measurement was published before it
+            return  # partial log: the measurement precedes it
         first, last = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
         self.latencies[robot].append((submap.end_ns, first, last))
 
 
 def history(samples: Iterable[Sample]) -> History:
-    """The history of one run, from its log's samples in the order of the log."""
+    """Compute the history of a run from its samples in log order."""
     found = _Gathering()
     centre = PeersAsCentre()
     rows: dict[str, ch.Channel | None] = {}
@@ -280,7 +272,7 @@ def history(samples: Iterable[Sample]) -> History:
 
 
 def _innovations(of: list[m.Innovation]) -> Innovations:
-    """The innovations by window, each once: a resumed robot repeats some of them."""
+    """Innovations by window, once each: a resumed robot repeats some."""
     once = {(each.incarnation, each.sequence): each for each in of}
     ordered = [once[name] for name in sorted(once)]
     return Innovations(

@@ -1,8 +1,7 @@
-"""Collect the contents of a log for an evaluation, in one pass.
+"""Collect a log's contents for an evaluation, in one pass.
 
-Most of a log is sensor measurements: each is counted by its head (robot, incarnation, measurement)
-and adds its stamp and numbers to its stream's `Timed`. All other messages are decoded and checked
-by `shown`.
+Measurements, most of a log, are counted by head (robot, incarnation, measurement) and added to
+their stream's `Timed`. All other messages are decoded and checked by `shown`.
 """
 
 from collections import defaultdict
@@ -54,7 +53,7 @@ _OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, 
 
 
 class Head(msgspec.Struct, array_like=True, gc=False):
-    """The first fields of every measurement; later fields are skipped."""
+    """First fields of every measurement."""
 
     tag: str
     stamp_ns: int
@@ -67,7 +66,7 @@ _HEAD = msgspec.msgpack.Decoder(Head)
 
 
 def head_of(sample: Sample) -> Head | None:
-    """The head of a measurement; None for anything else."""
+    """Head of a measurement, or None."""
     try:
         return _HEAD.decode(sample.payload)
     except (msgspec.DecodeError, UnicodeDecodeError):
@@ -84,9 +83,7 @@ class Traffic:
 
 @dataclass
 class Measurements:
-    """The measurements of one robot on its sensor channels, each (incarnation, measurement)
-    once.
-    """
+    """Measurements of one robot on its sensor channels, each (incarnation, measurement) once."""
 
     all: set[tuple[int, int]] = field(default_factory=set)
     odometry: set[tuple[int, int]] = field(default_factory=set)
@@ -94,12 +91,11 @@ class Measurements:
 
 @dataclass
 class Collected:
-    """The contents of a log, by channel and robot.
+    """Contents of a log by channel and robot.
 
-    samples: by key, as payloads that are decoded on demand. timed: by (robot, incarnation).
-    first_ns: the wall clock of the first sample that has one. unsound: samples that are no valid
-    message of their channel; they count as traffic only. disagreement: of a team without a centre,
-    the peers whose final map differs, in words.
+    samples: by key, decoded on demand. timed: by (robot, incarnation). first_ns: wall clock of the
+    first sample that has one. unsound: invalid samples, counted as traffic only. disagreement:
+    peers whose final map differs, as text.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
@@ -114,7 +110,7 @@ class Collected:
 
     @property
     def robots(self) -> list[str]:
-        """The robots with measurements or truth, by name."""
+        """Robots with measurements or truth, by name."""
         names = set(self.measurements)
         for key in self.traffic:
             found = channel_of(key)
@@ -123,11 +119,11 @@ class Collected:
         return in_order(names)
 
     def last(self, channel: Channel) -> Sample | None:
-        """The newest sample of a channel with one key."""
+        """Newest sample of a channel with one key."""
         return self.latest.get(channel.key())
 
     def messages(self, channel: Channel, robot: str) -> list[m.Message]:
-        """The valid messages of one robot's channel, in the log's order."""
+        """Valid messages of a robot's channel, in log order."""
         found = []
         for sample in self.samples.get(channel.key(robot), []):
             message = self.sound(sample)
@@ -136,13 +132,13 @@ class Collected:
         return found
 
     def faults(self) -> list[m.Fault]:
-        """The faults of all nodes, in the order of the nodes."""
+        """Faults of all nodes, ordered by node."""
         keys = sorted(key for key in self.samples if ch.FAULT.owner(key) is not None)
         found = (self.sound(sample) for key in keys for sample in self.samples[key])
         return [fault for fault in found if isinstance(fault, m.Fault)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
-        """The sample's message; None, and counted once as unsound, if it is invalid."""
+        """Message of a sample; None, counted once as unsound, if invalid."""
         if sample is None:
             return None
         try:
@@ -170,7 +166,7 @@ class Collected:
             self._keep(sample, channel)
 
     def keep(self, sample: Sample) -> None:
-        """Store a message that a peer has published in the centre's place; the traffic is the
+        """Store a message that a peer published in the centre's place; the traffic stays the
         peer's.
         """
         found = channel_of(sample.key)
@@ -197,7 +193,7 @@ class Collected:
             of_robot.odometry.add(name)
 
     def _time(self, sample: Sample, robot: str) -> None:
-        """Add a measurement to its stream's; an invalid one is counted only."""
+        """Add a measurement to its stream; only count an invalid one."""
         try:
             message = decoded(sample.payload, *_TIMED)
         except WireError:
@@ -207,7 +203,7 @@ class Collected:
 
 
 def collect_log(samples: Iterable[Sample]) -> Collected:
-    """Collect the contents of a log from its samples."""
+    """Collect a log's contents from its samples."""
     found = Collected()
     centre = PeersAsCentre()
     channels: dict[str, tuple[str, str]] = {}

@@ -1,6 +1,4 @@
-"""Match landmarks to true ones by distance: GOSPA of a map, and the true positions of landmarks
-without identities where no labels are known.
-"""
+"""Match landmarks to true ones by distance: GOSPA, and true positions of unnamed landmarks."""
 
 from dataclasses import dataclass
 
@@ -11,10 +9,9 @@ from scipy.optimize import linear_sum_assignment
 
 @dataclass(frozen=True)
 class Matching:
-    """The number of landmarks within `gate_m` of a true one, one to one, `of` all without
-    identities.
+    """Number of landmarks within `gate_m` of a true one, one to one, `of` all unnamed ones.
 
-    The gate also bounds the errors: those of landmarks beyond it are not counted.
+    Errors beyond the gate are not counted.
     """
 
     gate_m: float
@@ -29,9 +26,7 @@ class Matching:
 
 @dataclass(frozen=True)
 class Gospa:
-    """The distance, its cut-off c, and its parts: RMS of the assigned pairs, and the numbers of
-    missed and false points.
-    """
+    """Distance, cut-off c, RMS of assigned pairs, numbers of missed and false points."""
 
     distance_m: float
     cut_off_m: float
@@ -43,8 +38,8 @@ class Gospa:
 def assign(
     found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], gate_m: float
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """The one-to-one pairs within the gate of the least sum of squared distances: the rows of both
-    sets, and the squared distances [m²].
+    """Assign points one to one within the gate, with least sum of squared distances; returns rows
+    of both sets and squared distances [m²].
     """
     squared = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), gate_m**2)
     rows, columns = linear_sum_assignment(squared)
@@ -55,10 +50,9 @@ def assign(
 def nearest(
     means: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"]
 ) -> tuple[Int64[np.ndarray, " n"], Matching] | None:
-    """The row of each landmark's true position, −1 where it has none, in the frame of the truth.
+    """Row of each landmark's true position (−1: none), in the true frame.
 
-    The gate is half of the median distance of a true landmark from its nearest neighbour. None
-    below two true ones.
+    The gate is half the median nearest-neighbour distance of the true landmarks. None below two.
     """
     gate_m = half_spacing(true)
     if not gate_m:
@@ -72,11 +66,11 @@ def nearest(
 def gospa(
     found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], cut_off_m: float
 ) -> Gospa:
-    """GOSPA of the found points, in the frame of the true ones.
+    """GOSPA of points in the true frame.
 
-    One distance between two sets of points that counts misplaced, missed and false ones
-    (Rahmathullah, García-Fernández and Svensson 2017, p = 2, α = 2): over the best assignment of
-    pairs nearer than the cut-off c, GOSPA² = Σ d² + c²/2 · (missed + false).
+    A set distance that counts misplaced, missed and false points (Rahmathullah, García-Fernández
+    and Svensson 2017, p = 2, α = 2): over the best assignment of pairs nearer than the cut-off c,
+    GOSPA² = Σ d² + c²/2 · (missed + false).
     """
     assigned = assign(found, true, cut_off_m)[2]
     missed, false = len(true) - len(assigned), len(found) - len(assigned)
@@ -86,7 +80,7 @@ def gospa(
 
 
 def half_spacing(true: Float[np.ndarray, "m 2"]) -> float | None:
-    """Half the median distance of a true landmark from its nearest neighbour: the cut-off."""
+    """Half the median nearest-neighbour distance of true landmarks, used as cut-off."""
     if len(true) < 2:
         return None
     apart = np.hypot(*(true[:, None] - true[None]).transpose(2, 0, 1))

@@ -1,4 +1,4 @@
-"""The peers of a log: each one's final map, the time of it, and the traffic of the set."""
+"""Peers of a log: final map, its time, and traffic of the set."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,12 +12,11 @@ _OF, _OVER, _OVER_BYTES = "set_submaps.", "set_over.", "set_over_bytes."
 
 @dataclass(frozen=True, kw_only=True)
 class PeerResult:
-    """The conclusion of one peer, as it has announced it.
+    """Announced conclusion of one peer.
 
-    complete_at_s: wall time from the log's beginning to its final map. uplink, downlink: bytes of
-    the set's messages that it published, each once, and received. have: submaps of each robot.
-    over: new members, by the node over which they came. agrees: other peers whose last summary was
-    of the same set.
+    complete_at_s: wall time from log start to its final map. uplink, downlink: bytes of set
+    messages published (each once) and received. have: submaps by robot. over: new members by
+    relaying node. agrees: peers whose last summary named the same set.
     """
 
     final_map_sha256: str | None
@@ -31,7 +30,7 @@ class PeerResult:
 
 
 def peer_results(log: Collected) -> dict[str, PeerResult]:
-    """The result of every robot that has a copy of the set."""
+    """Result of every robot with a copy of the set."""
     found = {}
     for robot in log.robots:
         status = log.sound(log.latest.get(ch.STATUS.key(ch.robot_node(robot))))
@@ -64,7 +63,7 @@ def _named(figures: Mapping[str, float], prefix: str) -> dict[str, int]:
 
 
 def peer_json(peer: PeerResult) -> dict[str, object]:
-    """The figures under the names that machines read."""
+    """Figures under their JSON names."""
     return {
         "final_map_sha256": peer.final_map_sha256,
         "submaps": peer.submaps,

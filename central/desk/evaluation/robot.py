@@ -1,4 +1,4 @@
-"""One robot in a log: its poses, its truth, and the dispositions of its measurements."""
+"""One robot in a log: poses, truth, and dispositions of its measurements."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from team.wire import messages as m
 from team.wire.arrays import floats
 
 REJECTED = "rejected: "
-"""The beginning of the disposition of a measurement that was rejected."""
+"""Prefix of a rejected measurement's disposition."""
 
 
 @dataclass(frozen=True)
 class RobotLog:
-    """A robot's paths with their covariances, and the truth; each may be empty.
+    """A robot's paths with covariances, and truth; each may be empty.
 
-    online_channel: "team/pose", else "central/pose", else "own/pose", or None. Only poses in the
-    frame of the evaluation are in `online`; outside: there are poses, and none is in it.
+    online_channel: "team/pose", "central/pose", "own/pose", or None. `online` has only poses in the
+    evaluated frame; outside: poses exist, but none in it.
     """
 
     truth: Path
@@ -37,11 +37,11 @@ class RobotLog:
 
 @dataclass(frozen=True)
 class Consumption:
-    """Measurements on the robot's sensor channels, and their dispositions by the robot.
+    """Measurements on a robot's sensor channels, and their dispositions.
 
     steps: odometry intervals. published: distinct measurements. consumed, ledger: from the robot's
-    `Done`; None and empty without one. each_once: no measurement lies in two submaps, and the
-    ledger adds up to what was consumed.
+    `Done`, else None and empty. each_once: no measurement lies in two submaps, and the ledger sums
+    to consumed.
     """
 
     steps: int
@@ -53,7 +53,7 @@ class Consumption:
 
     @property
     def rejected(self) -> dict[str, int]:
-        """The number of rejected measurements by reason, the most frequent first."""
+        """Rejected measurements by reason, most frequent first."""
         found = [
             (count, disposition.removeprefix(REJECTED))
             for disposition, count in self.ledger.items()
@@ -63,25 +63,25 @@ class Consumption:
 
     @property
     def used(self) -> int | None:
-        """The number of measurements in a submap or factor, or known to be the initial pose."""
+        """Number of measurements in a submap or factor, or used as initial pose."""
         if not self.ledger:
             return None
         return sum(self.ledger.values()) - sum(self.rejected.values())
 
     @property
     def open(self) -> int | None:
-        """The number of published measurements that are neither used nor rejected."""
+        """Number of published measurements neither used nor rejected."""
         return None if self.consumed is None else self.published - self.consumed
 
     @property
     def not_used(self) -> str:
-        """The numbers of rejected and open measurements with the reasons; empty without any."""
+        """Counts of rejected and open measurements with reasons, as text."""
         parts = [f"{count} rejected ({reason})" for reason, count in self.rejected.items()]
         return ", ".join([*parts, f"{self.open} open"] if self.open else parts)
 
 
 def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) -> RobotLog:
-    """The paths of one robot; is_in_frame: whether poses in the named frame are evaluated."""
+    """Collect one robot's paths; is_in_frame: whether a named frame is evaluated."""
     trajectories = [t for t in log.messages(ch.TRAJECTORY, robot) if isinstance(t, m.Trajectory)]
     truths = [t for t in log.messages(ch.TRUTH, robot) if isinstance(t, m.Truth)]
     smoothed, smoothed_covariances = _stacked(
@@ -112,7 +112,7 @@ def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) ->
 
 
 def consumption(log: Collected, robot: str) -> Consumption:
-    """The measurements of one robot and their dispositions."""
+    """Measurements of one robot and their dispositions."""
     dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
     submaps = {
         (s.incarnation, s.sequence): s
@@ -139,7 +139,7 @@ def consumption(log: Collected, robot: str) -> Consumption:
 
 
 def _disjoint(submaps: Sequence[m.Submap]) -> bool:
-    """Whether no measurement lies in two of the submaps, which are in order."""
+    """Whether ordered submaps share no measurement."""
     return all(
         a.incarnation != b.incarnation or a.last_measurement < b.first_measurement
         for a, b in pairwise(submaps)
@@ -153,7 +153,7 @@ def _short(channel: ch.Channel) -> str:
 def _stacked(
     parts: Sequence[tuple[np.ndarray, np.ndarray]], covariances: Sequence[np.ndarray]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """The parts as one path by stamp, the last of equal stamps; covariances likewise."""
+    """Stack parts into one path by stamp, keeping the last of equal stamps."""
     stamps = np.concatenate([np.empty(0, np.int64), *(stamps for stamps, _ in parts)])
     poses = np.concatenate([np.empty((0, 3)), *(poses for _, poses in parts)])
     order = np.argsort(stamps, kind="stable")

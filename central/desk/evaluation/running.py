@@ -1,4 +1,4 @@
-"""Compute errors of running estimates against the truth as soon as that arrives."""
+"""Compute errors of running estimates as truth arrives."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -22,25 +22,25 @@ from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 
 SPACING_NS = 100_000_000
-"""Least spacing of the estimates that are compared."""
+"""Least spacing of compared estimates."""
 WAITING = 4_096
-"""Most poses of a robot that wait for their truth; the oldest are dropped first."""
+"""Most poses per robot that await truth; the oldest are dropped."""
 BATCHES = 20_000
-"""Most batches of a robot's truth that are kept, the newest."""
+"""Most truth batches kept per robot."""
 
 
 @dataclass
 class TruthFrames:
-    """The frames in which truth is given: those that a known initial pose fixes.
+    """Frames with truth: those fixed by a known initial pose.
 
-    Estimates in another frame are not compared with the truth. Without initial poses every frame is
-    taken for one of them, as is that of a message that names none: both are of earlier versions.
+    Without initial poses every frame counts, as does a message without a frame (both from earlier
+    versions).
     """
 
     _starts: dict[str, bool] = field(default_factory=dict)
 
     def take(self, start: m.InitialPose) -> None:
-        """Take a stream's initial pose, known or not."""
+        """Register a stream's initial pose, known or not."""
         self._starts[translate.frame_name(start.robot, start.incarnation)] = bool(start.pose)
 
     def has(self, frame: str) -> bool:
@@ -49,14 +49,14 @@ class TruthFrames:
 
     @property
     def none_is_known(self) -> bool:
-        """Whether there are initial poses, and all of them are unknown."""
+        """Whether initial poses exist and all are unknown."""
         return bool(self._starts) and not any(self._starts.values())
 
 
 class MapFit(NamedTuple):
-    """A map against the truth, as it lies: the landmarks that have truth, and their errors.
+    """Unaligned map errors of the landmarks that have truth.
 
-    rmse_m: of their positions. nees: eᵀ P⁻¹ e of each in its own covariance, 2 degrees of freedom.
+    rmse_m: of positions. nees: eᵀ P⁻¹ e in each landmark's own covariance, 2 degrees of freedom.
     """
 
     rmse_m: float
@@ -69,32 +69,32 @@ class MapFit(NamedTuple):
 
     @property
     def nees_per_dof(self) -> float:
-        """The mean of NEES/2; 1 where the covariances are right."""
+        """Mean NEES/2; 1 if the covariances are right."""
         return float(self.nees.mean()) / 2.0
 
 
 @dataclass(frozen=True)
 class TrueLandmarks:
-    """The true positions [m] of the landmarks by id, ascending."""
+    """True landmark positions [m], by ascending id."""
 
     ids: UInt32[np.ndarray, " T"] = field(default_factory=lambda: np.empty(0, np.uint32))
     positions: Float[np.ndarray, "T 2"] = field(default_factory=lambda: np.empty((0, 2)))
 
     @classmethod
     def of(cls, message: m.TruthLandmarks) -> "TrueLandmarks":
-        """The landmarks that a world publishes for evaluators."""
+        """Convert the world's message."""
         return cls(*translate.landmarks_of(message))
 
     def known(self, ids: UInt32[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:
-        """Whether the truth of each landmark is known."""
+        """Mask of landmarks with truth."""
         return np.isin(ids, self.ids)
 
     def at(self, ids: UInt32[np.ndarray, " L"]) -> Float[np.ndarray, "L 2"]:
-        """The true positions of landmarks that are all known."""
+        """True positions; all must be known."""
         return self.positions[np.searchsorted(self.ids, ids)]
 
     def fit(self, fused: m.FusedMap) -> MapFit | None:
-        """The errors of a map's landmarks; None where the truth of none is known."""
+        """Errors of a map's landmarks; None without truth."""
         ids, means = translate.landmarks_of(fused)
         known = self.known(ids)
         if not known.any():
@@ -108,34 +108,34 @@ class TrueLandmarks:
 
 @dataclass
 class NeesTally:
-    """Squared errors in units of their covariance: Σ NEES/dof, how many, how many within 95 %."""
+    """Σ NEES/dof, count, and count within 95 %."""
 
     nees_per_dof: float = 0.0
     count: int = 0
     inside: int = 0
 
     def take(self, nees: Float[np.ndarray, " n"], dof: int) -> None:
-        """Add squared errors, each of `dof` degrees of freedom."""
+        """Add squared errors of `dof` degrees of freedom each."""
         self.nees_per_dof += float(nees.sum()) / dof
         self.count += len(nees)
         self.inside += int(np.count_nonzero(nees <= chi2_quantile(BAND, dof)))
 
     @property
     def mean(self) -> float | None:
-        """NEES per degree of freedom, 1 where the covariances are right; None without any."""
+        """Mean NEES per degree of freedom, or None."""
         return self.nees_per_dof / self.count if self.count else None
 
     @property
     def coverage(self) -> float | None:
-        """The share within 95 %; None without any."""
+        """Share within 95 %, or None."""
         return self.inside / self.count if self.count else None
 
 
 @dataclass
 class RunningErrors:
-    """The errors of one robot's running poses; truth and poses may come in either order.
+    """Errors of one robot's running poses; truth and poses in either order.
 
-    spacing_ns: team time between two poses that are compared; nearer ones are left out.
+    spacing_ns: least team time between compared poses.
     """
 
     spacing_ns: int = SPACING_NS
@@ -146,18 +146,18 @@ class RunningErrors:
     _truth: deque[Path] = field(default_factory=lambda: deque(maxlen=BATCHES))
 
     def take_truth(self, message: m.Truth) -> None:
-        """Take a batch of truth."""
+        """Add a batch of truth."""
         poses = floats(message.poses, "poses").astype(np.float64).reshape(-1, 3)
         times = stamps(message.stamps, "stamps").astype(np.int64)
         if len(times):
             self._truth.append(Path(times, poses))
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether a pose of this time is far enough from the last."""
+        """Whether a pose at this time is far enough from the last."""
         return self.last_ns is None or stamp_ns >= self.last_ns + self.spacing_ns
 
     def take_pose(self, message: m.PoseEstimate) -> None:
-        """Take an estimate, if it is not too near to the last."""
+        """Add an estimate, unless too near to the last."""
         if not self.is_due(message.stamp_ns):
             return
         self.last_ns = message.stamp_ns
@@ -166,7 +166,7 @@ class RunningErrors:
         self._poses.append((message.stamp_ns, pose, P))
 
     def known(self) -> PoseErrors | None:
-        """The errors of the poses for which truth has arrived since the last call."""
+        """Errors of the poses whose truth has arrived since the last call."""
         until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
         due = []
         while until is not None and self._poses and self._poses[0][0] <= until:
@@ -178,24 +178,24 @@ class RunningErrors:
         return pose_errors(path, np.array(covariances), self._path(times[-1]))
 
     def truth_at(self, stamp_ns: int) -> Float[np.ndarray, "3"] | None:
-        """The true pose at a time; None where it is not known."""
+        """True pose at a time, or None."""
         poses, known = interpolate_truth(self._path(stamp_ns), np.array([stamp_ns]))
         return poses[0] if known[0] else None
 
     def forget(self, before_ns: int) -> None:
-        """Forget older truth and poses, but for the last batch of truth before this time."""
+        """Discard older truth and poses, except the last truth batch before this time."""
         while len(self._truth) > 1 and int(self._truth[1].stamps_ns[0]) < before_ns:
             self._truth.popleft()
         while self._poses and self._poses[0][0] < before_ns:
             self._poses.popleft()
 
     def forget_poses(self) -> None:
-        """Forget the poses that wait for their truth, to replace them by others."""
+        """Discard poses that await truth, before others replace them."""
         self._poses.clear()
         self.last_ns = None
 
     def _path(self, until_ns: int) -> Path:
-        """The truth up to the first batch that reaches beyond a time, in order."""
+        """Ordered truth up to the first batch that reaches beyond a time."""
         batches: list[Path] = []
         for batch in self._truth:
             batches.append(batch)

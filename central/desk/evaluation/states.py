@@ -1,4 +1,4 @@
-"""The state of each robot of a team in the final map."""
+"""State of each robot in the final map."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -9,15 +9,16 @@ from team.wire import channels as ch
 from team.wire import messages as m
 
 State = Literal["joined", "not joined", "withdrawn", "lost", "alone"]
-"""joined: in the team's map. not joined: its map, if it has one, is beside the team's. withdrawn:
-left out by an order, or since it contradicts the rest. lost: its stream is not wholly in the map.
-alone: the rule fuses nothing."""
+"""joined: in the team's map. not joined: its map, if any, is separate. withdrawn: by an order, or
+since it contradicts the rest. lost: its stream is incomplete in the map. alone: the rule does not
+fuse.
+"""
 UNNAMED_REASON = "the log does not contain the reason"
 NO_MEMBER = "nothing of it is in the map"
 
 
 class RobotState(NamedTuple):
-    """A robot's state in the final map, and the reason for any but joined; in words."""
+    """Robot state in the final map, and the reason unless joined."""
 
     state: State
     why: str = ""
@@ -26,7 +27,7 @@ class RobotState(NamedTuple):
 def robot_states(
     log: Collected, fused: m.FusedMap | None, robots: Collection[str]
 ) -> dict[str, RobotState]:
-    """The state of every robot of the team; empty without a final map."""
+    """State of every robot; empty without a final map."""
     if fused is None:
         return {}
     members = {member.robot for member in fused.members}
@@ -40,7 +41,7 @@ def robot_states(
         if name in fused.withdrawn:
             return RobotState("withdrawn", because.get(name, UNNAMED_REASON))
         if name in fused.lost:
-            return RobotState("lost", "its stream is not wholly in the map")
+            return RobotState("lost", "its stream is incomplete in the map")
         if name in apart:
             return RobotState("not joined", apart[name])
         if name in members:
@@ -51,7 +52,7 @@ def robot_states(
 
 
 def _withdrawals(log: Collected) -> Iterator[tuple[str, str]]:
-    """The robots that were withdrawn, by whom and why; an order comes last, since it holds."""
+    """Withdrawn robots, by whom and why; orders last, since they prevail."""
     for channel in (ch.WITHDRAWAL, ch.ORDER):
         for key in sorted(log.samples):
             if channel.owner(key) is None:
@@ -63,13 +64,13 @@ def _withdrawals(log: Collected) -> Iterator[tuple[str, str]]:
 
 
 def _reason_in(fused: m.FusedMap, name: str) -> str:
-    """Reason of a robot's absence in a map of another rule than `join`."""
+    """Reason for a robot's absence in a map of a rule other than `join`."""
     found = (each.partition(": ") for each in fused.reasons)
     return next((why for who, _, why in found if who == name), "")
 
 
 def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
-    """The robots that are not, or not wholly, in the map, with their states, in words."""
+    """Robots not or incompletely in the map, with state, as text."""
     return tuple(
         f"{name} {of.state}{': ' if of.why else ''}{of.why}"
         for name, of in states.items()

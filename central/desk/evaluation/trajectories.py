@@ -1,7 +1,7 @@
-"""Absolute and relative errors of a path, with the definitions that evo and the field use.
+"""Absolute and relative path errors, as defined by evo.
 
 Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012. `evo_ape` and
-`evo_rpe` give the same figures for the files that `central.desk.export.tum` writes.
+`evo_rpe` give the same figures for files written by `central.desk.export.tum`.
 """
 
 from dataclasses import asdict, dataclass
@@ -22,12 +22,11 @@ from central.desk.evaluation.errors import (
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """RMS over the poses that have truth; angles in radians; alignment is rigid, without scale.
+    """RMS over poses with truth; radians; rigid alignment without scale.
 
-    ape_m, ape_rad: pose against true pose, as the path lies (evo: -r trans_part, angle_rad).
-    ape_aligned_m, ape_aligned_rad: after the motion that aligns the positions best (evo: -a); None
-    where it is not determined. rpe_m, rpe_rad: the motion from each pose to the next one against
-    the true one (evo: --delta 1 --delta_unit f); no alignment changes it; None below two poses.
+    ape_m, ape_rad: absolute, unaligned (evo: -r trans_part, angle_rad). ape_aligned_m,
+    ape_aligned_rad: after the best position alignment (evo: -a); None if undetermined. rpe_m,
+    rpe_rad: motion between consecutive poses (evo: --delta 1 --delta_unit f); None below two poses.
     """
 
     poses: int
@@ -44,14 +43,14 @@ class TrajectoryErrors:
 
 
 def associate_truth(path: Path, truth: Path) -> tuple[Path, Path]:
-    """The poses of the path that have truth, and the true poses at the same stamps."""
+    """Poses of the path with truth, and the true poses at these stamps."""
     poses, known = interpolate_truth(truth, path.stamps_ns)
     stamps = path.stamps_ns[known]
     return Path(stamps, path.poses[known]), Path(stamps, poses[known])
 
 
 def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
-    """The errors of a path; None where no pose of it has truth."""
+    """Errors of a path; None without truth."""
     estimate, true = (each.poses for each in associate_truth(path, truth))
     if not len(estimate):
         return None
@@ -72,7 +71,6 @@ def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
 
 
 def _relative(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """a⁻¹ ∘ b of each row."""
     dx, dy = (b[:, :2] - a[:, :2]).T
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.column_stack((c * dx + s * dy, c * dy - s * dx, on_circle(b[:, 2] - a[:, 2])))

@@ -1,4 +1,4 @@
-"""An operator's verdicts on pairs of landmarks without names, and their effect on the map."""
+"""Operator verdicts on pairs of unnamed landmarks, and their effect on the map."""
 
 from collections.abc import Collection
 
@@ -10,17 +10,17 @@ Pair = frozenset[m.LocalLandmark]
 
 
 def pair_of(judgement: m.Judgement) -> Pair:
-    """The two landmarks, in whichever order they were named."""
+    """Unordered pair of the two landmarks."""
     return frozenset((judgement.first, judgement.second))
 
 
 def name_of(landmark: m.LocalLandmark) -> str:
-    """As `r1/1/12/7`: robot, incarnation, submap, local landmark."""
+    """Format as `r1/1/12/7`: robot, incarnation, submap, local landmark."""
     return f"{landmark.robot}/{landmark.incarnation}/{landmark.sequence}/{landmark.local}"
 
 
 def in_words(judgement: m.Judgement) -> str:
-    """A verdict in words."""
+    """Verdict as text."""
     first, second = name_of(judgement.first), name_of(judgement.second)
     return f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
 
@@ -28,10 +28,10 @@ def in_words(judgement: m.Judgement) -> str:
 def contradicting(
     judgement: m.Judgement, others: Collection[m.Judgement]
 ) -> tuple[m.Judgement, ...]:
-    """The fewest of the others that can not hold together with a verdict; empty where all can.
+    """Smallest set of other verdicts that contradicts a verdict; empty if consistent.
 
-    They are a chain of landmarks that are one, this verdict perhaps among them, and, last, that its
-    two ends are two.
+    A chain of "same" verdicts (possibly with this one), and last the "different" verdict on its
+    ends.
     """
     pair = pair_of(judgement)
     same = [each for each in others if each.same and pair_of(each) != pair]
@@ -52,10 +52,10 @@ def contradicting(
 def _chain(
     first: m.LocalLandmark, last: m.LocalLandmark, same: Collection[m.Judgement]
 ) -> list[m.Judgement] | None:
-    """The shortest chain of verdicts by which two landmarks are one; None where there is none."""
+    """Shortest chain of "same" verdicts between two landmarks."""
     chains: dict[m.LocalLandmark, list[m.Judgement]] = {first: []}
     reached = [first]
-    for at in reached:  # it grows
+    for at in reached:  # grows during the loop
         for each in same:
             pair = pair_of(each)
             for other in pair - {at} if at in pair else ():
@@ -66,7 +66,7 @@ def _chain(
 
 
 def verdicts_given(log: Collected) -> tuple[str, ...]:
-    """Each verdict of a log in words, in the order in which they were given."""
+    """Verdicts of a log as text, in order."""
     keys = [key for key in log.samples if ch.VERDICT.owner(key) is not None]
     samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
     given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]

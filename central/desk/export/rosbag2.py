@@ -1,7 +1,7 @@
-"""Export a run as a ROS 2 bag that RViz, Foxglove and evo open.
+"""Export a run as a ROS 2 bag for RViz, Foxglove and evo.
 
-For each robot: its odometry (dead reckoning from the logged intervals) with odom → base on the
-transform topic, and the messages of `team.ros2_answers`. Log times are team time.
+Each robot's dead-reckoned odometry with odom → base on the transform topic, and the messages of
+`team.ros2_answers`. Log times are team time.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,7 +27,7 @@ ODOMETRY_HZ = 50.0
 
 
 class _Robot:
-    """Dead reckoning and answers of one robot."""
+    """Dead reckoning and ROS 2 answers of one robot."""
 
     def __init__(self, name: str) -> None:
         self.config: RobotConfig | None = None
@@ -39,7 +39,7 @@ class _Robot:
         self._written_ns = -(2**62)
 
     def drive(self, message: m.AnyOdometry) -> Iterator[Answer]:
-        """The odometry's pose after an interval, at most ODOMETRY_HZ."""
+        """Odometry pose after an interval, at most ODOMETRY_HZ."""
         if self.config is None:
             return
         if message.incarnation != self.incarnation:
@@ -60,7 +60,7 @@ class _Robot:
 
 
 def answers_of(log: Log) -> Iterator[Answer]:
-    """The ROS 2 messages of a log, in the order of its messages."""
+    """ROS 2 messages of a log, in log order."""
     robots: dict[str, _Robot] = {}
     team = Answers(Names(TEAM_SPACE))
     final = False
@@ -89,9 +89,9 @@ def answers_of(log: Log) -> Iterator[Answer]:
 def export_rosbag2(
     log: Log, folder: Path, progress: Callable[[int], None] = lambda _: None
 ) -> dict[str, int]:
-    """Write a bag (MCAP) into a new folder; returns the number of messages by topic.
+    """Write a bag (MCAP) into a new folder; returns message counts by topic.
 
-    Raises LogError for a log without a robot's odometry or pose.
+    Raises LogError for a log without odometry or poses.
     """
     counts = dict[str, int]()
     with new_bag(folder) as bag:

@@ -1,8 +1,7 @@
-"""Write the results of a run, the map and the paths, as tables in common formats.
+"""Write a run's map and paths as tables in common formats.
 
-`map.csv` and `map.json` have a landmark a row, `paths/<robot>.csv` and `.tum` a pose a row. Metres,
-seconds, radians, all in the frame that the map names; numbers with all digits, so that they are
-read back to the last bit.
+`map.csv` and `map.json` have one landmark per row, `paths/<robot>.csv` and `.tum` one pose. Metres,
+seconds, radians, in the frame that the map names; numbers have all digits.
 """
 
 import csv
@@ -38,25 +37,19 @@ PATH_COLUMNS = (
 
 @dataclass(frozen=True)
 class TakenHome:
-    """The robots' smoothed paths, and the number of measurements of each landmark in the log."""
+    """Robots' smoothed paths, and measurement counts of the landmarks in the log."""
 
     paths: Mapping[str, SmoothedPath]
     measurements: Mapping[int, int]
 
 
 def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
-    """The paths at keyframe rate and the counts of a log; `progress` is called with each robot's
-    name.
-    """
+    """Paths at keyframe rate and measurement counts; `progress` receives each robot's name."""
     return TakenHome(smoothed_paths(found, progress), measurement_counts(found))
 
 
 def measurement_counts(found: Recorded) -> Mapping[int, int]:
-    """By how many measurements each landmark of the final map was seen.
-
-    Of landmarks without names those of a submap's window count that it has given to one of its
-    landmarks.
-    """
+    """Number of measurements of each landmark of the final map."""
     counts = Counter[int]()
     for stream in found.measurements.values():
         for message in stream.values():
@@ -74,7 +67,6 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
 
 
 def _detections(submap: m.Message) -> Iterator[tuple[tuple[str, int, int, int], int]]:
-    """The number of detections of each unnamed landmark of a submap."""
     assert isinstance(submap, m.Submap)
     numbers = ids(submap.ids, "ids")
     unnamed = (numbers[numbers >= UNNAMED] - UNNAMED).tolist()
@@ -87,8 +79,8 @@ def write_map(
 ) -> list[FilePath]:
     """Write map.csv and map.json; returns the files.
 
-    A landmark's covariance is its own 2 × 2 block; the correlations between landmarks are in the
-    log. The number of measurements of a landmark without a name is absent where no submap tells it.
+    Covariances are 2 × 2 blocks; correlations between landmarks are in the log. The count of an
+    unnamed landmark is absent if no submap reports it.
     """
     rows: list[dict[str, Any]] = []
     blocks = landmark_blocks(fused.covariance)
@@ -115,7 +107,7 @@ def write_map(
 
 
 def write_paths(paths: Mapping[str, SmoothedPath], folder: FilePath) -> list[FilePath]:
-    """Write <robot>.csv and <robot>.tum into the folder; returns the files."""
+    """Write <robot>.csv and <robot>.tum; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for robot, path in paths.items():

@@ -1,4 +1,4 @@
-"""Paths as files of the TUM format, which evo and most tools for trajectories read.
+"""Paths in the TUM format, as read by evo and most trajectory tools.
 
 One pose a line, `timestamp tx ty tz qx qy qz qw`: seconds, metres, a unit quaternion.
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
@@ -17,9 +17,7 @@ KINDS = ("smoothed", "online")
 
 
 def write_tum(path: Path, file: FilePath) -> None:
-    """Write a planar path: z = 0, rotations about z; stamps to the nanosecond, poses with all
-    digits.
-    """
+    """Write a planar path (z = 0), with nanosecond stamps and poses with all digits."""
     half = 0.5 * path.poses[:, 2]
     with file.open("w", encoding="ascii", newline="\n") as lines:
         lines.write("# timestamp tx ty tz qx qy qz qw\n")
@@ -30,17 +28,16 @@ def write_tum(path: Path, file: FilePath) -> None:
 
 
 def seconds(stamp_ns: int) -> str:
-    """A stamp in seconds, to the nanosecond."""
+    """Stamp in seconds with nanosecond digits."""
     whole, rest = divmod(abs(stamp_ns), 10**9)
     return f"{'-' * (stamp_ns < 0)}{whole}.{rest:09d}"
 
 
 def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:
-    """Write every robot's existing paths into the folder; returns the files.
+    """Write every robot's paths; returns the files.
 
-    r1.smoothed.tum, r1.online.tum, r1.truth.tum; where there is truth, r1.smoothed.truth.tum and
-    r1.online.truth.tum are the true poses at the stamps of the path, for tools that compare pose
-    with pose.
+    r1.smoothed.tum, r1.online.tum, r1.truth.tum; with truth, r1.smoothed.truth.tum and
+    r1.online.truth.tum hold the true poses at the path's stamps.
     """
     written = []
     folder.mkdir(parents=True, exist_ok=True)
@@ -59,7 +56,7 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
 def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
     """Write every robot's paths in the TUM format; returns the files.
 
-    Raises `LogError` for a log without a path, such as one of sensor measurements alone.
+    Raises `LogError` for a log without a path.
     """
     written = write_trajectories(evaluate(log.samples()), folder)
     if not written:

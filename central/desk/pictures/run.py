@@ -1,4 +1,4 @@
-"""Pictures of a run: the map with its uncertainty, and the robots' errors within their bounds."""
+"""Draw the map with its uncertainty, and robot errors with their bounds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ from central.desk.pictures.style import save
 from team.config import UNNAMED
 from team.estimation.geometry import inverse
 
-# Matplotlib takes half a second to import: a run that draws nothing has no use for it
+# Matplotlib takes half a second to import.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -34,18 +34,18 @@ if TYPE_CHECKING:
 DRAWN_ROBOTS = 12
 """Most rows of the error picture."""
 DRAWN_POINTS = 4000
-"""Most points of one line; longer paths are thinned."""
+"""Most points of a line; longer paths are thinned."""
 DRAWN_BARS = 60
-"""Most smoothed poses with an error bar, evenly spaced; more would hide the online poses."""
+"""Most error bars, evenly spaced; more would hide the online poses."""
 LABELLED_LANDMARKS = 60
 
 
 def map_picture(
     evaluation: Evaluation, path: FilePath, paths: Mapping[str, SmoothedPath] = MappingProxyType({})
 ) -> bool:
-    """Landmarks with 95 % ellipses, the truth, the paths; False where there is nothing to draw.
+    """Draw landmarks with 95 % ellipses, truth and paths; False if there is nothing to draw.
 
-    paths: smoothed ones at the rate of keyframes; without them lines go from submap to submap.
+    paths: smoothed at keyframe rate; otherwise lines join submap ends.
     """
     if evaluation.map is None and not evaluation.robots:
         return False
@@ -84,7 +84,7 @@ def map_picture(
 
 
 def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
-    """Where the map's frame is arbitrary, the truth moved into it by the map's alignment."""
+    """Move the truth into an arbitrary map frame by the map's alignment."""
     fused = evaluation.map
     motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
     if not evaluation.arbitrary_frame or motion is None:
@@ -103,10 +103,9 @@ def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
 
 
 def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
-    """Errors of x, y and heading over team time with ±3σ.
+    """Draw errors of x, y and heading over team time with ±3σ.
 
-    False where no robot has truth, or where the map's frame is arbitrary, so that errors have no
-    meaning without alignment.
+    False without truth, or for an arbitrary map frame, whose errors need alignment.
     """
     if evaluation.arbitrary_frame:
         return False
@@ -139,9 +138,9 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
 def new_figure(
     width: float, height: float, rows: int, columns: int, heights: Sequence[float] | None = None
 ) -> "tuple[Figure, list[list[Axes]]]":
-    """A figure on Agg without pyplot's global state, with its axes by row and column.
+    """Create an Agg figure without pyplot's global state, and its axes by row and column.
 
-    heights: those of the rows in relation to each other; None: all the same.
+    heights: relative row heights; None: equal.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -163,10 +162,10 @@ def _draw_paths(
     dense: SmoothedPath | None,
     apart: bool,
 ) -> None:
-    """The true path thin, a square at its start; the smoothed path, or else the online one.
+    """Draw the true path with its start, and the smoothed or else the online path.
 
-    apart: other robots have smoothed paths, and this one none: its online path is in no frame of
-    the map, and is left out.
+    apart: other robots have smoothed paths and this one has none, so its online path is not in the
+    map frame and is omitted.
     """
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
     line = smoothed if dense is None else _thinned(Path(dense.stamps_ns, dense.poses))
@@ -207,7 +206,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     )  # fmt: skip
     blocks = landmark_blocks(fused.covariance)
     draw_ellipses(axis, fused.means, blocks, MAP_COLOUR, width=1.1, zorder=7)
-    named = fused.ids < UNNAMED  # numbers of landmarks without names have no meaning
+    named = fused.ids < UNNAMED  # numbers of unnamed landmarks have no meaning
     if 0 < np.count_nonzero(named) <= LABELLED_LANDMARKS:
         means = fused.means[named]
         for landmark, mean, offset in zip(
@@ -227,10 +226,9 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
 
 
 def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
-    """The offset of each point's label [typographic points], away from its neighbours.
+    """Label offset of each point [typographic points], away from its neighbours.
 
-    Neighbours are the points within a twentieth of the map's extent; without any the offset is to
-    the upper right.
+    Neighbours lie within a twentieth of the map's extent; without any, offset to the upper right.
     """
     reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
     offsets = np.empty_like(points)
@@ -276,7 +274,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
 
 
 def _fit(axis: "Axes", errors: Float[np.ndarray, " n"], bound: float) -> None:
-    """Limit the axis so that all but one error in 500 are inside, and write how many are not."""
+    """Limit the axis to all but one error in 500, and annotate the number outside."""
     most = float(errors.max(initial=0.0))
     limit = 1.1 * max(bound, float(np.quantile(errors, 0.998)) if len(errors) else 0.0)
     if most <= 1.5 * limit:
@@ -301,7 +299,7 @@ def _thinned(path: Path) -> Path:
 
 
 def thinning(count: int) -> slice:
-    """The slice of a line's points that leaves about DRAWN_POINTS of them at most."""
+    """Slice that leaves at most about DRAWN_POINTS."""
     return slice(None, None, max(1, count // DRAWN_POINTS))
 
 
@@ -310,7 +308,6 @@ def _heading(evaluation: Evaluation) -> str:
 
 
 def _title(evaluation: Evaluation) -> list[str]:
-    """Data set, or scenario and seed; estimator, rule and errors."""
     fused = evaluation.map
     second = [evaluation.method] if evaluation.method else []
     if fused is None:

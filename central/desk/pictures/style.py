@@ -1,4 +1,4 @@
-"""The look and the file format of pictures: for a screen, or for a paper."""
+"""Style and file format of pictures, for screen or paper."""
 
 import re
 from collections.abc import Iterator
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 DPI = 120
 PAPER_DPI = 300
 COLUMN_IN, TEXT_IN = 3.5, 7.16
-"""Widths of a column and of a page's text in two columns [inches]."""
+"""Column and text width of a two-column page [inches]."""
 PAPER_PT, POINT_PT = 8.0, 6.0
-"""Sizes of text for a paper, and there of the labels of single points [points]."""
+"""Text size on paper, and size of point labels [points]."""
 LEAST_IN, MOST_IN = 1.0, 40.0
 INCHES = {"in": 1.0, "mm": 1.0 / 25.4, "cm": 1.0 / 2.54, "pt": 1.0 / 72.27}
 
 
 def parsed_width(text: str) -> float:
-    """A width such as 3.5in, 89mm, 8.9cm or 252pt [inches]; raises ValueError."""
+    """Parse a width such as 3.5in, 89mm, 8.9cm or 252pt [inches]; raises ValueError."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(in|mm|cm|pt)", text.strip())
     width = float(found[1]) * INCHES[found[2]] if found else 0.0
     if not LEAST_IN <= width <= MOST_IN:
@@ -53,7 +53,7 @@ class Picture(StrEnum):
 
 
 class Look(StrEnum):
-    """For a screen with titles; for a paper without, since the caption has them."""
+    """Screen pictures have titles; paper pictures have captions instead."""
 
     SCREEN = "screen"
     PAPER = "paper"
@@ -61,10 +61,9 @@ class Look(StrEnum):
 
 @dataclass(frozen=True)
 class Style:
-    """The look and the form of every picture of a report; only: the one picture that is drawn.
+    """Style and format of a report's pictures; only: the one picture drawn.
 
-    width_in: of a picture for a paper [inches]; None: COLUMN_IN, or TEXT_IN where it has several
-    panels.
+    width_in: paper width [inches]; None: COLUMN_IN, or TEXT_IN for several panels.
     """
 
     look: Look = Look.SCREEN
@@ -73,13 +72,13 @@ class Style:
     width_in: float | None = None
 
     def file_name(self, picture: Picture) -> str:
-        """The name of a picture's file, which for a paper is not that of the page's."""
+        """File name of a picture; differs between paper and page."""
         paper = "-paper" if self.look is Look.PAPER and self.form is Form.PNG else ""
         return f"{picture}{paper}.{self.form}"
 
     @property
     def drawn(self) -> tuple[Picture, ...]:
-        """The pictures that are drawn."""
+        """Pictures that are drawn."""
         return tuple(Picture) if self.only is None else (self.only,)
 
 
@@ -89,7 +88,7 @@ _current: ContextVar[Style] = ContextVar("style", default=SCREEN)
 
 @contextmanager
 def drawn_in(style: Style) -> Iterator[None]:
-    """Pictures that are drawn in this context have this style."""
+    """Apply the style within this context."""
     from matplotlib import rc_context, rcParams
 
     token = _current.set(style)
@@ -106,8 +105,8 @@ def drawn_in(style: Style) -> Iterator[None]:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a picture in the format of its name's suffix; for a paper without its titles, in its
-    width, with all text in PAPER_PT.
+    """Write a picture in its suffix's format; for paper without titles, in its width, with text in
+    PAPER_PT.
     """
     style = _current.get()
     if style.look is not Look.PAPER:
@@ -121,10 +120,9 @@ def save(figure: "Figure", path: Path) -> None:
 
 
 def _resize(figure: "Figure", width_in: float | None) -> None:
-    """Scale a figure to a width: lines and markers shrink with it, text has PAPER_PT.
+    """Scale a figure to a width: lines and markers shrink, text has PAPER_PT.
 
-    Labels of single points are smaller. In a column legends lie below their axes, and panels have
-    no titles.
+    Point labels are smaller. In a column, legends lie below their axes, and panels have no titles.
     """
     from matplotlib.lines import Line2D
     from matplotlib.text import Annotation, Text

@@ -1,4 +1,4 @@
-"""Pictures of a run over its team time: consistency, traffic, latency, events."""
+"""Draw a run over team time: consistency, traffic, latency, events."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
@@ -30,23 +30,22 @@ from team.estimation.consistency import chi2_interval
 from team.wire import channels as ch
 from team.wire.channels import channel_of
 
-if TYPE_CHECKING:  # as in central.desk.pictures.run: Matplotlib is slow to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
 BINS = 40
-"""Number of intervals of team time over which values are summed."""
 RATE_POINTS, RATE_WINDOWS = 200, 10.0
-"""Points of a line of bytes per second, and the run's length in units of its window."""
+"""Points of a rate line, and run length in windows."""
 BAND = 0.95
 BAND_COLOUR = "#d9ead3"
 WARN, FAIL = 1.1, 1.3
-"""The levels of the centre's consistency monitor."""
+"""Levels of the centre's consistency monitor."""
 LOGARITHMIC_FROM = 12.0
-"""A NEES beyond this is drawn on a logarithmic axis."""
+"""NEES from which the axis is logarithmic."""
 SHOWN_KEYS = 8
 _OTHERS = ("central", "recorder", "world")
-"""Nodes that are no robots: below these in the timeline."""
+"""Nodes other than robots, below these in the timeline."""
 EVENT_STYLES = {
     "joined": ("o", GREEN), "lost": ("X", RED), "restarted": ("^", ORANGE), "left": ("<", GREY),
     "map": ("D", BLUE), "closure": ("d", BLUE), "undone": ("d", RED), "withdrawn": ("P", PURPLE),
@@ -58,9 +57,9 @@ EVENT_STYLES = {
 def binned(
     history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
-    """Sums of each of the values in the BINS intervals of the run; empty intervals are left out.
+    """Sum each value over the BINS intervals of the run; empty intervals are omitted.
 
-    Returns the intervals' middles [s] and the sums; values outside the run count to its ends.
+    Returns interval middles [s] and sums; values outside the run count at its ends.
     """
     where = _bins(history, stamps_ns)
     filled = np.bincount(where, minlength=BINS) > 0
@@ -69,19 +68,17 @@ def binned(
 
 
 def _edges(history: History) -> Float[np.ndarray, " e"]:
-    """The ends of the run's BINS intervals [s]."""
     return np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
 
 
 def _middles(history: History) -> Float[np.ndarray, " b"]:
-    """The middles of the run's BINS intervals [s]."""
     edges = _edges(history)
     middles: Float[np.ndarray, " b"] = 0.5 * (edges[1:] + edges[:-1])
     return middles
 
 
 def _bins(history: History, stamps_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """The interval of each stamp; stamps outside the run count to its ends."""
+    """Interval of each stamp; stamps outside the run count at its ends."""
     at: Int64[np.ndarray, " n"] = np.searchsorted(
         _edges(history), history.seconds(stamps_ns), "right"
     )
@@ -90,9 +87,9 @@ def _bins(history: History, stamps_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndar
 
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
-    """NEES of poses and map, NIS, joint cost, each per degree of freedom over team time.
+    """Draw NEES of poses and map, NIS and joint cost per degree of freedom over team time.
 
-    Panels without values are left out; False where there is none at all.
+    Empty panels are omitted; False if all are empty.
     """
     panels = [
         draw
@@ -178,7 +175,7 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     axis.axhline(1.0, color="#888888", linewidth=0.8)
     _scale(axis, max(largest, *highs, 1.5))
     axis.set_ylabel("NIS per dof")
-    axis.set_title("Measurements against what the particles expected: needs no truth", fontsize=10)
+    axis.set_title("Measurements against the particles' predictions: needs no truth", fontsize=10)
 
 
 def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
@@ -215,7 +212,7 @@ def _scale(axis: "Axes", largest: float) -> None:
 
 
 def traffic_picture(history: History, path: FilePath) -> bool:
-    """Payload bytes per second of team time: by channel, and by robot."""
+    """Draw payload bytes per second of team time, by channel and robot."""
     if not history.traffic:
         return False
     figure, axes = new_figure(9.0, 6.6, 2, 1)
@@ -252,10 +249,9 @@ def _rate(
     at_s: Float[np.ndarray, " k"],
     width_s: float,
 ) -> Float[np.ndarray, " k"]:
-    """Bytes per second about each time, weighted by a triangle that is width_s wide on each side.
+    """Bytes per second about each time, with a triangular window of half-width width_s.
 
-    With this window, messages at regular intervals, such as submaps, have a constant rate; with
-    bins the rate would oscillate.
+    The window gives regular messages such as submaps a constant rate; bins would make it oscillate.
     """
     order = np.argsort(seconds, kind="stable")
     times, sums = seconds[order], np.concatenate(([0.0], np.cumsum(sizes[order])))
@@ -292,9 +288,7 @@ def _draw_rates(axis: "Axes", history: History, groups: Mapping[str, Sequence[Tr
 
 
 def _log_scale(axes: "Axes", axis: "Axis") -> None:
-    """A logarithmic scale with plain numbers: 1, 2, 5, 10 where it spans few powers of ten, and
-    more where it spans less than one.
-    """
+    """Set a logarithmic scale with plain tick numbers, denser over a short range."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     upright = axis is axes.yaxis
@@ -307,10 +301,10 @@ def _log_scale(axes: "Axes", axis: "Axis") -> None:
 
 
 def latency_picture(history: History, path: FilePath) -> bool:
-    """Wall time from a submap's first and last measurement to the first map that used it.
+    """Draw wall time from a submap's first and last measurement to its first map.
 
-    Above every submap over team time, with the median of all robots; below a row for each robot,
-    with its median and the range of 95 % of its submaps.
+    Above, every submap over team time with the median of all robots; below, each robot's median and
+    95 % range.
     """
     if not history.latencies:
         return False
@@ -374,7 +368,6 @@ def latency_picture(history: History, path: FilePath) -> bool:
 def _medians(
     history: History, stamps_ns: Int64[np.ndarray, " n"], values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
-    """The median of the values in each of the run's BINS intervals that has any."""
     where = _bins(history, stamps_ns)
     filled = np.unique(where)
     middles = np.array([np.median(values[where == each]) for each in filled])
@@ -382,7 +375,7 @@ def _medians(
 
 
 def timeline_picture(history: History, path: FilePath) -> bool:
-    """A row for each node, a mark for each of its events."""
+    """Draw one row per node, one mark per event."""
     nodes = list(dict.fromkeys(event.of for event in history.events))
     if not nodes:
         return False
@@ -409,7 +402,7 @@ def timeline_picture(history: History, path: FilePath) -> bool:
 
 
 def channel_name(key: str) -> str:
-    """The name of a key's channel; a viewer's keys have one name."""
+    """Channel name of a key; a viewer's keys have one name."""
     found = channel_of(key)
     if found is not None:
         return found[0].name
@@ -417,9 +410,7 @@ def channel_name(key: str) -> str:
 
 
 def publisher(key: str) -> str | None:
-    """The robot whose node publishes on this key; None for other publishers, its sensors
-    included.
-    """
+    """Robot whose node publishes on this key; None for others, including its sensors."""
     found = channel_of(key)
     if found is None or found[0] in ch.SENSORS:
         return None

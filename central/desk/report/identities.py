@@ -1,4 +1,4 @@
-"""The tables on landmarks without names: their scores, and the decisions on them."""
+"""Tables on unnamed landmarks: scores and decisions."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ LISTED = 200
 
 
 def score_sheet(found: AssociationResult) -> Sheet:
-    """The scores inside windows and over all."""
+    """Scores inside windows and over all."""
     rows = [_row("inside windows", found.inside), _row("over all", found.pairs)]
     return Sheet(SCORE_HEADINGS, rows, _score_note(found))
 
@@ -37,7 +37,6 @@ def _row(name: str, pairs: Pairs) -> tuple[str, ...]:
 
 
 def _score_note(found: AssociationResult) -> str:
-    """The other results of the labels, in words."""
     return (
         f"{found.landmarks} landmarks without names in all submaps, with those that the final map "
         "leaves out, that were given up, and that are of robots that are not joined; "
@@ -49,9 +48,7 @@ def _score_note(found: AssociationResult) -> str:
 
 
 def decision_sheet(decisions: Sequence[m.AssociationDecision]) -> Sheet:
-    """A row for each closure and merge: accepted and undone ones with the newest first, then those
-    that wait.
-    """
+    """One row per closure and merge: accepted and undone ones, newest first, then pending ones."""
     made = [each for each in decisions if each.kind != "waits"]
     waits = [each for each in decisions if each.kind == "waits"]
     rows = [

@@ -1,4 +1,4 @@
-"""Write the report as a folder: one self-contained page, its pictures, the figures."""
+"""Write the report as a folder: a self-contained page, pictures, figures."""
 
 import base64
 import json
@@ -44,7 +44,6 @@ NIS_NOTE = (
     "(range_white, bearing_white): the particles take every error for a new one."
 )
 _ORIGIN = ("commit", "seed", "command", "python")
-"""Metadata of a log that come first."""
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -79,7 +78,7 @@ PSS_NOTE = (
 
 
 def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str, Path]:
-    """Draw the pictures of a run in a style; returns by name those that had something to show."""
+    """Draw a run's pictures; returns the non-empty ones by name."""
     evaluation, history = run.evaluation, run.history
     draw: dict[Picture, Callable[[Path], bool]] = {
         Picture.MAP: lambda path: map_picture(evaluation, path, run.paths),
@@ -96,9 +95,9 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
 
 
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
-    """Write report.html, report.json, pictures and trajectories into the folder; returns the files.
+    """Write report.html, report.json, pictures and trajectories; returns the files.
 
-    figures: those of the evaluation and of the run. A picture without data is left out.
+    figures: of the evaluation and the run. Empty pictures are omitted.
     """
     directory.mkdir(parents=True, exist_ok=True)
     evaluation = run.evaluation
@@ -119,7 +118,6 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
 
 
 def _taken_home(run: Run, directory: Path) -> list[Path]:
-    """The map and the paths as tables, where there are any; returns the files."""
     home, written = run.taken_home, []
     if run.evaluation.map is not None:
         written += write_map(
@@ -162,19 +160,17 @@ def _page(
 
 
 def _identities(run: Run) -> list[str]:
-    """The section on landmarks without names: scores, closures and merges."""
     evaluation = run.evaluation
     parts = [] if evaluation.association is None else _sheet(score_sheet(evaluation.association))
     return parts + (_sheet(decision_sheet(evaluation.decisions)) if evaluation.decisions else [])
 
 
 def _peers(run: Run) -> list[str]:
-    """Each robot's copy of the team's set, where there are peers."""
     return _sheet(peer_sheet(run.evaluation)) if run.evaluation.peers else []
 
 
 def _processes(processes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
-    """The resources of each process of a launch, which are not in its log."""
+    """Resources of each launched process, which are not in the log."""
     if not processes:
         return []
     rows = [
@@ -194,7 +190,6 @@ def _notes(run: Run) -> str:
 
 
 def _own_maps(run: Run) -> list[str]:
-    """The robots' own maps, where there is no fused map."""
     return _sheet(own_sheet(run.evaluation)) if is_unfused(run.evaluation) else []
 
 
@@ -205,7 +200,7 @@ def _robots(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 
 
 def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    """The consistency of the covariances: with truth NEES and coverage, without it NIS and cost."""
+    """Consistency of the covariances: NEES and coverage with truth, otherwise NIS and cost."""
     innovations, cost = run.history.innovations, run.evaluation.cost_by_robot
     scale = run.evaluation.scale_by_robot
     rows = []
@@ -274,7 +269,7 @@ def _measurements(run: Run) -> list[str]:
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
         tables = _sheet(disposition_sheet(ledgers)) if any(ledgers.values()) else []
-        return [*tables, _note(f"As the robots report it. The ledger: {run.no_ledger}.")]
+        return [*tables, _note(f"As reported by the robots. The ledger: {run.no_ledger}.")]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
@@ -337,7 +332,7 @@ def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
 
 
 def _origin(run: Run) -> list[str]:
-    """The log's metadata; long values are collapsed."""
+    """Log metadata; long values are collapsed."""
     short = {k: v for k, v in run.provenance.items() if len(v) <= 80}
     first = [(k, short[k]) for k in _ORIGIN if k in short]
     rest = [(k, v) for k, v in sorted(short.items()) if k not in _ORIGIN]
@@ -369,7 +364,6 @@ def _note(text: str) -> str:
 
 
 def _sheet(sheet: Sheet) -> list[str]:
-    """A table, and its note below it."""
     return [_table(sheet.headings, sheet.rows), *([_note(sheet.note)] if sheet.note else [])]
 
 

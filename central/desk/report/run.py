@@ -1,4 +1,4 @@
-"""The contents of a run's report, and its figures for machines."""
+"""Contents of a run's report, and its figures for JSON."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,9 +18,8 @@ from central.desk.paths import SmoothedPath
 class Run:
     """A run from its log.
 
-    provenance: the log's metadata. ledger: the result of `verify-ledger`, None where it was not
-    requested or where the log lacks its inputs: `no_ledger` says which. taken_home: paths at the
-    rate of keyframes, and counts; None where they were not requested.
+    provenance: log metadata. ledger: result of `verify-ledger`; None if not requested, or without
+    its inputs (`no_ledger`). taken_home: keyframe paths and counts, if requested.
     """
 
     evaluation: Evaluation
@@ -32,11 +31,11 @@ class Run:
 
     @property
     def paths(self) -> Mapping[str, SmoothedPath]:
-        """The smoothed paths by robot, where they were requested."""
+        """Smoothed paths by robot, if requested."""
         return {} if self.taken_home is None else self.taken_home.paths
 
     def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
-        """By robot and by kind of path ("smoothed", "online"); those that have truth."""
+        """Errors by robot and kind of path ("smoothed", "online"), where truth exists."""
         found: dict[str, dict[str, TrajectoryErrors]] = {}
         for name, robot in self.evaluation.robots.items():
             for kind, path in (("smoothed", robot.smoothed_path), ("online", robot.online_path)):
@@ -47,14 +46,14 @@ class Run:
 
 
 def nis_line(history: History) -> str | None:
-    """NIS per degree of freedom of every robot in one line; None where nothing was predicted."""
+    """NIS per degree of freedom of every robot in one line, or None."""
     per_dof = {name: of.per_dof for name, of in history.innovations.items()}
     parts = [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]
     return f"NIS per dof: {', '.join(parts)}" if parts else None
 
 
 def run_figures(run: Run) -> dict[str, Any]:
-    """The figures that a report adds to an evaluation's; angles in radians, times in seconds."""
+    """Figures that a report adds to an evaluation; radians, seconds."""
     history, ledger = run.history, run.ledger
     span_s = (history.end_ns - history.start_ns) * 1e-9
     return {

@@ -1,4 +1,4 @@
-"""The tables of a report, for a terminal and for the page."""
+"""Tables of a report, for terminal and page."""
 
 from collections.abc import Mapping, Sequence
 from math import degrees
@@ -14,16 +14,16 @@ from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.names import OUTSIDE, not_joined, short
 
 ABSURD_NEES = 1000
-"""Beyond this a NEES per dof is shown in words."""
+"""NEES per degree of freedom above which words replace it."""
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 _COUNT_AGAIN = ("kalman", "kalman-per-axis")
 LEFT = ("robot", "disposition")
-"""Headings of columns with words."""
+"""Headings of text columns."""
 Rows = Sequence[tuple[str, str]]
 
 
 class Sheet(NamedTuple):
-    """A table for a terminal and for the page: headings, cells, and the note below it."""
+    """Table for terminal and page: headings, cells, note."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -31,7 +31,7 @@ class Sheet(NamedTuple):
 
 
 def summary_tables(evaluation: Evaluation) -> list[Table]:
-    """The team's figures, and a row for each robot; 80 columns wide at the most."""
+    """Team figures and one row per robot, at most 80 columns wide."""
     team = Table(title=Text(title_of(evaluation)), show_header=False)
     for name, value in team_rows(evaluation):
         team.add_row(Text(name), Text(value))
@@ -47,7 +47,7 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def terminal_table(sheet: Sheet) -> Table:
-    """The compact table of a sheet; long cells wrap, since a truncated number is wrong."""
+    """Compact table; long cells wrap, since a truncated number is wrong."""
     table = Table(caption=sheet.note or None, box=box.SIMPLE, padding=(0, 1, 0, 0))
     for heading in sheet.headings:
         side: JustifyMethod = "left" if heading in LEFT else "right"
@@ -66,7 +66,7 @@ PEER_NOTE = (
 
 
 def peer_sheet(evaluation: Evaluation) -> Sheet:
-    """For each robot the SHA-256 of its final map, its part of the set, and the traffic for it."""
+    """SHA-256 of each robot's final map, its part of the set, and traffic."""
     rows: list[tuple[str, ...]] = []
     for name, peer in evaluation.peers.items():
         robot = evaluation.robots.get(name)
@@ -93,15 +93,15 @@ def peer_sheet(evaluation: Evaluation) -> Sheet:
 
 
 def title_of(evaluation: Evaluation) -> str:
-    """The data set, or scenario and seed; then estimator and rule."""
+    """Data set, or scenario and seed; then estimator and rule."""
     return ": ".join(filter(None, (evaluation.title, evaluation.method)))
 
 
 def team_rows(evaluation: Evaluation) -> Rows:
-    """The team's figures: name and value."""
+    """Team figures: name and value."""
     fused = evaluation.map
     if fused is None:
-        return [("final map", "none: the run did not come to its end")]
+        return [("final map", "none: the run did not finish")]
     errors, arbitrary = fused.errors, evaluation.arbitrary_frame
     states = state_rows(evaluation)
     if not len(fused.ids) and fused.reasons:
@@ -143,7 +143,6 @@ def team_rows(evaluation: Evaluation) -> Rows:
 
 
 def _without_truth(evaluation: Evaluation) -> str:
-    """The reason why a map has no errors."""
     if evaluation.map is not None and evaluation.map.matching is not None:
         return str(evaluation.map.matching)
     if not len(evaluation.true_landmarks):
@@ -152,7 +151,7 @@ def _without_truth(evaluation: Evaluation) -> str:
 
 
 def state_rows(evaluation: Evaluation) -> Rows:
-    """Every robot of the team with its state in the final map; those that are joined in one row."""
+    """State of every robot in the final map; joined robots share a row."""
     states = evaluation.states
     joined = [name for name, of in states.items() if of.state == "joined"]
     rows = [("robots in the map", ", ".join(joined) or "none")] if states else []
@@ -166,7 +165,7 @@ def state_rows(evaluation: Evaluation) -> Rows:
 
 
 def in_words(errors: MapErrors, *, joint: bool) -> str:
-    """The map's NEES and whether chance explains it; `joint`: of the joint covariance."""
+    """Map NEES and whether chance explains it; `joint`: of the joint covariance."""
     low, high = errors.band
     kind = "joint" if joint else "blocks only"
     band = f"95 % of {low:.2f}…{high:.2f} ({kind})"
@@ -181,7 +180,7 @@ def in_words(errors: MapErrors, *, joint: bool) -> str:
 
 
 def _association_rows(evaluation: Evaluation) -> Rows:
-    """The scores of a run whose landmarks have no names, where there are labels or a GPS."""
+    """Association scores of a run with unnamed landmarks, given labels or GPS."""
     found, gps_m = evaluation.association, evaluation.gps_median_m
     rows = [] if gps_m is None else [("distance from GPS", f"{gps_m:.2f} m, median of the paths")]
     if found is None:
@@ -219,7 +218,7 @@ def _association_rows(evaluation: Evaluation) -> Rows:
 
 
 def _absurd(evaluation: Evaluation) -> str:
-    """Words in place of the digits of a very large NEES, with the probable cause."""
+    """Text that replaces a very large NEES, with the probable cause."""
     scenario = evaluation.scenario
     again = scenario is not None and scenario.fusion in _COUNT_AGAIN
     why = " (measurements counted again)" if again else ""
@@ -227,7 +226,6 @@ def _absurd(evaluation: Evaluation) -> str:
 
 
 def _robot_note(evaluation: Evaluation) -> str:
-    """The explanation of the robots' rows."""
     online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
     star = ", * of online ones" if online else ""
     frame = "; positions as aligned with the map" if evaluation.arbitrary_frame else ""
@@ -242,7 +240,7 @@ def _robot_note(evaluation: Evaluation) -> str:
 
 
 NOTED = 5
-"""Most robots whose measurements that were not used are named below the table."""
+"""Most robots whose unused measurements are named below the table."""
 ROBOT_HEADINGS = (
     "robot", "steps", "measure-\nments\nused", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
@@ -250,7 +248,7 @@ ROBOT_HEADINGS = (
 
 
 def robot_sheet(evaluation: Evaluation) -> Sheet:
-    """Measurements and errors of each robot; in an arbitrary frame only the aligned errors."""
+    """Measurements and errors of each robot; in an arbitrary frame, aligned errors only."""
     arbitrary = evaluation.arbitrary_frame
     rows = [_robot_row(n, robot, arbitrary=arbitrary) for n, robot in evaluation.robots.items()]
     return Sheet(ROBOT_HEADINGS, rows, _robot_note(evaluation))
@@ -286,9 +284,8 @@ PATH_NOTE = (
 
 
 def path_sheet(evaluation: Evaluation) -> Sheet:
-    """Position errors, NEES and coverage of the smoothed and of the online paths.
-
-    In an arbitrary frame only the aligned errors.
+    """Position errors, NEES and coverage of smoothed and online paths; in an arbitrary frame,
+    aligned errors only.
     """
     arbitrary = evaluation.arbitrary_frame
     rows = [_path_row(n, robot, arbitrary=arbitrary) for n, robot in evaluation.robots.items()]
@@ -320,13 +317,13 @@ OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
 def is_unfused(evaluation: Evaluation) -> bool:
-    """Whether there is no fused map, and each robot has its own."""
+    """Whether each robot has its own map, without a fused one."""
     empty = evaluation.map is not None and not len(evaluation.map.ids)
     return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
 
 
 def own_sheet(evaluation: Evaluation) -> Sheet:
-    """Errors, NEES with its band, and coverage of every robot's own map."""
+    """Errors, NEES with band, and coverage of every robot's own map."""
     rows = []
     for name, robot in evaluation.robots.items():
         own = robot.own_map
@@ -349,7 +346,7 @@ def own_sheet(evaluation: Evaluation) -> Sheet:
 
 
 def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
-    """Measurements by disposition, with a column for each robot."""
+    """Measurements by disposition, one column per robot."""
     rows = []
     for disposition in sorted(set().union(*ledgers.values())):
         counts = [of.get(disposition, 0) for of in ledgers.values()]
@@ -358,5 +355,5 @@ def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
 
 
 def format_figure(value: float | None, form: str, unit: str) -> str:
-    """The number with its unit, a dash where there is none."""
+    """Format a number with its unit, or a dash."""
     return "–" if value is None else f"{value:{form}}{unit}"

@@ -1,1 +1,1 @@
-"""Recomputes a log message by message and compares it with the recording."""
+"""Recompute a log's messages and compare them with the recording."""

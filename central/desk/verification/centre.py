@@ -1,8 +1,8 @@
-"""Recomputes the centre's messages: each recorded map from the inputs that it names.
+"""Recompute the centre's messages: each recorded map from the inputs that it names.
 
-Maps of submaps are made by the centre's own fold (`central.submap_fold`), from a store with the
-submaps that a recorded map names. The centres of comparison methods recompute their maps themselves
-(`sim.studies.rules`). Fields that no named input gives are taken from the recorded map.
+Submap maps come from the centre's own fold (`central.submap_fold`) over a store with the named
+submaps. Centres of comparison methods recompute their own maps (`sim.studies.rules`). Fields
+without a named input are copied from the recorded map.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,9 +22,7 @@ from team.wire.bus import Outgoing
 
 
 def recomputed_centre(log: Recorded) -> dict[Identity, m.Message]:
-    """The messages that follow from the inputs of the recorded maps, by the names of these
-    inputs.
-    """
+    """Recompute messages from the inputs of the recorded maps, by input names."""
     finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
     maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
     found: dict[Identity, m.Message] = {}
@@ -42,7 +40,7 @@ _OF_A_PEER = {
 
 
 def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """The messages of a peer's own fold, by the same rule from the same submaps."""
+    """Recompute a peer's own fold by the same rule."""
 
     def maps_on(channel: ch.Channel) -> list[m.FusedMap]:
         key = channel.key(robot)
@@ -60,7 +58,7 @@ def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 def _recomputed(
     log: Recorded, maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
 ) -> Iterator[Outgoing]:
-    """The messages that follow from the inputs of these maps, in the order of the inputs."""
+    """Messages from the inputs of these maps, in input order."""
     if not maps and not finals:
         return
     config, digest = log.central_config()
@@ -83,7 +81,6 @@ def _recomputed(
 def _from_submaps(
     log: Recorded, kind: type[SubmapFold], maps: Sequence[m.FusedMap]
 ) -> Iterator[Outgoing]:
-    """The messages of maps whose inputs are submaps."""
     recorded = _RecordedSet(log)
     config, digest = log.central_config()
     fold: SubmapFold | None = None
@@ -101,7 +98,7 @@ def _from_submaps(
 def _extends(
     store: SubmapStore, chains: Mapping[Stream, Sequence[m.Submap]], fused: m.FusedMap
 ) -> bool:
-    """Whether the set of a map contains the stored one."""
+    """Whether a map's set contains the stored one."""
     return (
         store.withdrawals.keys() <= {*fused.withdrawn}
         and store.verdicts <= {*fused.verdicts}
@@ -110,7 +107,7 @@ def _extends(
 
 
 class _RecordedSet:
-    """The set of a log, and the parts of it that its maps name."""
+    """Set of a log, and the parts named by its maps."""
 
     def __init__(self, log: Recorded) -> None:
         self._store = SubmapStore()
@@ -131,8 +128,8 @@ class _RecordedSet:
                 self._priors_of.setdefault(prior.digest, set()).add(stream)
 
     def chains(self, fused: m.FusedMap) -> Mapping[Stream, Sequence[m.Submap]] | None:
-        """The submaps that a map names; None where the log lacks one, or its initial pose or
-        inter-robot measurements.
+        """Submaps that a map names; None if one, its initial pose or its inter-robot measurements
+        are missing.
         """
         stored = self._store.chains
         vector = {(x.robot, x.incarnation): x.sequence for x in fused.members}
@@ -143,7 +140,7 @@ class _RecordedSet:
     def copy(
         self, store: SubmapStore, chains: Mapping[Stream, Sequence[m.Submap]], fused: m.FusedMap
     ) -> None:
-        """Copy the members of a map's set that a store lacks."""
+        """Copy members of a map's set that a store lacks."""
         for stream, chain in chains.items():
             store.add_start(self._store.start(stream))
             for submap in chain[len(store.chain(stream)) :]:
@@ -156,7 +153,7 @@ class _RecordedSet:
             store.add(_verdict_on(each, fused.stamp_ns))
 
     def fields(self, fused: m.FusedMap) -> RecordedFields:
-        """The fields of a map that do not follow from its set."""
+        """Fields of a map that do not follow from its set."""
         priors_of = self._priors_of.get(fused.digest, set())
         return RecordedFields(fused.missing, fused.heard, priors_of)
 

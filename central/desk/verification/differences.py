@@ -1,4 +1,4 @@
-"""Compares two messages that should be equal, and names the first field that differs."""
+"""Find the first differing field of two messages."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from team.wire import messages as m
 
 RELATIVE = 1e-6
 ABSOLUTE = 1e-9
-"""Elsewhere: |a − b| ≤ ABSOLUTE·s + RELATIVE·|b|, s the largest of the array (1 at the least)."""
+"""Elsewhere: |a − b| ≤ ABSOLUTE·s + RELATIVE·|b|, s the array's largest magnitude (at least 1)."""
 _IDS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "ids": arrays.ids,
     "stamps": arrays.stamps,
@@ -38,12 +38,12 @@ _FLOATS = (
     "crosses",
 )
 ARRAYS = frozenset({*_IDS, *_FLOATS})
-"""The fields that are compared number by number."""
+"""Fields compared number by number."""
 
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """The first field that differs, and both values as text."""
+    """First differing field, with both values as text."""
 
     field: str
     recorded: str
@@ -53,9 +53,7 @@ class FieldDifference:
 def first_difference(
     recorded: m.Message, recomputed: m.Message, *, exact: bool
 ) -> FieldDifference | None:
-    """The first differing field in the order of the fields; None where there is none, within the
-    tolerance unless `exact`.
-    """
+    """First differing field in field order, within the tolerance unless `exact`; or None."""
     for name in recorded.__struct_fields__:
         a, b = getattr(recorded, name), getattr(recomputed, name)
         if a == b:

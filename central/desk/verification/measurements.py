@@ -1,4 +1,4 @@
-"""The measurements of one stream in a log, by their numbers."""
+"""Measurements of one stream in a log, by number."""
 
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
@@ -7,10 +7,9 @@ from team.wire import messages as m
 
 
 class RecordedMeasurements(Mapping[int, m.Measurement]):
-    """The measurements of one incarnation of a robot, each once: of two with one number the first
-    in the log.
+    """Measurements of one incarnation; the first in the log for each number.
 
-    contradicted: numbers of measurements that the log has twice with different content.
+    contradicted: numbers that the log has twice with different content.
     """
 
     def __init__(self) -> None:
@@ -19,7 +18,7 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         self.contradicted: list[int] = []
 
     def put(self, message: m.Measurement) -> None:
-        """Add a measurement, unless one of its number is there already."""
+        """Add a measurement unless its number is present."""
         if self._messages.setdefault(message.number, message) != message:
             self.contradicted.append(message.number)
         self._odometry = None
@@ -35,19 +34,19 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """The least and the greatest stamp."""
+        """Least and greatest stamp."""
         stamps = [each.stamp_ns for each in self._messages.values()]
         return min(stamps), max(stamps)
 
     def intervals(self, begin: int, end: int) -> int:
-        """Number of odometry intervals with numbers begin … end − 1."""
+        """Number of odometry intervals numbered begin … end − 1."""
         if self._odometry is None:
             numbers = (n for n, x in self._messages.items() if isinstance(x, m.AnyOdometry))
             self._odometry = sorted(numbers)
         return bisect_left(self._odometry, end) - bisect_left(self._odometry, begin)
 
     def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement]:
-        """The measurements begin … end − 1, up to the first gap."""
+        """Measurements begin … end − 1, up to the first gap."""
         for number in range(begin, end):
             if number not in self._messages:
                 return

@@ -1,4 +1,4 @@
-"""Indexes a log by recorded inputs and recomputable outputs."""
+"""Index a log by recorded inputs and recomputable outputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,16 +21,16 @@ from team.wire.codec import WireError
 
 T = TypeVar("T")
 Identity = tuple[object, ...]
-"""A message's key and the names of its inputs."""
+"""Message key and names of its inputs."""
 
 
 class RerunError(ValueError):
-    """A log that can not be recomputed; the text names what it lacks."""
+    """Log that cannot be recomputed; the text names the missing input."""
 
 
 @dataclass(frozen=True)
 class RecordedOutput:
-    """A recorded message that can be recomputed, as its sample and decoded."""
+    """Recorded message that can be recomputed, as sample and decoded."""
 
     sample: Sample
     channel: ch.Channel
@@ -39,14 +39,13 @@ class RecordedOutput:
 
 @dataclass
 class Recorded:
-    """Everything in a log that is an input or an output of a node; each measurement once.
+    """All node inputs and outputs in a log; each measurement once.
 
-    measurements: by (robot, incarnation) and counter. configured: the last announcement of each
-    node. outputs: the recomputable messages, in the order of the log. reported: number of
-    measurements that a robot has reported as consumed. published: number of measurements that the
-    source has announced.
-    known_map: the prior map of localisation-only robots, if there is one. withdrawals: the first
-    order on each withdrawn robot. unsound: number of invalid samples.
+    measurements: by (robot, incarnation) and counter. configured: last announcement of each node.
+    outputs: recomputable messages in log order. reported: measurements consumed by the robot's
+    report. published: measurements announced by the source. known_map: prior map of
+    localisation-only robots. withdrawals: first order on each withdrawn robot. unsound: number of
+    invalid samples.
     """
 
     measurements: dict[Stream, RecordedMeasurements] = field(default_factory=dict)
@@ -61,12 +60,12 @@ class Recorded:
     _by_channel: dict[str, list[RecordedOutput]] = field(default_factory=dict)
 
     def take_all(self, samples: Sequence[Sample]) -> None:
-        """File samples in the order of the log."""
+        """Index samples in log order."""
         for sample in samples:
             self.take(sample)
 
     def take(self, sample: Sample) -> None:
-        """File one sample; a viewer's samples are neither input nor output."""
+        """Index one sample; a viewer's samples are ignored."""
         if _is_a_view(sample.key):
             return
         try:
@@ -106,11 +105,11 @@ class Recorded:
         self.published[stream] = max(self.published.get(stream, 0), head.measurements)
 
     def of(self, channel: ch.Channel) -> list[m.Message]:
-        """The recorded messages of a channel, in the order of the log."""
+        """Recorded messages of a channel, in log order."""
         return [each.message for each in self.outputs_of(channel)]
 
     def outputs_of(self, channel: ch.Channel) -> Sequence[RecordedOutput]:
-        """The recorded outputs on a channel, in the order of the log."""
+        """Recorded outputs on a channel, in log order."""
         for each in self.outputs[self._indexed :]:
             self._by_channel.setdefault(each.channel.name, []).append(each)
         self._indexed = len(self.outputs)
@@ -118,23 +117,23 @@ class Recorded:
 
     @property
     def contradicted(self) -> list[m.Measurement]:
-        """The measurements that the log has twice with different content, as it has them first."""
+        """First copies of measurements that the log has twice with different content."""
         streams = self.measurements.values()
         return [stream[number] for stream in streams for number in stream.contradicted]
 
     @property
     def robots(self) -> list[str]:
-        """Every robot with measurements or messages in the log, by name."""
+        """Every robot with measurements or messages, by name."""
         names = {robot for robot, _ in self.measurements}
         names |= {s.message.robot for s in self.outputs if isinstance(s.message, m.Submap | m.Done)}
         return in_order(names)
 
     def incarnations(self, robot: str) -> list[int]:
-        """The incarnations of a robot with measurements, in order."""
+        """A robot's incarnations with measurements, in order."""
         return sorted(incarnation for name, incarnation in self.measurements if name == robot)
 
     def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
-        """The recorded submaps by stream and sequence."""
+        """Recorded submaps by stream and sequence."""
         found: dict[Stream, dict[int, m.Submap]] = {}
         for submap in self.of(ch.SUBMAP):
             assert isinstance(submap, m.Submap)
@@ -142,9 +141,7 @@ class Recorded:
         return found
 
     def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
-        """The recorded inter-robot measurements by (robot, incarnation, sequence) of their
-        submap.
-        """
+        """Recorded inter-robot measurements by (robot, incarnation, sequence) of their submap."""
         found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
         for sighting in self.of(ch.SIGHTING_FACTOR):
             assert isinstance(sighting, m.SightingFactor)
@@ -153,16 +150,16 @@ class Recorded:
         return found
 
     def robot_config(self, robot: str) -> tuple[RobotConfig, bytes]:
-        """The configuration that a robot announced, and its digest; raises RerunError."""
+        """Announced configuration of a robot, and its digest; raises RerunError."""
         announced = self._announced(ch.robot_node(robot))
-        what = f"the configuration of {robot}"
-        return _parsed(announced.configuration, RobotConfig, what), announced.digest
+        subject = f"the configuration of {robot}"
+        return _parsed(announced.configuration, RobotConfig, subject), announced.digest
 
     def central_config(self) -> tuple[CentralConfig, bytes]:
-        """The centre's configuration and its digest; raises RerunError."""
+        """Configuration of the centre and its digest; raises RerunError."""
         announced = self._announced("central")
-        what = "the centre's configuration"
-        return _parsed(announced.configuration, CentralConfig, what), announced.digest
+        subject = "the centre's configuration"
+        return _parsed(announced.configuration, CentralConfig, subject), announced.digest
 
     def _announced(self, node: str) -> m.Configuration:
         if node not in self.configured:
@@ -172,21 +169,20 @@ class Recorded:
         return self.configured[node]
 
 
-def _parsed(text: str, kind: type[T], what: str) -> T:
+def _parsed(text: str, kind: type[T], subject: str) -> T:
     try:
         return msgspec.convert(with_current_names(msgspec.json.decode(text)), kind)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise RerunError(f"{what} is not one of this version: {error}") from None
+        raise RerunError(f"{subject} is not one of this version: {error}") from None
 
 
 _CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
          ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_CONFIGURING))
-"""The channels whose samples are filed."""
 
 
 def recorded(log: Log) -> Recorded:
-    """One pass over a log."""
+    """Index a log in one pass."""
     found = Recorded()
     for chunk in log.chunks(INPUTS):
         if isinstance(chunk, LogError):
@@ -202,7 +198,7 @@ def _is_a_view(key: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def identity(key: str, message: m.Message) -> Identity:
-    """The names of a message's inputs, after its key."""
+    """Message key, followed by the names of its inputs."""
     match message:
         case m.Submap():
             names: Identity = (

@@ -1,4 +1,4 @@
-"""Recomputes one robot's messages: its node over its recorded measurements."""
+"""Recompute one robot's messages: its node over its recorded measurements."""
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,17 +17,15 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
-"""By (incarnation, stamp), the priors that the recorded poses name; None: a pose without a
-prior.
-"""
+"""Priors named by the recorded poses, by (incarnation, stamp); None: a pose without prior."""
 WithdrawnAt = Collection[tuple[int, int]]
-"""By (incarnation, stamp), the own poses that went out on team/pose, too."""
+"""Own poses that were also published on team/pose, by (incarnation, stamp)."""
 
 
 class RecordedPoses(RunningPoses):
-    """Poses at the stamps of the log, each with the prior that it names.
+    """Poses at the log's stamps, each with the prior that it names.
 
-    Which prior a running pose used depends on the arrival times, so the pose names it.
+    The prior of a running pose depends on arrival times, so the pose names it.
     """
 
     def __init__(
@@ -38,7 +36,7 @@ class RecordedPoses(RunningPoses):
         self._withdrawn = withdrawn
 
     def publish(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
-        """The poses of this stamp, with every prior that a recorded one names."""
+        """Poses of this stamp, with every prior named by a recorded one."""
         out: list[Outgoing] = []
         incarnation = estimator.writer.incarnation
         for prior in self._recorded.get((incarnation, stamp_ns), ()):
@@ -50,9 +48,9 @@ class RecordedPoses(RunningPoses):
 
 
 class RecomputedRobot:
-    """A robot's node over recorded messages, with poses at the recorded stamps.
+    """Robot node over recorded messages, with poses at the recorded stamps.
 
-    The configuration keeps the digest under which it was announced.
+    The configuration keeps its announced digest.
     """
 
     def __init__(
@@ -72,7 +70,7 @@ class RecomputedRobot:
         self._boundary = Boundary(ch.robot_node(config.id))
 
     def given(self, message: m.Message) -> list[Outgoing]:
-        """Handle a message as the shell does: one that raises is set aside."""
+        """Handle a message as the shell does, with exceptions contained."""
         return self._boundary.give(self.node, message)
 
 
@@ -80,7 +78,7 @@ NewRobot = Callable[[], RecomputedRobot]
 
 
 def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """Every message that follows from the robot's measurements, by the names of its inputs."""
+    """Recompute every message that follows from the robot's measurements, by input names."""
     config, digest = log.robot_config(robot)
     named, withdrawn = _priors_named(log, robot), _withdrawn_at(log, robot)
 
@@ -118,12 +116,11 @@ def _withdrawn_at(log: Recorded, robot: str) -> WithdrawnAt:
 
 
 def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """The messages without feedback, where each incarnation, and each process that ended, is
-    independent.
+    """Messages without feedback: each incarnation and each ended process is independent.
 
-    A `Done` names the process that it closes: its last measurement and its number of steps. A
-    process that resumed after a submap is computed from there, as the robot does. Where a
-    measurement is not in the log, the computation continues after the next recorded submap.
+    A `Done` names the process that it closes: last measurement and number of steps. A process that
+    resumed after a submap is computed from there. After a missing measurement, the computation
+    continues after the next recorded submap.
     """
     for incarnation in log.incarnations(robot):
         measurements = log.measurements[(robot, incarnation)]
@@ -147,7 +144,7 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
 
 
 def _first_of(done: m.Done, chain: Sequence[m.Submap], measurements: RecordedMeasurements) -> int:
-    """The first measurement of the process that ended with this `Done`, by its steps."""
+    """First measurement of the process that this `Done` ends, from its steps."""
     last = min(done.measurements, max(measurements) + 1)
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in sorted((each for each in begins if each <= last), reverse=True):
@@ -163,9 +160,7 @@ def _life(
     first: int,
     until: int | None,
 ) -> Iterator[Outgoing]:
-    """The messages of a process from measurement `first` on, up to measurement `until` if it ended
-    there.
-    """
+    """Messages of a process from measurement `first`, up to `until` if it ended there."""
     start = measurements.get(0)
     if not isinstance(start, m.InitialPose):
         return
@@ -189,10 +184,9 @@ def _life(
 
 
 def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """The messages under a rule with feedback, where a robot waits for each round's map: the
-    recorded one.
+    """Messages under a feedback rule, where a robot waits for each round's map: the recorded one.
 
-    A round without a map in the log had no centre: the robot continued without it.
+    Without a recorded map the robot continued without a centre.
     """
     fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
     node = new()
@@ -222,10 +216,9 @@ def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]
 
 
 def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
-    """The disposition of each measurement of an incarnation that the robot's node consumed, as the
-    node words it.
+    """Disposition of each consumed measurement of an incarnation, as worded by the node.
 
-    The node runs without a centre, so that it waits for no map.
+    The node runs without a centre, and so waits for no map.
     """
     config, digest = log.robot_config(robot)
     disposition_of: dict[int, str] = {}

@@ -1,11 +1,10 @@
-"""Verification: recomputes every recomputable message of a log and compares.
+"""Recompute every recomputable message of a log and compare.
 
-A log's order is the recorder's, not a node's, so no run is replayed: each message is computed from
-the inputs that it names. Submaps, own maps and own poses follow from the measurements and the
-configuration alone; a team pose from the prior whose digest it names; a fused map, its priors, the
-trajectories and the final map from the recorded submaps of the map's version vector; the exchanges
-of a rule with feedback from the recorded maps of the round. So one wrong message is found by
-itself, and messages that follow from it are judged by its recorded bytes.
+A log has the recorder's order, not a node's, so each message is computed from the inputs that it
+names. Submaps, own maps and own poses follow from measurements and configuration; a team pose from
+the prior whose digest it names; fused and final maps, priors and trajectories from the recorded
+submaps of the map's version vector; the exchanges of a feedback rule from the round's recorded
+maps. So an error is located in one message; its successors are judged by its recorded bytes.
 """
 
 from collections.abc import Mapping
@@ -32,22 +31,23 @@ PLATFORM = (
     "kernels", "arithmetic",
     "version.numpy", "version.scipy", "version.numba", "version.llvmlite",
 )  # fmt: skip
-"""The metadata that have to be equal for equal bits; the processor's features are not among them:
-docs/decisions/32."""
+"""Metadata that must be equal for equal bits; processor features are not among them:
+docs/decisions/32.
+"""
 MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (
     ch.SUBMAP, ch.ASSOCIATION, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE,
     ch.ROBOT_DONE, ch.FUSED_MAP, ch.PRIOR, ch.TRAJECTORY, ch.FINAL_MAP, ch.PARTICLES, ch.INNOVATION,
     ch.CENTRAL_POSE, ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_FINAL,
 )  # fmt: skip
-"""Channels in the order of cause and effect."""
+"""Channels in order of cause and effect."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """A recorded message that differs from the recomputed one; `counter` is its publisher's.
+    """Recorded message that differs from the recomputed one; `counter` is its publisher's.
 
-    lacks: an input is not in the log, so that the message can not be judged.
+    lacks: an input missing from the log.
     """
 
     key: str
@@ -68,11 +68,10 @@ class Difference:
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """One channel: number of messages in the log, of those equal to the last bit, and of those
-    equal within the tolerance only.
+    """One channel: number of messages, of bit-equal ones, and of those equal within tolerance.
 
-    first: the first that differs by more, or else the first that can not be judged. lacking: number
-    of messages that can not be judged, since an input is not in the log. All others differ.
+    first: first that differs, or else that cannot be judged. lacking: messages that cannot be
+    judged for want of an input. All others differ.
     """
 
     channel: str
@@ -84,17 +83,16 @@ class ChannelResult:
 
     @property
     def different(self) -> int:
-        """Number of messages that differ from the recomputed ones."""
+        """Number of messages that differ."""
         return self.messages - self.equal - self.close - self.lacking
 
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of recomputing a log.
+    """Result of recomputing a log.
 
-    other_platform: the metadata in which this platform differs from the log's; if there are any,
-    numbers are compared within a tolerance. span_s: team time from the first measurement to the
-    last.
+    other_platform: metadata in which this platform differs; if any, numbers are compared within a
+    tolerance. span_s: team time between first and last measurement.
     """
 
     channels: tuple[ChannelResult, ...]
@@ -105,15 +103,13 @@ class Verification:
 
     @property
     def first(self) -> Difference | None:
-        """The first difference, causes before effects; without any, the first message that lacks an
-        input.
-        """
+        """First difference, causes first; otherwise the first message that lacks an input."""
         found = [c.first for c in self.channels if c.first is not None]
         return min(found, key=lambda each: each.lacks, default=None)
 
     @property
     def messages(self) -> int:
-        """Messages that were compared."""
+        """Number of compared messages."""
         return sum(c.messages for c in self.channels)
 
 
@@ -144,7 +140,7 @@ def verify(log: Log) -> Verification:
 
 
 def _others(log: Log, found: Recorded) -> frozenset[str]:
-    """The teammates in a robot's own log: their messages are inputs, and are not verified."""
+    """Teammates in a robot's own log, whose messages are inputs and are not verified."""
     if OWN not in log.metadata:
         return frozenset()
     there = frozenset(r for r in found.robots if ch.robot_node(r) in found.configured)
@@ -177,20 +173,20 @@ def _compared(
 
 
 def _difference(
-    output: RecordedOutput, again: m.Message | None, log: Recorded, *, exact: bool
+    output: RecordedOutput, recomputed: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
-    lacks = None if again is not None else _lacking(output.message, log)
-    if again is None:
+    lacks = None if recomputed is not None else _lacking(output.message, log)
+    if recomputed is None:
         none = "none" if lacks is None else f"{lacks}: none"
-        field, there, here = "the message", "there", none
+        field, recorded_text, recomputed_text = "the message", "there", none
     else:
-        found = first_difference(output.message, again, exact=exact)
+        found = first_difference(output.message, recomputed, exact=exact)
         if found is None:
             if not exact:
                 return None
-            field, there, here = "the encoding", "another", "the program's"
+            field, recorded_text, recomputed_text = "the encoding", "another", "the program's"
         else:
-            field, there, here = found.field, found.recorded, found.recomputed
+            field, recorded_text, recomputed_text = found.field, found.recorded, found.recomputed
     sample = output.sample
     names = _names(output.message)
     unknown = lacks is not None
@@ -200,8 +196,8 @@ def _difference(
         counter=sample.counter,
         names=names,
         field=field,
-        recorded=there,
-        recomputed=here,
+        recorded=recorded_text,
+        recomputed=recomputed_text,
         lacks=unknown,
     )
 
@@ -218,7 +214,7 @@ def _names(message: m.Message) -> str:
 
 
 def _lacking(message: m.Message, log: Recorded) -> str | None:
-    """The named input that is not in the log, in words; None where all are there."""
+    """Named input missing from the log, as text."""
     match message:
         case m.PoseEstimate() if any(message.map_digest):
             priors_of_all = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
@@ -233,7 +229,7 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
             fused = by_digest.get(message.digest)
             if fused is None:
                 return f"no map {message.digest.hex()} in the log"
-            return _lacking(fused, log)  # it came with that map, which lacks what it was made of
+            return _lacking(fused, log)  # it came with that map, which lacks an input
         case m.FusedMap():
             found = log.submaps()
             for each in message.members:
@@ -248,7 +244,7 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
 
 
 def _gap(log: Recorded, message: m.Message) -> str | None:
-    """The first measurement before a message that is not in the log."""
+    """First measurement before a message that is not in the log."""
     robot, incarnation = getattr(message, "robot", ""), getattr(message, "incarnation", None)
     for stream in sorted(log.measurements):
         if stream[0] != robot or incarnation not in {None, stream[1]}:

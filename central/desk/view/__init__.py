@@ -1,1 +1,1 @@
-"""The viewer: a team's messages as Foxglove's views, and as a page in a browser."""
+"""Viewer: a team's messages as Foxglove views and as a browser page."""

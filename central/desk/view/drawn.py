@@ -1,4 +1,4 @@
-"""The drawable part of a team's messages: landmarks and thinned paths."""
+"""Drawable contents of a team's messages: landmarks and thinned paths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,12 +11,12 @@ from team.wire import messages as m
 from team.wire.arrays import floats
 
 PATH_POINTS = 1_000
-"""Most points of one path; a longer one keeps every second."""
+"""Most points of a path; a longer one is halved."""
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Landmarks of one map: L ids, positions [m], covariances as (xx, xy, yy) [m²]."""
+    """Map landmarks: L ids, positions [m], covariances (xx, xy, yy) [m²]."""
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
@@ -31,10 +31,9 @@ def landmarks_of(message: m.MapEstimate | m.FusedMap) -> Landmarks:
 
 
 def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
-    """The particles' positions (ahead [m], left [m]) as seen from their mean pose.
+    """Particle positions (ahead [m], left [m]) relative to their mean pose.
 
-    A cloud lies along the robot's own poses, which have drifted from the team's frame; so it is
-    drawn around the robot, wherever that is.
+    The cloud is drawn around the robot, since its poses have drifted from the team's frame.
     """
     poses = floats(cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
     weights = floats(cloud.weights, "weights").astype(np.float64)
@@ -49,7 +48,7 @@ def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
 def place_points(
     points: Float[np.ndarray, "P 2"], pose: Sequence[float]
 ) -> Float[np.ndarray, "P 2"]:
-    """Points that are seen from a pose (x, y, theta), in the frame of that."""
+    """Transform points from pose coordinates to the frame of the pose (x, y, theta)."""
     x, y, theta = pose
     c, s = np.cos(theta), np.sin(theta)
     return np.asarray(points @ np.array([[c, s], [-s, c]]) + (x, y))
@@ -57,14 +56,14 @@ def place_points(
 
 @dataclass
 class Track:
-    """A growing path, thinned for drawing: (x [m], y [m]) at a least spacing [ns]."""
+    """Growing path (x [m], y [m]), thinned to a least spacing [ns]."""
 
     stamps: list[int] = field(default_factory=list)
     points: list[tuple[float, float]] = field(default_factory=list)
     spacing_ns: int = 100_000_000
 
     def take(self, stamp_ns: int, x: float, y: float) -> None:
-        """Append a point, unless it is nearer than the spacing to the last, or out of order."""
+        """Append a point, unless too near to the last or out of order."""
         if self.stamps and stamp_ns < self.stamps[-1] + self.spacing_ns:
             return
         self.stamps.append(stamp_ns)
@@ -74,6 +73,6 @@ class Track:
             self.spacing_ns *= 2
 
     def since(self, stamp_ns: int) -> list[tuple[float, float]]:
-        """The points from this time on, at least the last."""
+        """Points from this time on, at least the last."""
         first = int(np.searchsorted(self.stamps, stamp_ns))
         return self.points[min(first, len(self.points) - 1) :] if self.points else []

@@ -1,6 +1,4 @@
-"""Compute the views of a recorded log: those that a viewer would have published, in their
-order.
-"""
+"""Compute a recorded log's views as a viewer would have published them."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -19,28 +17,26 @@ _CHANNELS = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE
 
 
 def for_viewer(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
-    """The channel and message of a sample if a viewer subscribes to it; None otherwise, and for
-    invalid samples.
-    """
+    """Channel and message of a sample for a viewer; None for other or invalid samples."""
     found = ch.channel_of(sample.key)
     if found is None or found[0].name not in _CHANNELS:
         return None
     try:
         channel, _, message = opened(sample)
     except WireError:
-        return None  # no node would have let it in
+        return None  # nodes reject it
     return channel, message
 
 
 class Viewing:
-    """A viewer over samples: passes messages to the node, and returns its views as samples."""
+    """Viewer over samples: returns its node's views as samples."""
 
     def __init__(self) -> None:
         self.node = ViewerNode()
         self._counters: dict[str, int] = {}
 
     def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
-        """The views that follow from a sample's message, with counters of their own."""
+        """Views that follow from a sample's message, with their own counters."""
         out = []
         for shown in [] if input_ is None else self.node.handle(*input_):
             counter = self._counters.get(shown.key, 0)
@@ -50,7 +46,7 @@ class Viewing:
 
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
-    """The samples, each followed by its views; views in the log are left out."""
+    """Samples, each followed by its views; recorded views are omitted."""
     viewing, centre = Viewing(), PeersAsCentre()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
@@ -60,7 +56,7 @@ def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
 
 
 class Drawn(NamedTuple):
-    """Number of the log's own messages, of its views drawn now, and of those drawn in the run."""
+    """Numbers of the log's messages, of views drawn now, and of recorded views."""
 
     own: int
     views: int
@@ -70,16 +66,16 @@ class Drawn(NamedTuple):
         text = f"{self.own + self.views} messages, {self.views} of them views"
         if self.before and self.before != self.views:
             text += (
-                f" ({self.before} in the log: a viewer of the run draws nothing of what comes "
-                "before it has joined and after it has left)"
+                f" ({self.before} in the log: a viewer of the run draws only what it "
+                "receives between joining and leaving)"
             )
         return text
 
 
 def export_views(log: Log, out: Path) -> Drawn:
-    """Write a log with its views to a new log `out`, all of them drawn again.
+    """Write a log with its views, all redrawn, to a new log `out`.
 
-    Raises `LogError` for a damaged log, `RecorderError` when `out` exists.
+    Raises `LogError` for a damaged log, `RecorderError` if `out` exists.
     """
     written, drawn, before = 0, 0, 0
     with Recorder(out, log.team, log.metadata) as recorder:

@@ -1,9 +1,7 @@
-"""Restrict access to the page and to Foxglove's WebSocket: viewers of this machine, no page of a
-foreign origin.
+"""Restrict the page and Foxglove's WebSocket to viewers of this machine and permitted origins.
 
-The SDK's server accepts any origin, so it listens at a random address of loopback and a random
-port. Viewers connect to this proxy, which checks Host and Origin and forwards every frame in both
-directions.
+The SDK's server accepts any origin, so it listens at a random loopback address and port. Viewers
+connect to this proxy, which checks Host and Origin and forwards frames both ways.
 """
 
 import asyncio
@@ -21,12 +19,12 @@ from websockets.typing import Subprotocol
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 VIEWERS = (*LOOPBACK, "https://app.foxglove.dev", "file://")
-"""Origins of viewers: hosts of this machine, Foxglove in a browser, and Foxglove on a desktop."""
+"""Origins of viewers: this machine's hosts, Foxglove in a browser and on a desktop."""
 PROTOCOLS = tuple(map(Subprotocol, ("foxglove.sdk.v1", "foxglove.websocket.v1")))
 
 
 def hidden_host() -> str:
-    """An address of loopback that no page can guess; where there is only one, that."""
+    """Loopback address that no page can guess, where the system has several."""
     host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
     try:
         socket.create_server((host, 0)).close()
@@ -38,10 +36,10 @@ def hidden_host() -> str:
 def refusal(
     listening_at: str, host: str, origins: list[str], others: Collection[str] = ()
 ) -> str | None:
-    """Why a request for `host` from a page of these origins is refused; None: it is not.
+    """Reason to refuse a request for `host` from these origins, or None.
 
-    listening_at: our own address; on loopback a request under another name is refused (DNS
-    rebinding). others: permitted origins, or their hosts, beside our own.
+    listening_at: own address; on loopback a request under another name is refused (DNS rebinding).
+    others: further permitted origins or hosts.
     """
     if listening_at in LOOPBACK and (urlsplit(f"//{host}").hostname or "") not in LOOPBACK:
         return f"{host!r} is not this machine\n"
@@ -57,7 +55,7 @@ def refusal(
 def refuse(
     listening_at: str, viewer: ServerConnection, request: Request, others: Collection[str] = ()
 ) -> Response | None:
-    """The answer to a request that is refused; None for a permitted one."""
+    """Response to a refused request; None if permitted."""
     hosts = request.headers.get_all("Host")
     why = refusal(
         listening_at, hosts[0] if hosts else "", request.headers.get_all("Origin"), others
@@ -79,7 +77,7 @@ async def proxy(host: str, port: int, behind: str) -> Server:
 
 
 async def _forward(viewer: ServerConnection, behind: str) -> None:
-    """Forward frames in both directions until one side closes."""
+    """Forward frames both ways until one side closes."""
     chosen = PROTOCOLS if viewer.subprotocol is None else (viewer.subprotocol,)
     async with connect(behind, subprotocols=chosen, compression=None, max_size=None) as server:
         ways = [

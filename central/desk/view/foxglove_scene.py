@@ -1,6 +1,6 @@
-"""Encode drawable things as Foxglove's messages: the one module that imports its encoders.
+"""Encode drawable objects as Foxglove messages; the only module that imports its encoders.
 
-z is height: the plane of the map is z = 0. Rotations are about z, (0, 0, sin θ/2, cos θ/2).
+The map plane is z = 0. Rotations are about z, (0, 0, sin θ/2, cos θ/2).
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,30 +16,29 @@ from central.desk.view.drawn import Landmarks
 from team.wire.views import MAP_FRAME
 
 Shade = tuple[str, float]
-"""A colour as #rrggbb, and its opacity."""
+"""Colour #rrggbb and opacity."""
 TRUTH: Shade = ("#8a93a3", 0.9)
 LANDMARK: Shade = ("#f5b83d", 1.0)
 _FLAT_M = 0.002
 _LEAST_M = 0.01
-"""Least thickness and width of an ellipse."""
 
 
 _LAST_NS = 2**32 * 1_000_000_000 - 1
 
 
 def stamp(stamp_ns: int) -> fox.Timestamp:
-    """A team time as Foxglove's; before zero it is zero, beyond 32 bits of seconds the last one."""
+    """Team time as a Foxglove time, clamped to 32 bits of seconds."""
     at = min(max(stamp_ns, 0), _LAST_NS)
     return fox.Timestamp(at // 1_000_000_000, at % 1_000_000_000)
 
 
 def scene(entities: Iterable[fox.SceneEntity]) -> bytes:
-    """A scene update; an entity replaces the earlier one with its name."""
+    """Scene update; an entity replaces an earlier one of its name."""
     return bytes(fox.SceneUpdate(entities=list(entities)).encode())
 
 
 def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> fox.SceneEntity:
-    """The team's landmarks: a dot, the 95 % ellipse, the number."""
+    """Team landmarks: dot, 95 % ellipse, number."""
     major, minor, direction = ellipses(landmarks.blocks)
     dots, names = [], []
     for i, ((x, y), name) in enumerate(
@@ -56,7 +55,7 @@ def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> fox.
 def true_landmarks_entity(
     stamp_ns: int, truth: Float[np.ndarray, "T 2"], size_m: float
 ) -> fox.SceneEntity:
-    """The true landmarks, as small squares."""
+    """True landmarks, as small squares."""
     edge = fox.Vector3(x=0.25 * size_m, y=0.25 * size_m, z=_FLAT_M)
     cubes = [
         fox.CubePrimitive(pose=_pose(x, y, 0.0), size=edge, color=_colour(TRUTH))
@@ -76,7 +75,7 @@ def robot_entity(
     *,
     lost: bool,
 ) -> fox.SceneEntity:
-    """A robot: an arrow, the 95 % ellipse of its position, its name, its recent path."""
+    """Robot: arrow, 95 % position ellipse, name, recent path."""
     x, y, theta = (float(v) for v in pose)
     P = np.array([[covariance[0, 0], covariance[0, 1], covariance[1, 1]]])
     (major,), (minor,), (direction,) = ellipses(P)
@@ -101,7 +100,7 @@ def robot_entity(
 def true_robot_entity(
     stamp_ns: int, name: str, pose: Float[np.ndarray, "3"], size_m: float
 ) -> fox.SceneEntity:
-    """The true pose of a robot."""
+    """True pose of a robot."""
     x, y, theta = (float(v) for v in pose)
     arrow = _arrow(_pose(x, y, theta), 0.8 * size_m, (TRUTH[0], 0.6))
     return _entity(stamp_ns, f"true robot {name}", arrows=[arrow])
@@ -110,7 +109,7 @@ def true_robot_entity(
 def path_entity(
     stamp_ns: int, name: str, points: Sequence[tuple[float, float]], shade: Shade, pixels: float
 ) -> fox.SceneEntity:
-    """A path as a line of this width in pixels."""
+    """Path as a line of this width in pixels."""
     return _entity(stamp_ns, name, lines=[_line(points, shade, pixels)])
 
 
@@ -144,7 +143,7 @@ def cloud(
     values: Float[np.ndarray, " n"],
     name: Literal["id", "weight"],
 ) -> bytes:
-    """Points of the plane with one value each, as float32."""
+    """Planar points with one value each, as float32."""
     packed = np.zeros((len(points), 4), "<f4")
     with np.errstate(over="ignore"):  # infinite beyond 3e38
         packed[:, :2] = points

@@ -1,7 +1,7 @@
-"""Foxglove's WebSocket: the views of a log or a run in Foxglove or Lichtblick, by the SDK's server.
+"""Foxglove WebSocket: views of a log or run in Foxglove or Lichtblick, by the SDK's server.
 
-Views are sent as they are drawn; a new subscriber receives the newest view of its topic at once. To
-play a finished log, open its file there.
+A new subscriber receives the newest view of its topic at once. To play a finished log, open its
+file there.
 """
 
 import threading
@@ -17,11 +17,11 @@ from team.wire.bus import Sample
 
 
 class FoxgloveServer(ServerListener):
-    """The SDK's server at a hidden address of loopback; the views of one team are its channels."""
+    """SDK server at a hidden loopback address; the team's views are its channels."""
 
     def __init__(self) -> None:
         self.team = ""
-        """The team's name; to be set before the first view."""
+        """Team name; set before the first view."""
         self._context = Context()
         self._channels: dict[str, Channel] = {}
         self._newest: dict[str, Sample] = {}
@@ -44,7 +44,7 @@ class FoxgloveServer(ServerListener):
         self._server.stop()
 
     def publish(self, view: Sample) -> None:
-        """Send a view to the subscribers of its topic."""
+        """Send a view to its topic's subscribers."""
         topic = f"team/{self.team}/{view.key}"
         with self._lock:
             if topic not in self._channels:
@@ -54,7 +54,7 @@ class FoxgloveServer(ServerListener):
         self._server.broadcast_time(max(view.stamp_ns, 0))
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send the newest view of the topic."""
+        """Send the topic's newest view."""
         self._send(channel.topic)
 
     def _send(self, topic: str) -> None:

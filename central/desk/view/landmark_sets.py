@@ -1,4 +1,4 @@
-"""The members of a map's unnamed landmarks, and the step by which each was associated."""
+"""Members of a map's unnamed landmarks, and the associating step of each."""
 
 from central.unnamed_landmarks import SHOWN, STEPS
 from team.wire import messages as m
@@ -6,8 +6,7 @@ from team.wire.arrays import floats, ids
 
 
 def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
-    """For each landmark with unnamed members: its number of submaps, in a running map no more than
-    SHOWN, and its members in words.
+    """Number of submaps (in a running map at most SHOWN) and members of each landmark.
 
     `r1/1/12/7` is robot, incarnation, submap, local landmark: the form that `teamslam verdict`
     reads.

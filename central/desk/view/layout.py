@@ -1,4 +1,4 @@
-"""A layout for Foxglove and Lichtblick: scene, events, errors with bounds, consistency."""
+"""Foxglove and Lichtblick layout: scene, events, errors with bounds, consistency."""
 
 import json
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from team.wire.views import MAP_FRAME
 
 
 def layout(team: str, robots: Sequence[str]) -> str:
-    """The layout of a team's log or run, as JSON to be imported there."""
+    """JSON layout for a team's log or run."""
     prefix = f"team/{team}"
     ordered = in_order(robots)
     configs = {
@@ -70,9 +70,7 @@ def _scene(prefix: str, robots: Sequence[str]) -> dict[str, object]:
 
 
 def _errors(prefix: str, robots: Sequence[str], of: str, title: str) -> dict[str, object]:
-    """Each robot's error, with the bounds of the first robot only, since more lines are
-    unreadable.
-    """
+    """Each robot's error, with bounds of the first only, for readability."""
     lines = []
     for number, robot in enumerate(robots):
         topic = f"{prefix}/{views.ROBOT.key(robot)}"
@@ -106,7 +104,6 @@ def _split(direction: str, first: object, second: object, percentage: int) -> di
 
 
 def _column(panels: Sequence[str]) -> object:
-    """Panels one below the other, of equal height."""
     if len(panels) == 1:
         return panels[0]
     return _split("column", panels[0], _column(panels[1:]), round(100 / len(panels)))

@@ -1,7 +1,6 @@
-"""The viewer's node: the team's messages in, views out; no I/O, no clock.
+"""Viewer node: messages in, views out; no I/O, no clock.
 
-It receives the truth as an evaluator does; no estimator does, since no node of a team subscribes to
-a view.
+It receives the truth like an evaluator; no node of a team subscribes to a view.
 """
 
 import math
@@ -27,23 +26,23 @@ from team.wire.arrays import floats
 from team.wire.channels import Channel
 
 PERIOD_NS = 1_000_000_000
-"""Team time between two views of poses and errors."""
+"""Team time between views of poses and errors."""
 PATHS_EVERY = 10
-"""Whole paths come with every tenth view."""
+"""Number of views per whole path."""
 TRAIL_NS = 15_000_000_000
-"""Length of the recent path that is sent with a robot; the rest is sent with the whole paths."""
+"""Length of the recent path sent with a robot."""
 LAG_NS = 30_000_000_000
-"""A robot that is further behind the fastest does not hold back the view."""
+"""A robot further behind the fastest does not hold back the view."""
 MOST_PERIODS = 60
-"""Most views for one message; of a longer jump in time the earlier part is left out."""
+"""Most views per message; the earlier part of a longer jump is omitted."""
 FORGET_NS = 10_000_000_000
 """Time for which an estimate waits for its truth."""
 _MARKS_ACROSS = 45.0
-"""Number of robots, at their drawn size, that fit across the known extent."""
+"""Number of drawn robots that fit across the known extent."""
 
 
 class Shown(NamedTuple):
-    """One view to be published: its relative key, team time and payload."""
+    """View to be published: relative key, team time, payload."""
 
     key: str
     stamp_ns: int
@@ -52,7 +51,7 @@ class Shown(NamedTuple):
 
 @dataclass
 class _Robot:
-    """The state of one robot; the team's pose of it is preferred to its own.
+    """State of one robot; its team pose is preferred to its own.
 
     coming: estimates after the view's time. reached_ns: the robot's team time.
     """
@@ -72,24 +71,24 @@ class _Robot:
     status: dict[str, float] = field(default_factory=dict)
 
     def pose(self) -> Float[np.ndarray, "3"]:
-        """(x [m], y [m], theta [rad]); to be called where there is an estimate."""
+        """Pose (x [m], y [m], theta [rad]); needs an estimate."""
         assert self.estimate is not None
         return floats(self.estimate.pose, "pose").astype(np.float64)
 
     def covariance(self) -> Float[np.ndarray, "3 3"]:
-        """The covariance of the pose."""
+        """Pose covariance."""
         assert self.estimate is not None
         return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
     def leave(self) -> None:
-        """Forget poses and errors, which are not in the team's frame any more."""
+        """Discard poses and errors, which left the team's frame."""
         self.coming.clear()
         self.estimate = self.last_error = None
         self.track = Track()
         self.errors.forget_poses()
 
     def go_to(self, now_ns: int, frames: TruthFrames) -> None:
-        """Take the estimates up to this time; frames: those in which truth is given."""
+        """Apply estimates up to this time; frames: those with truth."""
         while self.coming and self.coming[0].stamp_ns <= now_ns:
             self.estimate = self.coming.popleft()
             x, y, _ = self.pose().tolist()
@@ -103,16 +102,16 @@ class _Robot:
         self.errors.forget(now_ns - FORGET_NS)
 
     def note(self, errors: PoseErrors | None) -> None:
-        """Set the newest error, which holds until the next."""
+        """Set the newest error."""
         if errors is not None:
             self.last_error = (errors.errors[-1], float(errors.nees[-1]) / 3.0)
 
 
 class ViewerNode:
-    """One viewer of a team: `handle` until `finished`.
+    """Viewer of a team: `handle` until `finished`.
 
-    The view's time is that of the slowest robot at work, so that all robots are shown at one time,
-    however far the others are ahead; no robot holds it back by more than LAG_NS.
+    View time is that of the slowest active robot, so all are shown at one time; a robot holds it
+    back by at most LAG_NS.
     """
 
     listens = (
@@ -140,13 +139,11 @@ class ViewerNode:
 
     @property
     def now_ns(self) -> int:
-        """The team time of the last view; 0 before there was one."""
+        """Team time of the last view, or 0."""
         return 0 if self._now_ns is None else self._now_ns
 
     def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
-        """Take one message of a channel; returns the views that are due, one per period of team
-        time.
-        """
+        """Process a message of a channel; returns the due views, one per period of team time."""
         out = [_logged(event) for event in self._detector.take(message, self.now_ns)]
         self._take(channel, message)
         reached = self._reached_ns()
@@ -163,7 +160,7 @@ class ViewerNode:
         return out
 
     def _reached_ns(self) -> int | None:
-        """The team time up to which all robots have moved; None before any has."""
+        """Team time up to which all robots have moved, or None."""
         marks = {n: r.reached_ns for n, r in self._robots.items() if r.reached_ns is not None}
         if not marks:
             return None
@@ -230,7 +227,7 @@ class ViewerNode:
         elif message.node.startswith("robot/"):
             robot = self._of(message.node.removeprefix("robot/"))
             robot.status = message.figures
-            if robot.reached_ns is not None:  # a robot without detections publishes nothing else
+            if robot.reached_ns is not None:  # a robot without detections publishes only this
                 robot.reached_ns = max(robot.reached_ns, message.stamp_ns)
 
     def _extend(self, points: Float[np.ndarray, "n 2"]) -> None:
@@ -242,7 +239,7 @@ class ViewerNode:
             )  # fmt: skip
 
     def _size_m(self) -> float:
-        """The drawn size of a robot: 1, 2 or 5 times a power of ten, so that it rarely changes."""
+        """Drawn size of a robot: 1, 2 or 5 times a power of ten, so it rarely changes."""
         left, bottom, right, top = self._reach
         across = max(right - left, top - bottom) / _MARKS_ACROSS
         if not across > 0.0 or not math.isfinite(across):
@@ -272,7 +269,7 @@ class ViewerNode:
         return out
 
     def _go_to(self, now_ns: int, *, last: bool) -> None:
-        """Set every part to its state at this time; at the last view with the final map."""
+        """Advance all parts to this time; the last view has the final map."""
         self._now_ns = now_ns
         while self._maps and (last or self._maps[0].stamp_ns <= now_ns):
             self._fused = self._maps.popleft()

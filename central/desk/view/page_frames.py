@@ -1,15 +1,14 @@
-"""The frames that the page receives: one per event, as JSON, in the order of the log.
+"""Frames for the page: one JSON object per event, in log order.
 
 t: seconds of team time since the first measurement. Poses and errors are rows of numbers, maps and
 particles base64 of little-endian float32 and uint32. Frames, by `k`:
 
-hello: team, title, colours, live. now: the team time of all robots at work. pose: rows x, y,
-heading, xx, xy, yy, variance of the heading. outside: whether the robot is outside the team's map
-from this time on; its poses are then not in the team's frame, and not sent. frame: from this time
-on a robot's poses are in another frame than before. err: rows of three errors, three 3σ bounds,
-NEES per degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as their names.
-fig: a node's figures. bytes: [key, t, messages, bytes] of one second. ev: an event. eof: the log
-has been read.
+hello: team, title, colours, live. now: team time of all active robots. pose: rows x, y, heading,
+xx, xy, yy, heading variance. outside: whether the robot is outside the team's map from now on; its
+poses are then not sent. frame: the robot's pose frame changes. err: rows of three errors, three 3σ
+bounds, NEES per degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as
+named. fig: a node's figures. bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of
+the log.
 """
 
 import base64
@@ -32,15 +31,15 @@ from team.wire.arrays import floats, stamps
 from team.wire.bus import Sample
 
 SPACING_NS = 100_000_000
-"""Least time between two poses, of truth and of estimates, that the page receives."""
+"""Least time between poses sent to the page, estimated or true."""
 MAP_SPACING_NS = 1_000_000_000
-"""Least time between two maps that the page receives."""
+"""Least time between maps sent to the page."""
 _OF_A_SET = ("set_submaps", "set_agrees")
 _BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
 
 
 def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
-    """The title of the page: scenario, seed, file."""
+    """Page title: scenario, seed, file."""
     try:
         scenario = str(json.loads(metadata.get("scenario", "{}"))["name"])
     except (ValueError, KeyError, TypeError):
@@ -51,7 +50,7 @@ def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
 
 @dataclass
 class _Stream:
-    """One robot's poses that are not sent to the page yet."""
+    """One robot's unsent poses."""
 
     errors: RunningErrors = field(default_factory=RunningErrors)
     by_team: bool = False
@@ -68,7 +67,7 @@ class _Stream:
 
 
 class PageFrames:
-    """Converts samples to frames: `take` them, `flush` the frames that are ready."""
+    """Convert samples to frames: `take` samples, `flush` finished frames."""
 
     def __init__(self) -> None:
         self._out: list[str] = []
@@ -84,12 +83,12 @@ class PageFrames:
         self._newest_ns = 0
 
     def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
-        """The first frame; live: the log is being recorded."""
+        """Emit the first frame; live: the log is being recorded."""
         title = title_of(team, metadata, name)
         self._add_frame("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
     def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> None:
-        """Convert one sample of the log, and its message if a viewer subscribes to it."""
+        """Convert one sample, and its message if a viewer subscribes to it."""
         found = ch.channel_of(sample.key)
         channel = "" if found is None else found[0].name
         if self._origin_ns is None and channel in _BEGIN:
@@ -102,7 +101,7 @@ class PageFrames:
             self._take(*input_)
 
     def flush(self, now_ns: int | None = None) -> list[str]:
-        """The frames since the last call; now_ns: the team time of the robots."""
+        """Frames since the last call; now_ns: team time of the robots."""
         for robot, stream in self._streams.items():
             self._add_errors(stream)
             for kind, (times, values) in stream.rows.items():
@@ -118,7 +117,7 @@ class PageFrames:
         return out
 
     def end(self, notes: Sequence[str] = (), *, complete: bool) -> list[str]:
-        """The last frames; notes: faults of the log."""
+        """Last frames; notes: log faults."""
         out = self.flush(self._newest_ns)
         for note in notes:
             self._add_frame("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
@@ -129,13 +128,13 @@ class PageFrames:
         self._out.append(json.dumps({"k": kind, **fields}, separators=(",", ":")))
 
     def _t(self, stamp_ns: int) -> float:
-        """Seconds since the first measurement; 0 for earlier messages."""
+        """Seconds since the first measurement, at least 0."""
         if self._origin_ns is None:
             return 0.0
         return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)
 
     def _take(self, channel: ch.Channel, message: m.Message) -> None:
-        if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead of all others
+        if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead
             self._newest_ns = max(self._newest_ns, message.stamp_ns)
         timeless = isinstance(message, m.Liveliness | m.Status)
         at_ns = self._newest_ns if timeless else message.stamp_ns
@@ -171,7 +170,7 @@ class PageFrames:
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         stream = self._streams[message.robot]
         if by_team and stream.by_team and not message.in_team_frame:
-            stream.errors.forget_poses()  # they are in a frame that is the team's no more
+            stream.errors.forget_poses()  # their frame is no longer the team's
         if by_team:
             stream.by_team = message.in_team_frame
         due = stream.pose_ns is None or message.stamp_ns >= stream.pose_ns + SPACING_NS
@@ -244,7 +243,7 @@ class PageFrames:
         second = int(self._t(message.stamp_ns))
         shown = message.node == "central" or message.node.startswith("robot/")
         whole, agrees = (message.figures.get(name, 0.0) for name in _OF_A_SET)
-        news = second, whole, agrees  # behind the end of the streams peers still come to agree
+        news = second, whole, agrees  # peers still come to agree after the streams end
         if shown and self._figures_s.get(message.node) != news:
             self._figures_s[message.node] = news
             figures = {name: _short(value) for name, value in message.figures.items()}
@@ -252,7 +251,7 @@ class PageFrames:
 
 
 def _short(value: float) -> float:
-    """Round to seven digits, the resolution of the page."""
+    """Round to seven digits, the page's resolution."""
     return float(f"{value:.7g}")
 
 

@@ -1,7 +1,7 @@
-"""Serve a log: the page with its stream of frames over a WebSocket, and Foxglove's WebSocket.
+"""Serve a log: page with a WebSocket stream of frames, and Foxglove's WebSocket.
 
-A new connection receives every frame of the log from the first on, then the new ones. A page of
-another origin may not connect, nor one that uses another name for this machine (DNS rebinding).
+A new connection receives every frame of the log, then new ones. Pages of another origin, or under
+another name of this machine (DNS rebinding), are refused.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ from team.wire.bus import BusError
 
 STREAM = "/stream"
 LOOK_S = 0.2
-"""Time [s] between two looks at a log that is being written."""
+"""Polling period [s] of a growing log."""
 _BATCH_BYTES = 500_000
 _TYPES = {
     ".html": "text/html",
@@ -42,11 +42,11 @@ _POLICY = "default-src 'self'; connect-src 'self' ws: wss:; style-src 'self' 'un
 
 
 class ServerError(BusError):
-    """The page can not be served at this address."""
+    """The page cannot be served at this address."""
 
 
 def page_files() -> dict[str, tuple[str, bytes]]:
-    """(type, bytes) of every file of the page by its path."""
+    """Type and bytes of every page file by path."""
     found = {}
     for file in files("central.desk.view").joinpath("page").iterdir():
         suffix = Path(file.name).suffix
@@ -58,9 +58,9 @@ def page_files() -> dict[str, tuple[str, bytes]]:
 
 @dataclass
 class Feed:
-    """Reads a log as it grows, and stores its frames.
+    """Read a growing log and store its frames.
 
-    foxglove: receives every view, once, in order. error: why reading ended early.
+    foxglove: receives every view once, in order. error: why reading ended early.
     """
 
     tail: Tail
@@ -73,9 +73,7 @@ class Feed:
     _greeted: bool = False
 
     def read_more(self, *, growing: bool) -> bool:
-        """Read the new samples; returns whether there were any. A log that does not grow ends
-        here.
-        """
+        """Read new samples; returns whether there were any. A log that does not grow ends here."""
         try:
             samples = self.tail.more()
         except (LogError, OSError) as error:
@@ -100,7 +98,6 @@ class Feed:
         return bool(samples)
 
     def _faults(self) -> list[str]:
-        """The faults of the log, in words."""
         found = [] if self.error is None else [self.error]
         if self.tail.damaged:
             found.append(
@@ -111,7 +108,7 @@ class Feed:
 
 
 class PageServer:
-    """Serves one page at a host and port; to be run in an event loop of its own."""
+    """Server of one page; runs in its own event loop."""
 
     def __init__(self, feed: Feed, host: str, *, growing: bool) -> None:
         self._feed = feed
@@ -132,7 +129,7 @@ class PageServer:
         )
 
     async def read(self, stop: asyncio.Event) -> None:
-        """Read the log until its end or until `stop`."""
+        """Read the log until its end or `stop`."""
         while not (self._feed.ended or stop.is_set()):
             some = await asyncio.to_thread(self._feed.read_more, growing=self._growing)
             async with self._frame_ready:
@@ -179,7 +176,7 @@ class PageServer:
             pass
 
     async def _wait(self, connection: ServerConnection) -> None:
-        """Until there is news, or a while has passed; a page that has gone is noticed."""
+        """Wait for news or a timeout, and detect a closed page."""
         try:
             await asyncio.wait_for(self._frame_ready.wait(), 5.0)
         except TimeoutError:
@@ -188,7 +185,7 @@ class PageServer:
 
 @dataclass(frozen=True)
 class Shown:
-    """The addresses at which a log is shown; foxglove: empty without Foxglove's WebSocket."""
+    """Addresses of a shown log; foxglove: may be empty."""
 
     url: str
     foxglove: str
@@ -199,11 +196,11 @@ class Shown:
 def session(
     log: Path, host: str, port: int, foxglove_port: int, *, growing: bool
 ) -> Iterator[Shown]:
-    """Show a log until the context ends; raises ServerError where a port is taken.
+    """Show a log until the context ends; raises ServerError for a taken port.
 
-    growing: its recorder may still be running, or has not begun.
+    growing: its recorder may still run, or not have begun.
     """
-    # The library logs every connection on the console otherwise.
+    # The library logs every connection otherwise.
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with FoxgloveServer() as foxglove:
         feed = Feed(Tail(log), foxglove)
@@ -215,7 +212,7 @@ def session(
 def serving(
     feed: Feed, host: str, port: int, foxglove_port: int = 0, *, growing: bool
 ) -> Iterator[Shown]:
-    """Serve the page, and Foxglove where the feed has it, on a thread until the context ends.
+    """Serve page and Foxglove on a thread until the context ends.
 
     Raises ServerError.
     """
@@ -242,7 +239,7 @@ def serving(
             servers.append(runner.run(proxy(host, foxglove_port, feed.foxglove.url)))
             foxglove_url = f"ws://{at}:{_port_of(servers[1])}"
     except OSError as error:
-        stop.set()  # a server that listens already is closed
+        stop.set()  # close a server that already listens
         run()
         what, number, option = (
             ("Foxglove", foxglove_port, "--foxglove-port")

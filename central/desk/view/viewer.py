@@ -1,4 +1,4 @@
-"""The viewer's process: a bus around the node; the recorder records its views."""
+"""Viewer process: a bus around the node; the recorder records its views."""
 
 import threading
 import time
@@ -19,12 +19,10 @@ NODE = "viewer"
 
 
 def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> int:
-    """Publish the views of a team until its final map is shown, or until `stop`; returns their
-    number.
+    """Publish views until the final map is shown or `stop` is set; returns their number.
 
-    peers: the robots of a team whose robots are peers: the final map is the one on which they
-    agree. Without them it is the centre's.
-    Raises FaultyRunError, at its end, where the map lacks a robot or something could not be drawn.
+    peers: robots whose agreed map is the final one; without them, the centre's. Raises
+    FaultyRunError at the end if the map lacks a robot or something could not be drawn.
     """
     viewing = Viewing()
     centre = PeersAsCentre(peers)
@@ -37,7 +35,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
     boundary = Boundary(NODE)
     due = 0.0
     final: FusedMap | None = None
-    # One that comes after the end has nothing to show, so its node does not finish by the map.
+    # After the end there is nothing to show, so the map does not finish the node.
     while not (viewing.node.finished or final is not None or stop.is_set()):
         if time.monotonic() >= due:
             due = time.monotonic() + STATUS_S
@@ -53,7 +51,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
                 if input_ is not None and isinstance(input_[1], FusedMap) and input_[1].final:
                     final = input_[1]
                 views = viewing.take(sample, input_)
-            except Exception as error:  # a message that can not be drawn is left out
+            except Exception as error:  # omit a message that cannot be drawn
                 bus.publish(boundary.note(error, sample, ""))
                 continue
             for shown in views:

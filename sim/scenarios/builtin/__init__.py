@@ -1,1 +1,1 @@
-"""The built-in scenarios: one TOML file each."""
+"""Built-in scenarios: one TOML file each."""

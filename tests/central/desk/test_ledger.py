@@ -107,7 +107,7 @@ def test_a_measurement_that_was_changed_and_sent_again_is_named(
     (offender,) = ledger_of([*samples, again], tmp_path).offenders
     assert (
         offender
-        == f"measurement {counter} of r1, incarnation 1 is in the log twice, and not the same"
+        == f"measurement {counter} of r1, incarnation 1 is in the log twice with different contents"
     )
 
 

@@ -115,7 +115,7 @@ def test_without_truth_there_are_the_monitor_and_nis(log: list[Sample], tmp_path
 @pytest.mark.parametrize("count", [0, 1, 30])
 def test_a_log_that_stops_anywhere_is_reported(count: int, tmp_path: Path) -> None:
     page = page_of(run_of(world_log(scenario())[:count]), tmp_path)
-    assert "did not come to its end" in page
+    assert "did not finish" in page
 
 
 def written(log: list[Sample], path: Path) -> Path:

@@ -106,7 +106,7 @@ FAULTS = {
         surveyed=False,
     ),
     "no odometry of one robot": Fault(
-        removed("Robot2_Odometry"), ("r2: no odometry: only what it saw is given",)
+        removed("Robot2_Odometry"), ("r2: no odometry: only its observations are used",)
     ),
     "no measurements of one robot": Fault(
         removed("Robot2_Measurement"), ("r2: no measurements: only its odometry is given",)

@@ -251,8 +251,7 @@ def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path: Path) -> 
     seen = SEEN + "1,7,2.5,0.5\n2,9,0,0.1\n2,9,-1,0.1\n0.5,9,1,0.1\n9,9,1,0.1\n"
     stream = only(data_set(tmp_path, odometry=SPEEDS + "3,1,1\n", observations=seen))
     assert stream.notes == (
-        "1 odometry row dropped: another row has the same time, so it lasts no time "
-        "(r1/odometry.csv, at line 5)",
+        "1 odometry row dropped: another row has the same time (r1/odometry.csv, at line 5)",
         "2 measurements earlier than the row before: sorted by time "
         "(r1/observations.csv, first at line 5)",
         "2 measurements dropped: range not above 0 (r1/observations.csv, first at line 6)",

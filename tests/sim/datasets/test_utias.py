@@ -334,7 +334,7 @@ def test_a_robot_without_odometry_still_gives_what_it_saw(folder: Path) -> None:
     found = read(folder).streams
     assert set(found[1].kinds) == set(expected[1].kinds) - {ODOMETRY}
     assert found[1].kinds[0] == START
-    assert "no odometry: only what it saw is given" in found[1].notes
+    assert "no odometry: only its observations are used" in found[1].notes
     assert len(found[0]) == len(expected[0])
 
 

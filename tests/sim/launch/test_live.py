@@ -64,7 +64,7 @@ def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repea
     watch.statuses["source/r1"] = status("source/r1", "waiting")
     come = shown()[-1]
     assert "waiting for the driver of r2" in come
-    assert "r1 is there and has handed over no odometry" in come
+    assert "r1 is running and has sent no odometry" in come
     watch.statuses["source/r1"] = status(
         "source/r1", "measuring", measurements=60.0, team_time_s=1.7e9
     )

@@ -67,7 +67,7 @@ def test_a_few_silent_processes_are_named_each_once_a_minute(
     team.hears(*range(FEW))
     assert team.after(9.0) == []
     said = team.after(2.0)
-    assert [f"robot-r{k} (pid {100 + k}) is there and has said nothing for 11 s" in text
+    assert [f"robot-r{k} (pid {100 + k}) is there and has sent no message for 11 s" in text
             for k, text in enumerate(said)] == [True] * FEW  # fmt: skip
     assert team.after(5.0) == [], "one line a silence"
     team.hears(0)
@@ -83,7 +83,7 @@ def test_nobody_is_advised_to_end_a_process_that_computes(monkeypatch: pytest.Mo
     team.hears(0, 1)
     idle, busy = team.after(11.0)
     assert "kill" not in idle, "a healthy process may be slow to start"
-    assert "robot-r1 (pid 101) is computing and has said nothing for 11 s" in busy
+    assert "robot-r1 (pid 101) is computing and has sent no message for 11 s" in busy
     assert "kill" not in busy
     team.hears(0, 1)
     team.after(0.0)

@@ -186,7 +186,7 @@ def test_who_holds_the_team_up_is_named(monkeypatch):
         node.publish(clock)
         assert node.status().warnings == ()
     node.publish(6.0)
-    assert node.status().warnings == ("robot/r1 holds the team up: it has got no further for 6 s",)
+    assert node.status().warnings == ("robot/r1 blocks the team: no progress for 6 s",)
     node.handle(progress("r1", 5), 0)
     node.publish(7.0)
     assert node.status().warnings == ()

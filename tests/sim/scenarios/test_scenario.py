@@ -190,7 +190,7 @@ UTIAS = 'world = { kind = "utias" }\n'
         ),
         (
             SMALL + '[central]\nfusion = "kalman"',
-            "`fusion` is said once for the whole team, at the top of the file",
+            "`fusion` is set once for the whole team, at the top of the file",
         ),
         (
             SMALL + "[[robots]]\n[[robots]]\nmotion = { turn = { per_y = 1 } }",
