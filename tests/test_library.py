@@ -135,7 +135,7 @@ def test_submaps_of_a_log_join_to_its_final_map(log: Path) -> None:
 
 
 def ran(name: str, *arguments: str, capsys: pytest.CaptureFixture[str], monkeypatch) -> str:
-    """What an example prints."""
+    """Output of an example."""
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(EXAMPLES / name))
     return capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Whole teams that use sightings of each other: the laws hold, and the log says all of it again."""
+"""Whole teams that use sightings of each other: the laws hold, and the log reproduces the run."""
 
 import random
 

@@ -283,7 +283,7 @@ def test_the_reasons_that_are_told_apart_are_bounded() -> None:
 
 
 def numbered(number: int, gid: bytes = b"a" * 16) -> bytes:
-    """What rmw_zenoh attaches, as its C++ serializer writes it."""
+    """The attachment of rmw_zenoh as its C++ serializer writes it."""
     named = struct.pack("<B15sqB16sq", 15, b"sequence_number", number, 16, b"source_timestamp", S)
     return named + struct.pack("<B10sB16s", 10, b"source_gid", 16, gid)
 
