@@ -124,7 +124,7 @@ def test_a_certificate_of_another_robot_is_nobodys_proof(nodes: dict[str, PeerNo
 
 
 class Renewed:
-    """r1 in a running team, with each of its certificates; r2 receives from r1, r3 from r2 alone."""
+    """r1 in a running team, with each of its certificates; r2 receives from r1, r3 from r2."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
