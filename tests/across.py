@@ -1,4 +1,4 @@
-"""The same run recomputed as on other processors: which stage's bits differ.
+"""Compare the bits of a run between classes of processors.
 
     python -m tests.across                 waypoints, a piece of thesis, a piece of a data set
     python -m tests.across --only thesis   the cases whose name begins so
@@ -61,7 +61,7 @@ def measured(name: str, path: Path) -> None:
 
 
 def digests(path: Path) -> dict[str, str]:
-    """Of each channel all that a run on these measurements sent there."""
+    """Hash all messages of each channel in a run on these measurements."""
     scenario, streams = pickle.loads(path.read_bytes())
     found: dict[str, hashlib._Hash] = {}
     for sample in bits.run_team(scenario, streams):
@@ -71,7 +71,7 @@ def digests(path: Path) -> dict[str, str]:
 
 
 def compared(name: str, classes: int) -> list[str]:
-    """What differs between the classes of processors, a line for each."""
+    """List the channels that differ between the classes of processors, one a line."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "case"
         measured(name, path)

@@ -56,7 +56,7 @@ def pair(estimator: str, fusion: str) -> Scenario:
 
 
 def outliers() -> Scenario:
-    """Three measurements in ten have nothing to do with their landmark; the robots know it."""
+    """Three measurements in ten are outliers, and the robots' configurations allow for them."""
     scenario = world("thesis", outlier_share=0.3)
     robots = tuple(
         msgspec.structs.replace(
@@ -124,7 +124,7 @@ def _hash(data: bytes) -> str:
 
 
 def machine() -> dict[str, str]:
-    """What the bits depend on beside the program."""
+    """Processor and libraries on which the bits depend."""
     kernels = {str(each.get("architecture")) for each in threadpool_info()}
     return {
         "processor": platform.machine(),

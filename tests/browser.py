@@ -88,7 +88,7 @@ class Page:
         return result["result"].get("value")
 
     def text(self, selector: str) -> str:
-        """What an element says."""
+        """Text of an element."""
         return str(self.ask(f"document.querySelector({json.dumps(selector)})?.textContent ?? ''"))
 
     def wait(self, expression: str, timeout_s: float = 60.0) -> Any:
@@ -117,7 +117,7 @@ class Page:
         self.drag((x, y), (x, y))
 
     def picture(self, path: Path, *, whole: bool = False) -> None:
-        """What is seen, or the whole page, as PNG."""
+        """Write the visible part, or the whole page, as PNG."""
         data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
         path.write_bytes(base64.b64decode(data["data"]))
 

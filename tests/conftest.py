@@ -1,4 +1,4 @@
-"""What holds in every test run: one BLAS thread, checked shapes, repeatable examples.
+"""Settings of every test run: one BLAS thread, checked shapes, repeatable examples.
 
 Two workers run system tests one by one, beside the others.
 """

@@ -17,7 +17,7 @@ _costs: Counter[str] = Counter()
 
 
 def cpu_s() -> float:
-    """Of this process and of all that it has waited for."""
+    """CPU time [s] of this process and of its children that have ended."""
     used = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in used)
 

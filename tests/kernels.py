@@ -1,4 +1,4 @@
-"""Which compiled kernels this process has called."""
+"""Compiled kernels that this process has called."""
 
 import sys
 

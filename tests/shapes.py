@@ -15,7 +15,7 @@ from beartype import BeartypeConf, FrozenDict, beartype
 F = TypeVar("F", bound=Callable[..., object])
 
 CALLS = 20
-"""Of every function so many calls of one test are checked; the others run as they do in a program.
+"""Number of checked calls of each function in a test; the others run as in a program.
 
 A check takes longer than most functions, and a test that calls one half a million times, with the
 same shapes, learns nothing from the last of them.

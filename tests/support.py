@@ -1,4 +1,4 @@
-"""What several tests need: waiting for a condition, a link that can be cut, sample messages."""
+"""Shared helpers: waiting for a condition, a link that can be cut, sample messages."""
 
 import contextlib
 import socket
@@ -163,7 +163,7 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 
 
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
-    """The message as the node says it that publishes on the channel's key for this name."""
+    """The message with the node that publishes on the channel's key for this name."""
     publisher = channel.publisher(name)
     says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault | m.SetSummary
     return (

@@ -128,7 +128,7 @@ def published(each: RobotStream) -> list[m.Measurement]:
 def driven(
     node: RobotNode, measurements: Sequence[m.Message], *, end: bool = True
 ) -> list[Outgoing]:
-    """What a robot says to these measurements, without a centre; `end` with the last counter."""
+    """Run a robot on these measurements without a centre; `end`: with the end of the stream."""
     out = [o for measurement in measurements for o in node.handle(measurement, 0)]
     if end:
         last = measurements[-1]
@@ -146,12 +146,12 @@ def of(out: Sequence[Outgoing], channel: ch.Channel) -> list[m.Message]:
 
 
 def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
-    """What a lonely robot sends for fusion."""
+    """Submaps of a robot without a centre."""
     return of(driven(robot_node(config(each.robot, **options)), published(each)), ch.SUBMAP)
 
 
 class Submaps(Mapping[str, list[m.Submap]]):
-    """What each of some lonely robots sends for fusion; computed for the test that asks first.
+    """Submaps of robots without a centre, computed when a test first uses them.
 
     At import it would need kernels, which one worker would compile while the others wait for them.
     """

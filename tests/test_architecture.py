@@ -1,4 +1,4 @@
-"""What the documentation names is there: files, names in files, commands, options, make targets."""
+"""Files, names in files, links, commands and options in the documentation exist."""
 
 import ast
 import re
@@ -22,12 +22,12 @@ ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 FOLDERS = ("team", "central", "sim", "tests", "docs", "examples", "benchmarks")
 NAMED = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]+\.\w+):\s+([^`]+)`")
 PATHS = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w.-]+(?:/[\w.-]+)*(?:\.\w+|/))[`:]")
-"""Of a folder with its slash at the end: keys of the wire look alike."""
+"""Folders end with a slash, since keys of the wire look alike."""
 
 
 @cache
 def names_of(path: Path) -> frozenset[str]:
-    """What a module defines, and `Class.member` of its classes; of a page, its headings."""
+    """Names that a module defines, and `Class.member` of its classes; headings of a page."""
     text = path.read_text()
     if path.suffix == ".md":
         return frozenset(re.findall(r"^#+ (.+)$", text, re.MULTILINE))
@@ -50,7 +50,7 @@ def _defined(node: ast.stmt) -> list[str]:
 
 
 def wrong(text: str) -> list[str]:
-    """What a page names as `file: name` or as a path, and what is not there."""
+    """Paths and `file: name` in a page that do not exist."""
     found = [
         f"{path}: {name}"
         for path, name in NAMED.findall(text)
@@ -116,7 +116,7 @@ CLI = typer.main.get_command(app)
 
 
 def unknown(line: str) -> str | None:
-    """What a command line of a page has that the program has not: a command, or an option.
+    """A command or an option of a command line that the program lacks.
 
     Three dots stand for any command of a group, or for arguments.
     """

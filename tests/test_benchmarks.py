@@ -1,4 +1,4 @@
-"""Baselines of benchmarks are complete, hold what they say, and those of seconds hold here."""
+"""Baselines of benchmarks are complete, and those that take seconds hold here."""
 
 import shlex
 import subprocess

@@ -205,7 +205,7 @@ def test_a_robot_that_dies_and_comes_back_changes_no_bit_of_it(seed, when, victi
 
 @cache
 def messages():
-    """All that a centre hears of the pair."""
+    """All messages that a centre receives of the pair."""
     return [
         *(published(each)[0] for each in PAIR.streams),
         *(

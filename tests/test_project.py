@@ -123,7 +123,7 @@ def test_the_citation_is_sound_and_tells_of_this_version() -> None:
 
 
 def test_every_pinned_distribution_has_its_hashes() -> None:
-    """`make setup` and the image install what they know the hash of, and nothing else."""
+    """`make setup` and the image install distributions with a listed hash alone."""
     pin = re.compile(
         r"^([\w.-]+==[\w.]+)(?: ;.*)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M
     )

@@ -1,4 +1,4 @@
-"""A node's shell: what it says while the node waits."""
+"""A node's shell: its reports while the node waits, and its end."""
 
 import logging
 import signal

@@ -1,4 +1,4 @@
-"""Whole teams that use sightings of each other: the laws hold, and the log says all of it again."""
+"""Whole teams that use sightings of each other: the laws hold, and the log reproduces the run."""
 
 import random
 
@@ -59,9 +59,9 @@ def samples():
     return team_samples(SCENARIO)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_final_map_is_the_same_bytes_for_any_interleaving_of_submaps_and_sightings(first, seed):
-    assert encoded(team(seed).final) == encoded(first.final)
+def test_the_final_map_is_the_same_bytes_for_another_interleaving_of_submaps_and_sightings(first):
+    assert first.sent[ch.SIGHTING_FACTOR.key(SCENARIO.robots[0].id)]
+    assert encoded(team(1).final) == encoded(first.final)
 
 
 def test_a_robot_that_dies_and_comes_back_changes_no_bit_of_it(first):

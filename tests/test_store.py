@@ -1,4 +1,4 @@
-"""The set of submaps: a union; what does not fit is refused, says why, and changes nothing."""
+"""The set of submaps is a union; a misfit is refused with its reason and changes nothing."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""The driver: what it refuses, what it keeps, and what the wire says of it."""
+"""The driver: refused calls, the stored stream, and its messages."""
 
 import inspect
 import re
@@ -29,7 +29,7 @@ S = 10**9
 
 @pytest.fixture
 def alone(tmp_path):
-    """A driver that nobody hears; its network never comes."""
+    """A driver without a network."""
     robots = []
 
     def make(**options):
@@ -249,7 +249,7 @@ def test_a_difference_of_poses_covers_the_time_in_which_a_driver_was_away(alone)
 
 
 class Listener:
-    """A robot's process as a driver sees it: it takes what comes and says how far it is."""
+    """A robot's process for a driver: it receives measurements and reports its progress."""
 
     def __init__(self, endpoint):
         self.bus = ZenohBus("lab", endpoint)

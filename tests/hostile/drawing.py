@@ -35,7 +35,7 @@ OF_THE_RUN = (
     m.FusedMap, m.End, m.Done, m.Withdrawal, m.WithdrawalHeard, m.GivenUp, m.TeamEnd, m.StreamHead,
     m.Fault,
 )  # fmt: skip
-"""What only keys can keep a stranger from: he ends the run or makes it wait, or lies of a fault."""
+"""Messages that only keys keep from a stranger: they end a run, delay it, or report faults."""
 SKIPPED = (*ch.QUERIES, ch.VIEW, ch.ALIVE)
 CHANNELS = {
     kind: [row for row in ch.CHANNELS if row not in SKIPPED and kind in row.kinds]
@@ -207,14 +207,14 @@ class Team:
 
 
 def progress(robot: str, submaps: int) -> m.Progress:
-    """What a robot says that has published so many submaps of ten seconds."""
+    """Progress of a robot that has published so many submaps of ten seconds."""
     return build.progress(
         stamp_ns=submaps * 10 * S, robot=robot, measurements=1000, submaps=submaps
     )
 
 
 def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
-    """Of robots that have published so many submaps each, and of the world."""
+    """Last messages of the world and of robots with so many submaps each."""
     out: list[m.Message] = []
     for robot, count in submaps.items():
         said = progress(robot, count)
@@ -233,7 +233,7 @@ def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
 def centre_session(
     messages: Sequence[m.Message], config: CentralConfig | None = None
 ) -> tuple[CentralNode, list[Outgoing]]:
-    """A centre that hears these; what it says is what every receiver takes."""
+    """Run a centre on these messages; check that its own messages are valid."""
     centre = CentralNode(config or CentralConfig(), list(ROBOTS))
     out = centre.begin()
     for robot in ROBOTS:
@@ -326,7 +326,7 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
 
 
 def prior(rng: np.random.Generator, robot: str) -> m.Prior:
-    """What a centre may say of the robot's place."""
+    """Draw a prior for a robot."""
     ids = np.unique(rng.integers(1, 8, int(rng.integers(0, 5)))).astype(np.uint32)
     n = 3 + 2 * len(ids)
     sequence = int(rng.integers(-1, 4))
@@ -344,7 +344,7 @@ def prior(rng: np.random.Generator, robot: str) -> m.Prior:
 def robot_session(
     messages: Iterator[m.Message], config: RobotConfig
 ) -> tuple[RobotNode, list[Outgoing]]:
-    """A robot that hears what of these its door lets in; what it says every receiver takes."""
+    """Run a robot on the valid ones of these messages; check that its own messages are valid."""
     node = robot_node(config)
     out = node.begin()
     for message in messages:

@@ -89,7 +89,7 @@ def few_large(path: Path) -> Path:
 
 
 def far_counters(path: Path) -> Path:
-    """Sound messages whose counters speak of 10¹⁸ measurements."""
+    """Sound messages whose counters name 10¹⁸ measurements."""
     far = 2**60
     joint = from_floats([0.0] * 5)
     submap = build.submap(

@@ -1,4 +1,4 @@
-"""What raises is set aside and named, whoever runs the node; the rest of the team ends its map."""
+"""A message whose handling raises is set aside and named; the team completes its map."""
 
 import re
 import threading

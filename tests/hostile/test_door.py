@@ -1,4 +1,4 @@
-"""What can not be true of a team is refused by every node, counted, named, and changes nothing."""
+"""Every node refuses impossible messages, counts and names them, and changes nothing."""
 
 import msgspec
 import pytest
@@ -44,7 +44,7 @@ def progress(robot: str, measurements: int, submaps: int, stamp_s: float = 12.0)
 
 
 def run() -> list[tuple[ch.Channel, str, m.Message]]:
-    """All that a centre hears of a team, in one possible order."""
+    """All messages that a centre receives of a team, in one possible order."""
     said: list[tuple[ch.Channel, str, m.Message]] = []
     for name, submaps in SUBMAPS.items():
         here = build.liveliness(node=f"robot/{name}")

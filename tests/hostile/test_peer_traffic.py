@@ -1,4 +1,4 @@
-"""What a hostile or broken peer sends can neither fill a robot nor keep it busy."""
+"""Messages of a hostile or broken peer neither fill a robot nor keep it busy."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A robot goes on whatever its sensors say: rejected with a reason, never dead, nothing unsound."""
+"""A robot continues on any stream of its sensors, and rejects measurements with a reason."""
 
 import os
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What a stranger and a robot that was taken over can say at a router with keys: nothing of others.
+"""With keys a stranger or a captured robot publishes nothing in the names of others.
 
 Each attack is made twice: at a router with keys nothing arrives, at an open one it does.
 """
@@ -64,7 +64,7 @@ ATTACKS = {
     ),
     "gives the truth": (ch.TRUTH, "r1", example(m.Truth)),
 }
-"""What r2 says that is not its own to say."""
+"""Messages of r2 in the names of others."""
 
 
 def on_every_row() -> Iterator[Outgoing]:
@@ -326,7 +326,7 @@ def test_each_side_names_a_certificate_that_it_refuses(
 
 
 def shut_out(bus: ZenohBus) -> tuple[str, float]:
-    """What a node that is in says when it is let in no more, and after how long."""
+    """Error of a connected node that the router no longer accepts, and the time [s] until it."""
     began = time.monotonic()
     while time.monotonic() - began < 60.0:
         try:
@@ -361,7 +361,7 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
 def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its link comes up again, and it hears nothing: the others, who are not revoked, do."""
+    """Its link comes up again and delivers nothing; those of the others deliver."""
     monkeypatch.setattr(session, "LINK_S", 0.3)
     home, carried = tmp_path / "home", tmp_path / "carried"
     make_keys(home, TEAM, nodes_of(["r1", "r2"]))

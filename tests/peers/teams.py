@@ -59,7 +59,7 @@ def done(robot: str, submaps: int) -> Member:
 
 @cache
 def said(robot: str, submaps: int, mate: str) -> tuple[list[Member], ...]:
-    """What a robot says in its life, by occasion."""
+    """The members of one robot's life, by occasion."""
     parcels = [parcel(robot, k, [mate] if k % 3 == 1 else []) for k in range(submaps)]
     return ([start(robot)], *parcels, [done(robot, submaps)])
 
@@ -182,6 +182,6 @@ class Storm:
                 self.send(name, other, each.message)
 
     def fed(self, name: str) -> Iterator[m.Message]:
-        """What a fold that begins now is handed."""
+        """The messages that a fresh fold receives."""
         self.nodes[name].restart_fold()
         return self.nodes[name].new_messages()

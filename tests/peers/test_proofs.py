@@ -1,4 +1,4 @@
-"""What a third robot carries is believed by the signature of who said it, where there are keys."""
+"""With keys, members that a third robot carries need their author's signature."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def nodes(folder: Path) -> dict[str, PeerNode]:
-    """Peers with keys; r1 has said something, which r2 has heard."""
+    """Peers with keys; r2 has received members of r1."""
     found = {}
     for robot in ROBOTS:
         signer = Signer(credentials_of(folder, f"robot-{robot}", "t"))
@@ -124,7 +124,7 @@ def test_a_certificate_of_another_robot_is_nobodys_proof(nodes: dict[str, PeerNo
 
 
 class Renewed:
-    """r1 in a running team, with each of its certificates in turn; r2 hears it, r3 only r2."""
+    """r1 in a running team, with each of its certificates; r2 receives from r1, r3 from r2."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -141,7 +141,7 @@ class Renewed:
         return Proofs("r1", Signer(credentials_of(self.folder, "robot-r1", "t")))
 
     def say(self, proofs: Proofs, *members: Member) -> None:
-        """r1 publishes its certificate and members; r2 hears both and the signatures."""
+        """r1 publishes its certificate and members; r2 receives both and the signatures."""
         self.r2.take(member(ch.CERTIFICATE, proofs.certificate()), "robot/r1")
         for each in members:
             self.r2.take(each, "robot/r1")
@@ -206,7 +206,7 @@ def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(
 def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_it_is_not(
     tmp_path: Path,
 ) -> None:
-    """Whatever the time is at which it is checked: the certificate of r1 ended a day ago."""
+    """The certificate of r1 ended a day ago; the time of the check does not matter."""
     now = datetime.now(UTC)
     make_keys(tmp_path, "t", nodes_of(ROBOTS), now=now - timedelta(days=3))
     team = Renewed(tmp_path)

@@ -40,7 +40,7 @@ def digest_of(replica: Replica) -> bytes:
 
 
 def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> None:
-    """A liar says to have everything, of everyone, and gives nothing; r2 has four submaps."""
+    """A liar claims every submap of everyone and gives nothing; r2 has four submaps."""
     node, honest = (
         PeerNode("robot/r1", ("r1", "r2", "r3")),
         PeerNode("robot/r2", ("r1", "r2", "r3")),

@@ -6,7 +6,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
-from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -344,12 +343,3 @@ def test_a_record_longer_than_any_of_ours_is_refused_unread(path: Path) -> None:
         file.truncate(LARGEST_CHUNK + 2**20)
     with pytest.raises(LogError, match=f"record of {LARGEST_CHUNK + 1} bytes"):
         list(open_log(path).samples())
-
-
-def test_measurement_is_lazy(path: Path, noise: list[Sample]) -> None:
-    recorded(path, noise)
-    last = chunks_of(path)[-1]
-    data = bytearray(path.read_bytes())
-    data[last[0] + last[1] // 2] ^= 1
-    path.write_bytes(data)
-    assert list(islice(open_log(path).samples(), 3)) == noise[:3]

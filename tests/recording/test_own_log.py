@@ -1,4 +1,4 @@
-"""A robot's own log and another's make the whole: what one has not heard the other has."""
+"""Robots' own logs complete each other."""
 
 import threading
 from pathlib import Path

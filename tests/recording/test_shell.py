@@ -177,7 +177,7 @@ def test_absent_nodes_are_a_warning_until_they_appear(path: Path) -> None:
 
 
 def team_of(source: Bus) -> list[Outgoing]:
-    """What a small team publishes, its final map at the end."""
+    """Publish the messages of a small team, the final map last."""
     out = [Outgoing(c.ODOMETRY, "alpha", odometry(i)) for i in range(1_000)]
     out += [Outgoing(c.SUBMAP, "alpha", submap(i)) for i in range(20)]
     out.append(Outgoing(c.FINAL_MAP, "", FINAL))

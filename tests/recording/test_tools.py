@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from team.recording.check import check_log
 from team.recording.counters import Counters
 from team.recording.csv_tables import export_csv
-from team.recording.cut import CUT, cut
+from team.recording.cut import cut
 from team.recording.declared import find_misdeclaration, read_declarations
 from team.recording.merge import MERGED, merge
 from team.recording.reader import Log, LogError, open_log
@@ -169,7 +169,7 @@ def test_a_cut_log_lacks_nothing_outside_of_its_cut(path: Path, samples: list[Sa
 
 
 def test_a_process_without_a_last_word_is_named(path: Path) -> None:
-    """A killed robot's second life says what it has published; of the first nobody knows."""
+    """A killed robot's second life reports its totals; those of the first are unknown."""
 
     def status(counter: int, wall_s: int) -> Sample:
         said = build.status(stamp_ns=counter * 10**9, node="robot/alpha")
@@ -294,7 +294,7 @@ def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(
 
 
 def test_a_publication_that_came_as_a_reply_is_not_missing() -> None:
-    """Which one it is, its missing counter does not tell; that it is there, its contents do."""
+    """Without its counter it is one of those published; which one does not matter."""
     counters = Counters()
     counters.take(Sample("central/final", b"", 0, 5, NO_COUNTER))
     assert counters.findings(part=False, totals=(1,)) == []
@@ -449,17 +449,6 @@ def test_a_cut_has_its_stretch_its_channels_and_what_holds_in_it(
     }  # fmt: skip
 
 
-def test_every_cut_is_noted_in_the_metadata(whole: Log, tmp_path: Path) -> None:
-    cut(whole, tmp_path / "a.mcap", 2.0)
-    cut(open_log(tmp_path / "a.mcap"), tmp_path / "b.mcap", to_s=1.0, channels=[c.ODOMETRY])
-    metadata = open_log(tmp_path / "b.mcap").metadata
-    assert metadata["seed"] == "7"
-    assert metadata[CUT] == (
-        "log.mcap: [2, ) s since 100000000000 ns, all channels; "
-        "a.mcap: [, 1) s since 102000000000 ns, odometry"
-    )
-
-
 @pytest.mark.parametrize("bounds", [(6.0, None), (None, 0.0), (2.01, 2.02)])
 def test_a_cut_with_nothing_in_it_is_refused(
     tmp_path: Path, bounds: tuple[float | None, float | None]
@@ -508,17 +497,6 @@ def test_what_a_robot_says_again_after_a_restart_is_no_duplicate(tmp_path: Path)
     log = recorded(tmp_path / "a.mcap", twice)
     assert merge([log, log], tmp_path / "m.mcap") == (2, 2)
     assert list(open_log(tmp_path / "m.mcap").samples()) == twice
-
-
-def test_what_differs_of_logs_of_one_name_is_numbered(tmp_path: Path) -> None:
-    logs = []
-    for robot in ("alpha", "bravo"):
-        (tmp_path / robot).mkdir()
-        logs.append(recorded(tmp_path / robot / "log.mcap", drive(robot, 1), host=robot))
-    merge(logs, tmp_path / "m.mcap")
-    metadata = open_log(tmp_path / "m.mcap").metadata
-    assert metadata["host@1:log.mcap"] == "alpha"
-    assert metadata["host@2:log.mcap"] == "bravo"
 
 
 def test_logs_of_two_teams_are_not_merged(whole: Log, tmp_path: Path) -> None:

@@ -17,22 +17,18 @@ from team.ros2_answers import Answers, LiveAnswers, RosPublisher, landmark_block
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.zenoh.foreign import ForeignKeys
-from tests import build
-from tests.ros2.test_live import free_port
+from tests.ros2.conftest import Network
 from tests.sim.reruns import team_samples, thesis, written
-from tests.support import examples, packed, spd, wait_until
+from tests.support import example, packed, spd, wait_until
 
 S = 10**9
 NAMES = names_of("r1", "/r1/odom", "odom", "base_link")
 
 
 def posed(stamp_ns: int, pose: tuple[float, float, float], *, inside: bool = True):
-    (example,) = (each for each in examples() if isinstance(each, m.PoseEstimate))
-    fields = {name: getattr(example, name) for name in example.__struct_fields__}
-    fields |= {"stamp_ns": stamp_ns, "robot": "r1", "pose": from_floats(pose)}
-    P = np.diag([0.04, 0.09, 0.01])
-    fields |= {"covariance": from_floats(P), "in_team_frame": inside}
-    return build.pose_estimate(**fields)
+    P = from_floats(np.diag([0.04, 0.09, 0.01]))
+    given = {"pose": from_floats(pose), "covariance": P, "in_team_frame": inside}
+    return example(m.PoseEstimate, stamp_ns=stamp_ns, robot="r1", **given)
 
 
 def decoded(answer):
@@ -86,7 +82,7 @@ def test_a_pose_has_its_covariance_in_six_dimensions() -> None:
 
 
 def test_landmarks_have_ellipses_of_two_sigma_and_their_ids() -> None:
-    (fused,) = (each for each in examples() if isinstance(each, m.FusedMap))
+    fused = example(m.FusedMap)
     out = by_topic(Answers(NAMES).convert(fused))
     markers = decoded(out["/r1/team_landmarks"]).markers
     assert markers[0].action == 3, "the landmarks of the map before are deleted first"
@@ -102,13 +98,11 @@ def test_landmarks_have_ellipses_of_two_sigma_and_their_ids() -> None:
 
 @pytest.mark.parametrize("joint", [True, False])
 def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint: bool) -> None:
-    (fused,) = (each for each in examples() if isinstance(each, m.FusedMap))
     P, ids = spd(6), from_ids([1, 2, 3])
     blocks = np.array([P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)])
     data = packed(P) if joint else from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
-    fields = {name: getattr(fused, name) for name in fused.__struct_fields__}
     changed = {"ids": ids, "means": from_floats(range(6)), "covariance": data, "joint": joint}
-    np.testing.assert_array_equal(landmark_blocks(build.fused_map(**fields | changed)), blocks)
+    np.testing.assert_array_equal(landmark_blocks(example(m.FusedMap, **changed)), blocks)
 
 
 def test_an_ellipse_has_the_directions_of_its_covariance() -> None:
@@ -132,16 +126,13 @@ def test_a_robot_s_topics_are_beside_its_odometry(topic, frame, namespace, tf) -
     assert (names.namespace, names.tf) == (namespace, tf)
 
 
-def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types() -> None:
-    port = free_port()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
+def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types(
+    network: Network,
+) -> None:
+    router, endpoint = network
     live = LiveAnswers("r1", RobotTopics(odometry="/r1/odom"))
     with (
-        zenoh.open(config) as router,
-        ForeignKeys(f"tcp/127.0.0.1:{port}", [], []) as session,
+        ForeignKeys(endpoint, [], []) as session,
         router.declare_subscriber("0/**") as by_rmw,
         router.declare_subscriber("r1/**") as by_bridge,
     ):
@@ -172,18 +163,14 @@ def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types
         assert any(each.endswith("/NN/%/%/teamslam_r1") for each in graph)
 
 
-def test_a_late_subscriber_receives_the_newest_path_and_map() -> None:
-    port = free_port()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    with zenoh.open(config), ForeignKeys(f"tcp/127.0.0.1:{port}", [], []) as session:
+def test_a_late_subscriber_receives_the_newest_path_and_map(network: Network) -> None:
+    _, endpoint = network
+    with ForeignKeys(endpoint, [], []) as session:
         publisher = RosPublisher(session, "teamslam_r1", 0)
         for answer in Answers(NAMES).convert(posed(1 * S, (2.0, 0.0, 0.0))):
             publisher.publish(answer)
         topics = ["0/r1/team_path/*/*"]
-        with ForeignKeys(f"tcp/127.0.0.1:{port}", [], [], latched=topics) as late:
+        with ForeignKeys(endpoint, [], [], latched=topics) as late:
             received: list[str] = []
 
             def came() -> bool:

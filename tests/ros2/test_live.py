@@ -1,6 +1,5 @@
 """A ROS 2 robot live: keys of rmw_zenoh and of a bridge, from a publisher that is not ours."""
 
-import socket
 import struct
 import time
 from collections.abc import Callable
@@ -26,16 +25,10 @@ from team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
 from team.wire.digest import configured
 from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
+from tests.ros2.conftest import Network
 from tests.support import wait_until
 
 S = 10**9
-
-
-def free_port() -> int:
-    """A port that is free now."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
 
 
 ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
@@ -96,35 +89,32 @@ EXPECTED = [
 
 
 @pytest.mark.parametrize("key", [by_rmw, by_bridge])
-def test_topics_on_zenoh_become_a_driver_s_calls(key: Callable[[str, str], str]) -> None:
-    port = free_port()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
+def test_topics_on_zenoh_become_a_driver_s_calls(
+    network: Network, key: Callable[[str, str], str]
+) -> None:
+    router, endpoint = network
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
-    with zenoh.open(config) as router:
-        token = "@/beef/@ros2_lv/MP/r1§tags/vision_msgs§msg§Detection3DArray/:::"
-        held = router.liveliness().declare_token(token) if key is by_bridge else None
-        with ForeignKeys(f"tcp/127.0.0.1:{port}", driver.keys, driver.tokens) as foreign:
-            odom = router.declare_publisher(key("/r1/odom", ODOMETRY))
-            tag = router.declare_publisher(key("/r1/tags", TAGS))
-            wait_until(lambda: odom.matching_status.matching and tag.matching_status.matching)
-            odom.put(odometry(1))
-            odom.put(odometry(2)[:-7])
-            odom.put(odometry(2))
-            tag.put(tags(2))
-            odom.put(odometry(1))
-            odom.put(odometry(3))
+    token = "@/beef/@ros2_lv/MP/r1§tags/vision_msgs§msg§Detection3DArray/:::"
+    held = router.liveliness().declare_token(token) if key is by_bridge else None
+    with ForeignKeys(endpoint, driver.keys, driver.tokens) as foreign:
+        odom = router.declare_publisher(key("/r1/odom", ODOMETRY))
+        tag = router.declare_publisher(key("/r1/tags", TAGS))
+        wait_until(lambda: odom.matching_status.matching and tag.matching_status.matching)
+        odom.put(odometry(1))
+        odom.put(odometry(2)[:-7])
+        odom.put(odometry(2))
+        tag.put(tags(2))
+        odom.put(odometry(1))
+        odom.put(odometry(3))
 
-            def done() -> bool:
-                for sample in foreign.receive(0.05):
-                    driver.take(sample)
-                return len(robot.calls) >= len(EXPECTED)
+        def done() -> bool:
+            for sample in foreign.receive(0.05):
+                driver.take(sample)
+            return len(robot.calls) >= len(EXPECTED)
 
-            wait_until(done)
-        assert (held is not None) == (key is by_bridge)
+        wait_until(done)
+    assert (held is not None) == (key is by_bridge)
     in_time = sorted(robot.calls, key=lambda call: call[1])  # Zenoh promises no order across keys
     assert in_time == EXPECTED
     assert driver.taken == {"/r1/odom": 5, "/r1/tags": 1}
@@ -175,36 +165,30 @@ def test_a_static_transform_says_where_the_sensor_sits() -> None:
 
 
 @pytest.mark.parametrize("topic", ["/tf_static", "/r1/tf_static"])
-def test_what_was_published_once_before_the_driver_began_is_received(topic: str) -> None:
-    port = free_port()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("timestamping/enabled", "true")
+def test_what_was_published_once_before_the_driver_began_is_received(
+    network: Network, topic: str
+) -> None:
+    router, endpoint = network
     robot = Robot()
     driver = Ros2Driver(robot, RobotTopics(odometry="/r1/odom", detections=("/r1/tags",)))
     kind = "tf2_msgs/msg/TFMessage"
     here = ros.transforms((0, "base_link", "eye", ros.vector(0.2), (0.0, 0.0, 1.0, 0.0)))
     seen = ros.cdr(TAGS, ros.detections(S, "eye", [("7", ros.pose(3.0, 4.0))]))
-    with zenoh.open(config) as router:
-        latched = zenoh.ext.declare_advanced_publisher(
-            router,
-            by_rmw(topic, kind),
-            cache=zenoh.ext.CacheConfig(max_samples=1),
-            publisher_detection=True,
-        )
-        latched.put(ros.cdr(kind, here))
-        with ForeignKeys(
-            f"tcp/127.0.0.1:{port}", driver.keys, driver.tokens, latched=driver.latched
-        ) as foreign:
+    latched = zenoh.ext.declare_advanced_publisher(
+        router,
+        by_rmw(topic, kind),
+        cache=zenoh.ext.CacheConfig(max_samples=1),
+        publisher_detection=True,
+    )
+    latched.put(ros.cdr(kind, here))
+    with ForeignKeys(endpoint, driver.keys, driver.tokens, latched=driver.latched) as foreign:
 
-            def has_come() -> bool:
-                for sample in foreign.receive(0.05):
-                    driver.take(sample)
-                return driver.taken[topic] > 0
+        def has_come() -> bool:
+            for sample in foreign.receive(0.05):
+                driver.take(sample)
+            return driver.taken[topic] > 0
 
-            wait_until(has_come)
+        wait_until(has_come)
     driver.take(ForeignSample(by_rmw("/r1/tags", TAGS), seen))
     np.testing.assert_allclose(robot.calls[0][3], [[3.0, 4.0]], atol=1e-12)
     (mount,) = driver.mounts
@@ -299,7 +283,7 @@ def test_the_reasons_that_are_told_apart_are_bounded() -> None:
 
 
 def numbered(number: int, gid: bytes = b"a" * 16) -> bytes:
-    """What rmw_zenoh attaches, as its C++ serializer writes it."""
+    """The attachment of rmw_zenoh as its C++ serializer writes it."""
     named = struct.pack("<B15sqB16sq", 15, b"sequence_number", number, 16, b"source_timestamp", S)
     return named + struct.pack("<B10sB16s", 10, b"source_gid", 16, gid)
 

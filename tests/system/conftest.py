@@ -1,4 +1,4 @@
-"""What the system tests share: their processes, short scenarios, and one finished launch."""
+"""Fixtures of the system tests: their processes, short scenarios, and one finished launch."""
 
 import json
 import signal

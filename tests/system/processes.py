@@ -32,7 +32,7 @@ async def until(condition: Callable[[], object], what: str, timeout_s: float = 1
 
 
 class Process:
-    """One process that a test started; what it says goes into a file."""
+    """One process that a test started; its output goes into a file."""
 
     def __init__(self, name: str, process: asyncio.subprocess.Process, output: Path) -> None:
         self.name = name

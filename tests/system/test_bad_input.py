@@ -1,6 +1,6 @@
-"""What a user may get wrong: exit status 2, one clear message, no traceback, nothing left running.
+"""Mistakes of a user: exit status 2, one clear message, no traceback, nothing left running.
 
-And what looks wrong but works: a data set without ground truth, a robot without odometry.
+And unusual input that works: a data set without ground truth, a robot without odometry.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""A team whose processes are started by hand: what each says, and what it refuses."""
+"""A team whose processes are started by hand: their output and their refusals."""
 
 import signal
 

@@ -1,4 +1,4 @@
-"""Processes that die: who it was is told, the rest goes on or ends, and nothing is left behind."""
+"""Processes that die are named, the rest goes on or ends, and none is left behind."""
 
 import json
 import os

@@ -17,7 +17,7 @@ MESSAGES = 500
 
 
 async def test_what_no_honest_node_says_ends_no_process_and_is_no_fault(team: Processes) -> None:
-    """A tenth of it is mutated. Afterwards the centre and a robot still say how they are."""
+    """A tenth of it is mutated. Afterwards the centre and a robot still report their status."""
     scenario = short(team.folder)
     endpoint = await team.router()
     there = ["--connect", endpoint]

@@ -31,7 +31,7 @@ async def test_a_user_s_own_folders_do_not_shadow_ours(team: Processes) -> None:
 
 
 async def done(team: Processes, name: str, command: Sequence[object]) -> str:
-    """What a command says that ends with 0; a PYTHONPATH would lead it to our sources."""
+    """Output of a command that ends with 0, without a PYTHONPATH to our sources."""
     words = ["env", "-u", "PYTHONPATH", *(str(word) for word in command)]
     process = await team.run(name, words)
     assert await process.ended() == 0, process.said()

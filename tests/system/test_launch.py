@@ -155,7 +155,7 @@ def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
 
 
 def keep_another_runs_set(launched: Launched, file: Path) -> None:
-    """The set of a centre that has heard the same names of submaps with other numbers."""
+    """Write the set of another run: submaps of the same names with other numbers."""
     file.parent.mkdir()
     kept = StoredSet(file)
     for sample in open_log(launched.log).samples((ch.SUBMAP,)):

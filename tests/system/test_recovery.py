@@ -1,4 +1,4 @@
-"""What is lost on the way comes back: the map is that of a run in which nothing was lost."""
+"""Lost messages come back: the map is that of a run without losses."""
 
 import signal
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""`teamslam replay`: a log's traffic again, into a program that knows nothing of us."""
+"""`teamslam replay`: a log's traffic again, into a program that is not ours."""
 
 import json
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ Arrived = list[tuple[str, bytes, bytes]]
 
 @contextmanager
 def plain_subscriber(endpoint: str) -> Iterator[Arrived]:
-    """What a foreign Zenoh session gets of everything there is."""
+    """Samples that a foreign Zenoh session receives."""
     config = zenoh.Config.from_json5(
         f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
         "scouting: {multicast: {enabled: false}}, "
@@ -37,7 +37,7 @@ def plain_subscriber(endpoint: str) -> Iterator[Arrived]:
 
 
 def recorded(launched: Launched) -> Arrived:
-    """What must arrive: each message of the log, in its order."""
+    """The expected samples: each message of the log, in its order."""
     return [
         (
             (key := f"team/short/{sample.key}"),

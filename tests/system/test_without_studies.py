@@ -15,7 +15,7 @@ from tests.system.scenarios import short
 
 PACKAGES = ("team", "central", "sim")
 PATIENCE_S = 300.0
-"""Of one command: where no test before has compiled the kernels, the launch does."""
+"""Time limit [s] of a command: the launch may have to compile the kernels."""
 REMOVABLE = ("sim/studies",)
 REMOVED = """import sys
 

@@ -21,15 +21,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from sim.scenarios.scenario import load
+from tests.namespaces import NET, ip, network
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
 
-NET = "10.213.77"
 PORT = 7447
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
@@ -51,36 +50,6 @@ class Run:
         """As if nothing had happened."""
         unnamed = bool(self.lacks) and not self.check
         return self.equal and not unnamed and not any(self.exits.values())
-
-
-def ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True)
-
-
-@contextmanager
-def network(nodes: Sequence[str]) -> Iterator[dict[str, str]]:
-    """A namespace for the router with a bridge, and one on it for each node; their names."""
-    names = {node: f"teamslam-{os.getpid()}-{k}" for k, node in enumerate(["router", *nodes])}
-    made: list[str] = []
-    try:
-        for name in names.values():
-            ip("netns", "add", name)
-            made.append(name)
-            ip("-n", name, "link", "set", "lo", "up")
-        hub = names["router"]
-        ip("-n", hub, "link", "add", "hub", "type", "bridge")
-        ip("-n", hub, "addr", "add", f"{NET}.1/24", "dev", "hub")
-        ip("-n", hub, "link", "set", "hub", "up")
-        for k, node in enumerate(nodes):
-            of = names[node]
-            ip("-n", hub, "link", "add", node, "type", "veth", "peer", "name", "up0", "netns", of)
-            ip("-n", hub, "link", "set", node, "master", "hub", "up")
-            ip("-n", of, "addr", "add", f"{NET}.{k + 2}/24", "dev", "up0")
-            ip("-n", of, "link", "set", "up0", "up")
-        yield names
-    finally:
-        for name in made:
-            ip("netns", "del", name)
 
 
 def commands(scenario: Path, robots: Sequence[str], speed: str) -> dict[str, list[str]]:

@@ -25,7 +25,8 @@ from pathlib import Path
 from sim.scenarios.scenario import load, with_options
 from team.recording.check import holes
 from team.recording.reader import open_log
-from tests.trials.cuts import NET, ONE_THREAD, PORT, ip, network
+from tests.namespaces import NET, ip, network
+from tests.trials.cuts import ONE_THREAD, PORT
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

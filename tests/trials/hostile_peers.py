@@ -64,7 +64,7 @@ def claims(rng: random.Random, node: str, serial: int) -> m.SetSummary:
 
 
 def given(rng: random.Random, node: str) -> bytes:
-    """An answer: a large payload, a large signature, a robot that nobody knows."""
+    """An answer: a large payload, a large signature, a robot that is not in the team."""
     start = build.initial_pose(robot="x9")
     done = build.concluded()
     return encoded(

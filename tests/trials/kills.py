@@ -93,7 +93,7 @@ def children(launch: int, folder: Path) -> dict[int, list[str]]:
 
 
 def lacking(folder: Path) -> list[str]:
-    """What of the streams and of the submaps is not in the log, by their own last counts."""
+    """Measurements and submaps that the log lacks, by their streams' last counts."""
     counted: dict[tuple[str, str, int], set[int]] = {}
     said: dict[tuple[str, str, int], int] = {}
     try:
@@ -145,7 +145,7 @@ def expected_of(scenario: Scenario) -> bytes:
 
 
 def await_text(path: Path, text: str, patience_s: float = 120.0) -> str:
-    """What follows a text in a file, once it stands there."""
+    """Wait for a text in a file; return the text behind it."""
     end = time.monotonic() + patience_s
     while not (path.exists() and text in path.read_text("utf-8", "replace")):
         if time.monotonic() > end:

@@ -34,7 +34,7 @@ def spin() -> None:
 
 
 class Questions(logging.Handler):
-    """Counts what the bus says that it asks for."""
+    """Count the keys that the bus requests."""
 
     def __init__(self) -> None:
         super().__init__()

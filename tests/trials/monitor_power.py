@@ -1,4 +1,4 @@
-"""Whether the consistency monitor sees a factor of two, profile by profile.
+"""Power of the consistency monitor against a factor of two, profile by profile.
 
     python -m tests.trials.monitor_power [--seeds FIRST-LAST] [--dataset ZIP …] [--profiles NAME …]
 
@@ -29,7 +29,7 @@ SIMULATED = ("thesis", "thesis-b", "waypoints", "random-3")
 ROBUST = "robust"
 OUTLIERS = 0.1
 CLAIMED = ((1.0, ""), (0.5, "too much"), (2.0, "too little"))
-"""What all covariances are taken times, and the words that the monitor then owes."""
+"""Factors of all covariances, and the words of the monitor's warning for each."""
 
 
 def robust() -> Scenario:
@@ -47,7 +47,7 @@ def robust() -> Scenario:
 
 
 def found_at(fold: Fold, claimed: float, normal: float) -> Finding:
-    """What the monitor says of the map, all of whose covariances are taken times `claimed`."""
+    """Finding of the monitor for the map with all covariances times `claimed`."""
     key = fold.main_key
     assert key is not None
     settings = replace(

@@ -1,4 +1,4 @@
-"""What online poses could be: everything that the whole team has measured by then, at once.
+"""Bound of online poses: the batch estimate of all measurements of the team until then.
 
     python -m tests.trials.online_bound [SCENARIO …] [--seeds FIRST-LAST]
 
@@ -40,12 +40,12 @@ class Bounded(NamedTuple):
     headings: np.ndarray
 
     def rmse_m(self, stamps_ns: np.ndarray) -> float:
-        """Of the positions at these stamps."""
+        """RMSE [m] of the positions at these stamps."""
         at = np.isin(self.stamps_ns, stamps_ns)
         return float(np.sqrt(np.mean(np.sum(self.errors[at, :2] ** 2, axis=1))))
 
     def sigma_m(self, stamps_ns: np.ndarray) -> float:
-        """What this RMSE is expected to be."""
+        """Expected RMSE [m]."""
         at = np.isin(self.stamps_ns, stamps_ns)
         variances = self.covariances[at, 0, 0] + self.covariances[at, 1, 1]
         return float(np.sqrt(np.mean(variances)))
@@ -71,14 +71,14 @@ class Bounded(NamedTuple):
         return found
 
     def nees_per_dof(self, stamps_ns: np.ndarray) -> float:
-        """Of these poses; 1 on average."""
+        """NEES per degree of freedom of these poses; 1 on average."""
         at = np.isin(self.stamps_ns, stamps_ns)
         solved = np.linalg.solve(self.covariances[at], self.errors[at, :, np.newaxis])[:, :, 0]
         return float(np.mean(np.sum(self.errors[at] * solved, axis=1)) / 3.0)
 
 
 def bounds(scenario: Scenario, world: WorldStreams) -> dict[str, Bounded]:
-    """Of each robot, after each odometry interval."""
+    """Errors and covariances of each robot after each odometry interval."""
     filter_ = _AtTruth(world)
     found: dict[str, list[tuple[int, np.ndarray, np.ndarray, float]]] = {
         config.id: [] for config in scenario.robots

@@ -1,4 +1,4 @@
-"""What a long run costs each process: memory, descriptors and threads over time.
+"""Memory, descriptors and threads of each process over a long run.
 
     python -m tests.trials.soak [--scenario random-3] [--minutes 60] [--speed 100] [--fusion join]
                               [--json FILE]

@@ -87,7 +87,7 @@ def of_robot(stream: RobotStream) -> list[ros.Message]:
 
 
 def write_bags(streams: tuple[RobotStream, ...], folder: Path) -> None:
-    """Both bags, and the file that tells their topics."""
+    """Write both bags, and the file of their topics."""
     messages = sorted((m for s in streams for m in of_robot(s)), key=lambda m: m[0])
     for name in ("mcap", "db3"):
         ros.write_bag(folder / name, messages, db3=name == "db3")
@@ -116,7 +116,7 @@ def starts(streams: tuple[RobotStream, ...]) -> dict[str, str]:
 
 
 def publish(mode: str, bag: Path, port: int, speed: float) -> None:
-    """Publish a bag's bytes when standard input says so; each robot by a session of its own."""
+    """Publish a bag's bytes upon a line on standard input; each robot by a session of its own."""
     with opened_bag(bag) as there:
         kinds = {topic.name: topic.kind for topic in there.topics}
         messages = [(m.arrival_ns, m.topic, bytes(m.data)) for m in there.messages(list(kinds))]

@@ -43,13 +43,3 @@ def test_no_entry_of_a_pose_covariance_is_infinite_or_no_number(value, place):
     P = np.eye(3).ravel()
     P[place] = value
     assert verdict(check_pose_covariance, from_floats(P), "it") == "not finite"
-
-
-def test_a_pose_covariance_has_nine_numbers():
-    assert verdict(check_pose_covariance, from_floats(np.eye(2)), "it") == "wrong length"
-    assert verdict(check_pose_covariance, b"1234567", "it") == "wrong length"
-
-
-def test_large_finite_entries_are_numbers():
-    huge = np.diag([1e308, 1e308, 1e308])
-    assert verdict(check_pose_covariance, from_floats(huge), "it") == "sound"

@@ -1,4 +1,4 @@
-"""What has arrived of a publisher: each once, in order, and what is missing is known."""
+"""Arrivals of a publisher: each once, in order, and the missing ones are listed."""
 
 import itertools
 

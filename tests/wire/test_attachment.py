@@ -10,7 +10,7 @@ from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 
 KEY = "team/t/robot/r1/submap"
 GOLDEN = bytes.fromhex("0100000000000000feffffffffffffff0300000000000000496a1b39ffcf6e5c")
-"""Of team time 1 ns, wall clock -2 ns and counter 3 on `KEY`."""
+"""Attachment of team time 1 ns, wall clock -2 ns and counter 3 on `KEY`."""
 stamps = st.integers(-(2**63), 2**63 - 1)
 
 

@@ -1,4 +1,4 @@
-"""What every bus must do: the same tests for the bus in memory and for the bus over Zenoh."""
+"""Contract of a bus, tested for the bus in memory and for the bus over Zenoh."""
 
 import threading
 from collections.abc import Callable, Iterable, Iterator

@@ -103,28 +103,6 @@ def test_no_tag_is_read_where_there_is_none() -> None:
     assert [tag_in(data) for data in (b"", b"\x98", b"\x98\x01\x02")] == ["", "", ""]
 
 
-@settings(deadline=None)
-@given(
-    st.lists(
-        st.tuples(
-            st.integers(0, UNNAMED - 1), st.floats(0, 1e300), st.floats(-float(np.pi), float(np.pi))
-        )
-    )
-)
-def test_observations_come_back_as_they_went(seen: list[tuple[int, float, float]]) -> None:
-    ids, ranges, bearings = zip(*seen, strict=True) if seen else ((), (), ())
-    message = build.observations(
-        stamp_ns=5,
-        robot="alpha",
-        incarnation=0,
-        number=1,
-        ids=from_ids(ids),
-        ranges=from_floats(ranges),
-        bearings=from_floats(bearings),
-    )
-    assert decoded(encoded(message), m.Observations) == message
-
-
 def with_fields(message: m.Message, **values: object) -> bytes:
     fields = fields_of(message)
     for name, value in values.items():

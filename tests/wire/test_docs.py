@@ -1,4 +1,4 @@
-"""docs/wire.md says what the code does: its tables are the code's, its program runs."""
+"""docs/wire.md matches the code: its tables are the code's, its program runs."""
 
 import ast
 import inspect

@@ -1,4 +1,4 @@
-"""What others send can neither fill a log nor forge a line of it."""
+"""Messages of others neither fill a log nor forge a line of it."""
 
 import logging
 

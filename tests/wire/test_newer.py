@@ -1,4 +1,4 @@
-"""The newer of two messages: by what they say, whatever the order in which they come."""
+"""The newer of two messages by their contents, in any order of arrival."""
 
 import msgspec
 from hypothesis import given

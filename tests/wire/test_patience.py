@@ -1,4 +1,4 @@
-"""What is missing is asked for after a while, and not again and again."""
+"""A missing message is requested after a while, at growing intervals."""
 
 import itertools
 
