@@ -91,10 +91,6 @@ class Fault:
 NO_START = "no ground truth at its first measurement: its start pose is not known"
 FAULTS = {
     "none, in a zip of another name": Fault(zipped, ()),
-    "no truth of one robot": Fault(
-        removed("Robot2_Groundtruth"),
-        ("r2: no ground truth: its trajectory's error can not be computed", f"r2: {NO_START}"),
-    ),
     "no truth at all": Fault(
         removed("Robot1_Groundtruth", "Robot2_Groundtruth", "Landmark_Groundtruth"),
         (
@@ -107,17 +103,6 @@ FAULTS = {
     ),
     "no odometry of one robot": Fault(
         removed("Robot2_Odometry"), ("r2: no odometry: only what it saw is given",)
-    ),
-    "no measurements of one robot": Fault(
-        removed("Robot2_Measurement"), ("r2: no measurements: only its odometry is given",)
-    ),
-    "unknown barcodes": Fault(
-        changed("Measurement", lambda rows: [*rows, *(f"{i}.5 999 2.0 0.1" for i in range(20))]),
-        ("r2: 20 measurements dropped: unknown barcode",),
-    ),
-    "backward steps": Fault(
-        changed("Odometry", lambda rows: [*rows[:7], rows[8], rows[7], *rows[9:]]),
-        ("r2: 1 odometry row earlier than the row before: sorted by time",),
     ),
     "gaps": Fault(
         changed("Odometry", lambda rows: rows[:10] + rows[15:]),

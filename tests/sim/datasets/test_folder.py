@@ -411,13 +411,6 @@ def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path: Path) -> 
     assert "line 5, column t_s: 'x' is not a time" in str(result.exception)
 
 
-def test_times_in_other_units_are_noted(tmp_path: Path) -> None:
-    rows = "".join(f"{1000 * k},1,0\n" for k in range(9))
-    odometry = "t_s,forward_m_s,yaw_rate_rad_s\n" + rows
-    notes = only(data_set(tmp_path, odometry=odometry, observations=SEEN)).notes
-    assert "most rows of its odometry are 1,000 s apart" in " ".join(notes)
-
-
 def test_a_folder_around_the_data_set_is_named(tmp_path: Path) -> None:
     data_set(tmp_path / "inner", odometry=SPEEDS, observations=SEEN)
     with pytest.raises(DatasetError, match=r"the data set is in its folder .*inner: give that"):
