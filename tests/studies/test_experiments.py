@@ -1,4 +1,4 @@
-"""What experiments say: figures over seeds, goals, the page, the command line."""
+"""Experiments: figures over seeds, goals, the page, the command line."""
 
 import json
 from pathlib import Path

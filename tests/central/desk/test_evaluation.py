@@ -1,4 +1,4 @@
-"""The figures of a run: each must equal what it says it is."""
+"""The figures of a run equal their definitions."""
 
 import json
 from pathlib import Path as Folder

@@ -1,4 +1,4 @@
-"""How a run went over its time: figures against what was put into the log, events in words."""
+"""The history of a run: its figures equal those computed from the log."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""What `teamslam status` advises."""
+"""Advice of `teamslam status` on clocks that differ."""
 
 import pytest
 

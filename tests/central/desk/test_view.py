@@ -37,7 +37,7 @@ S = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def samples() -> list[Sample]:
-    """What two robots say in 40 steps of the thesis' world."""
+    """Run two robots for 40 steps of the thesis' world."""
     scenario = with_options(load("thesis"), seed=1)
     scenario = msgspec.structs.replace(
         scenario, world=msgspec.structs.replace(scenario.world, steps=40)

@@ -1,4 +1,4 @@
-"""`teamslam log`: what it prints, writes and refuses, and with which exit status."""
+"""`teamslam log`: output, files, refusals and exit status."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Data sets with a fault each: the team still ends with a sound map, and it is said what was wrong.
+"""Data sets with one fault each: the team ends with a sound map, and the fault is named.
 
 The faults are those of sets that people have: files that are missing, foreign barcodes, rows out
 of order, gaps. Measurements and repairs themselves are tested in test_utias.
@@ -80,7 +80,7 @@ def zipped(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is done to a set, what must be said; framed: the map lies in the truth's frame."""
+    """Damage to a data set and the notes expected; framed: the map is in the truth's frame."""
 
     damage: Callable[[Path], None]
     said: tuple[str, ...]

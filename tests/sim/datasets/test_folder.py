@@ -1,4 +1,4 @@
-"""Data sets in folders of CSV tables: bits stay, what is dropped is counted, damage is named."""
+"""Data sets in folders of CSV tables: exact values, counts of dropped rows, named damage."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""UTIAS data sets: what is written is read again, repairs are counted, damage is named exactly."""
+"""UTIAS data sets: written sets read back equal, repairs are counted, damage is named."""
 
 import shutil
 import zipfile

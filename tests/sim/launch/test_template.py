@@ -1,4 +1,4 @@
-"""The template: when it is started and ended, and when a process is forked from it."""
+"""The template process: start, end, and conditions of a fork."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from sim.launch import ahead, template
 
 
 def test_nothing_is_forked_from_a_process_that_has_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that is forked from a process with threads could wait for a lock for ever."""
+    """A process forked from one with threads may deadlock on a lock."""
     forks: list[int] = []
     monkeypatch.setattr(os, "fork", lambda: forks.append(1))
     done = threading.Event()

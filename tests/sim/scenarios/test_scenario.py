@@ -1,4 +1,4 @@
-"""Scenarios: built-in ones, a user's file, a command line, and what is said of mistakes."""
+"""Scenarios: built-in ones, a user's file, a command line, and errors in them."""
 
 from pathlib import Path
 
