@@ -79,3 +79,11 @@ def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:
         for robot, count in measurements.items()
     )
     return m.End(stamp_ns=stamp_ns, streams=tuple(streams))
+
+
+def version(**last: int) -> tuple[m.VersionEntry, ...]:
+    """Version vector of a set: the last sequence of each robot's first incarnation."""
+    return tuple(
+        m.VersionEntry(robot=robot, incarnation=1, sequence=sequence)
+        for robot, sequence in last.items()
+    )

@@ -23,8 +23,7 @@ SMALL = Limits(begin=24, lag=3)
 
 @pytest.fixture(scope="module")
 def world():
-    """Laps of a ring; a closure says that the second one is the first again, when most of the first
-    is condensed."""
+    """Laps of a ring; the second lap closes on the first when most of that is condensed."""
     rng = np.random.default_rng(5)
     angle = 2.0 * np.pi * (np.arange(32) + 0.6 * rng.uniform(size=32)) / 32
     r = rng.uniform(17.0, 23.0, 32)
@@ -81,7 +80,7 @@ def ticks(world, _small):
 
 @pytest.fixture(scope="module")
 def all_said(cluttered, _small):
-    """The running fold of all that the other robot said."""
+    """The running fold of all submaps of the other robot."""
     messages, _ = cluttered
     return folded(messages)
 

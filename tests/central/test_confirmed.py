@@ -80,7 +80,7 @@ def test_what_two_submaps_agree_on_enters_the_map_with_both() -> None:
 def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
     robust_c: float | None, stands: bool
 ) -> None:
-    """Without a robust loss nobody is doubted: the centre has been told to expect no outliers."""
+    """Without a robust loss the centre expects no outliers and discounts no robot."""
     fused = final(rule(set(APART), landmark_submaps=2, robust_c=robust_c))
     assert (FALSE in ids(fused.ids, "ids")) == stands
 
@@ -98,7 +98,7 @@ def test_running_maps_and_priors_have_the_same_landmarks() -> None:
 
 
 def test_the_rest_of_the_map_is_what_it_was() -> None:
-    """Who is left out is in the solution still: its submap's chain and the others lose nothing."""
+    """Landmarks that are not shown stay in the solution: no pose and no other landmark changes."""
     whole, less = (final(rule({("r1", 3)}, landmark_submaps=least)) for least in (1, 2))
     kept = [k for k, id_ in enumerate(ids(whole.ids, "ids").tolist()) if id_ != FALSE]
     means = (np.frombuffer(each.means).reshape(-1, 2) for each in (whole, less))

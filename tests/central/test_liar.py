@@ -1,4 +1,4 @@
-"""A robot that lies about its own submaps is found whoever fixes the frame, and moves nobody."""
+"""A robot with false submaps is detected whichever robot fixes the frame, and moves no other."""
 
 import math
 from collections.abc import Collection, Iterator
@@ -236,7 +236,7 @@ def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map() -> None:
 
 
 def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:
-    """r1 never sees where r3 is: whether r1 or r2 lies can not be told."""
+    """r1 shares nothing with r3, so no test decides between r1 and r2."""
     quiet = Agreement(0.0, 1.0, {"r1": (50.0, 50.0), "r2": (50.0, 50.0), "r3": (50.0, 50.0)}, ())
     loud = Agreement(0.0, 1.0, {"r1": (1e4, 50.0), "r2": (60.0, 50.0), "r3": (50.0, 50.0)}, ())
 

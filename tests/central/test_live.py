@@ -7,6 +7,7 @@ from central.node import CentralNode
 from team.robot.node import RobotNode
 from team.wire import channels as ch
 from team.wire import messages as m
+from tests import build
 from tests.teams import config, driven, of, published, stream
 
 STREAMS = {name: stream(name, 9, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
@@ -19,16 +20,14 @@ def head(robot, count, state="ended", incarnation=1):
 
 
 def begun(robot, incarnation=1):
-    return m.InitialPose(
-        stamp_ns=0, robot=robot, incarnation=incarnation, number=0, pose=b"", covariance=b""
-    )
+    return build.initial_pose(robot=robot, incarnation=incarnation)
 
 
 ORDER = m.TeamEnd(stamp_ns=0, by="operator", reason="it rains")
 
 
 class Live:
-    """A centre, and what robots and drivers have said to it."""
+    """A centre with the messages of its robots and drivers."""
 
     def __init__(self, *robots, admit=False):
         self.centre = CentralNode(CentralConfig(), robots, admit=admit)
@@ -104,13 +103,13 @@ def test_a_robot_that_nobody_has_named_is_admitted_only_where_the_scenario_says_
 def test_the_map_of_a_live_team_is_that_of_the_same_streams_of_a_world():
     live = Live("r1", "r2").robot("r1").robot("r2")
     world = Live("r1", "r2")
-    counts = []
+    counts = {}
     for name, each in STREAMS.items():
         measured = published(each)
-        counts.append(m.StreamEnd(robot=name, incarnation=1, measurements=len(measured)))
+        counts[name] = len(measured)
         said = driven(RobotNode(config(name)), measured)
         world.tell(measured[0], *(o.message for o in said))
-    world.tell(m.End(stamp_ns=0, streams=tuple(counts)))
+    world.tell(build.end(**counts))
     assert world.final.digest == live.final.digest
     assert world.final.means == live.final.means
 

@@ -13,6 +13,7 @@ from team import translate
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import decoded, encoded
+from tests import build
 from tests.teams import Submaps, of, published, stream
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=6.0)
@@ -70,10 +71,7 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
     assert [each.stamp_ns // 10**9 for each in maps] == [3, 9, 15]
     for each in maps:
         last = each.stamp_ns // 3_000_000_000 - 1
-        assert each.members == (
-            m.VersionEntry(robot="r1", incarnation=1, sequence=last),
-            m.VersionEntry(robot="r2", incarnation=1, sequence=last),
-        )
+        assert each.members == build.version(r1=last, r2=last)
         assert (each.final, each.provisional, each.frame) == (False, False, "r1/1")
     assert {p.digest for p in priors} == {each.digest for each in maps}
     assert len({each.digest for each in maps}) == 3
@@ -83,7 +81,7 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
 
 
 def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
-    """Windows of 3 s, ticks of 100 s: what r1 and r2 have closed does not wait for the tick."""
+    """Windows of 3 s, ticks of 100 s: closed windows are published before their tick ends."""
     found, maps = rule(CentralConfig(tick_s=100.0, broadcast_s=3.0)), []
     for k in range(3):
         for name, behind_ns in (("r1", 3_000_000_000), ("r2", 0)):
@@ -92,13 +90,7 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
             said = of(found.publish_due(submap.stamp_ns - behind_ns, submap.stamp_ns), ch.FUSED_MAP)
             assert bool(said) == (name == "r2"), "r1's waits for r2's, nothing is said twice"
             maps += said
-    assert [each.members for each in maps] == [
-        (
-            m.VersionEntry(robot="r1", incarnation=1, sequence=k),
-            m.VersionEntry(robot="r2", incarnation=1, sequence=k),
-        )
-        for k in range(3)
-    ]
+    assert [each.members for each in maps] == [build.version(r1=k, r2=k) for k in range(3)]
     assert not any(each.provisional for each in maps)
     for submap in SUBMAPS.every():
         found.store.add_submap(submap)
@@ -107,7 +99,7 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
 
 
 def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
-    """What r1 has just closed is out though r2 is a window behind, and no broadcast is due."""
+    """A closed window of r1 is published although r2 lags and no broadcast is due."""
     config = CentralConfig(tick_s=100.0, broadcast_s=100.0)
     found, said = rule(config), []
     for name, k in (("r1", 0), ("r2", 0), ("r1", 1)):
@@ -156,7 +148,7 @@ def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_on
     late_ns = SUBMAPS["r1"][0].stamp_ns + 18_000_000_000
     (fused,) = of(found.publish_due(float("-inf"), late_ns), ch.FUSED_MAP)
     assert fused.provisional
-    assert fused.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
+    assert fused.members == build.version(r1=4)
     assert found.publish_due(float("-inf"), late_ns + 1) == []
     assert found.publish_due(float("-inf"), 10 * late_ns) == [], "there is nothing new to say"
     assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
@@ -180,11 +172,8 @@ def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
                 found.store.add_submap(submap)
     assert found.store.processed(("r2", 1)) == 2
     fused = final(found)
-    assert fused.missing == (m.VersionEntry(robot="r2", incarnation=1, sequence=2),)
-    assert fused.members == (
-        m.VersionEntry(robot="r1", incarnation=1, sequence=4),
-        m.VersionEntry(robot="r2", incarnation=1, sequence=1),
-    )
+    assert fused.missing == build.version(r2=2)
+    assert fused.members == build.version(r1=4, r2=1)
 
 
 def test_a_refused_submap_changes_no_bit_and_says_why():
@@ -213,7 +202,7 @@ def test_nobody_need_wait_for_what_was_refused_and_what_follows_it():
     assert found.store.acknowledged(("r1", 1)) == 3
     assert found.store.processed(("r1", 1)) == 3
     assert sequences(found, "r1") == [0]
-    assert final(found).members == (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
+    assert final(found).members == build.version(r1=0)
     assert found.store.add_submap(SUBMAPS["r1"][1]) is None, "the right one may still come"
     assert found.store.acknowledged(("r1", 1)) == 3
     assert sequences(found, "r1") == [0, 1, 2]

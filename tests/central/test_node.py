@@ -1,4 +1,4 @@
-"""The centre's node: the watermark, who is waited for, and one final map."""
+"""The centre's node: watermark, missing robots, and one final map."""
 
 import msgspec
 import pytest
@@ -9,18 +9,14 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import WireError, decoded, encoded
 from team.wire.digest import digest_of
+from tests import build
 from tests.teams import Submaps, of, published, stream
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=3.0)
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 SUBMAPS = Submaps(list(STREAMS.values()))
 STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
-END = m.End(
-    stamp_ns=0,
-    streams=tuple(
-        m.StreamEnd(robot=n, incarnation=1, measurements=len(s)) for n, s in STREAMS.items()
-    ),
-)
+END = build.end(**{name: len(each) for name, each in STREAMS.items()})
 
 
 def alive(name, *, here=True):
@@ -28,30 +24,28 @@ def alive(name, *, here=True):
 
 
 def progress(name, stamp_s, submaps, incarnation=1):
-    return m.Progress(
+    return build.progress(
         stamp_ns=round(stamp_s * 1e9),
         node=f"robot/{name}",
         robot=name,
         incarnation=incarnation,
-        measurements=0,
         submaps=submaps,
     )
 
 
 def done(name, submaps=4, incarnation=1):
-    return m.Done(
+    return build.done(
         stamp_ns=12_000_000_000,
         robot=name,
         incarnation=incarnation,
         measurements=31,
         steps=12,
         submaps=submaps,
-        ledger=(),
     )
 
 
 class Centre:
-    """A centre and everything that it has said."""
+    """A centre and all its publications."""
 
     def __init__(self, config=CONFIG, robots=("r1", "r2")):
         self.node = make_centre(config, robots)
@@ -96,10 +90,7 @@ def test_a_tick_closes_when_every_live_robot_has_passed_it():
     (fused,) = centre.maps
     assert (fused.provisional, fused.members) == (
         False,
-        (
-            m.VersionEntry(robot="r1", incarnation=1, sequence=0),
-            m.VersionEntry(robot="r2", incarnation=1, sequence=0),
-        ),
+        build.version(r1=0, r2=0),
     )
 
 
@@ -107,7 +98,7 @@ def test_a_robot_that_is_lost_is_not_waited_for():
     centre = joined()
     centre.hears(SUBMAPS["r1"][0], progress("r1", 3, 1))
     centre.hears(alive("r2", here=False))
-    assert centre.maps[0].members == (m.VersionEntry(robot="r1", incarnation=1, sequence=0),)
+    assert centre.maps[0].members == build.version(r1=0)
     centre.hears(alive("r2"), SUBMAPS["r1"][1], progress("r1", 6, 2))
     assert len(centre.maps) == 1, "come back, it is waited for again"
 
@@ -118,7 +109,7 @@ def test_submaps_that_are_announced_but_not_here_hold_the_watermark():
     centre.hears(progress("r1", 9, 3), SUBMAPS["r1"][0], SUBMAPS["r1"][2])
     assert centre.maps == []
     centre.hears(SUBMAPS["r1"][1])
-    assert centre.maps[0].members == (m.VersionEntry(robot="r1", incarnation=1, sequence=2),)
+    assert centre.maps[0].members == build.version(r1=2)
 
 
 def test_a_set_that_is_handed_in_again_gives_the_same_final_map_and_closes_nothing_before():
@@ -176,10 +167,7 @@ def test_the_final_map_comes_once_when_everybody_is_done_and_everything_is_here(
         assert centre.node.finished
         assert centre.node.final == centre.final
         centre.hears(*messages, alive("r1", here=False))
-        assert centre.final.members == (
-            m.VersionEntry(robot="r1", incarnation=1, sequence=3),
-            m.VersionEntry(robot="r2", incarnation=1, sequence=3),
-        )
+        assert centre.final.members == build.version(r1=3, r2=3)
 
 
 def test_a_robot_that_was_never_there_is_waited_for():
@@ -189,9 +177,7 @@ def test_a_robot_that_was_never_there_is_waited_for():
 
 
 def given_up(robot):
-    return m.GivenUp(
-        stamp_ns=0, node=f"robot/{robot}", by="operator", reason="it fell into the water"
-    )
+    return build.given_up(node=f"robot/{robot}", reason="it fell into the water")
 
 
 def test_a_robot_that_is_lost_at_the_end_is_waited_for_until_it_is_given_up():
@@ -200,10 +186,7 @@ def test_a_robot_that_is_lost_at_the_end_is_waited_for_until_it_is_given_up():
     assert not centre.node.finished
     assert centre.node.awaited == ["r2"]
     centre.hears(given_up("r2"))
-    assert centre.final.members == (
-        m.VersionEntry(robot="r1", incarnation=1, sequence=3),
-        m.VersionEntry(robot="r2", incarnation=1, sequence=1),
-    )
+    assert centre.final.members == build.version(r1=3, r2=1)
     assert (centre.final.lost, centre.final.provisional) == (("r2",), True)
     assert "r2 is given up" in centre.node.status().warnings[0]
 
@@ -250,7 +233,7 @@ def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_is_waited_for_
     centre.hears(alive("r2", here=False))
     assert not centre.node.finished
     centre.hears(given_up("r2"))
-    assert centre.final.missing == (m.VersionEntry(robot="r2", incarnation=1, sequence=1),)
+    assert centre.final.missing == build.version(r2=1)
     assert centre.final.lost == ("r2",)
 
 
@@ -261,10 +244,7 @@ def test_a_refused_submap_does_not_hold_up_the_team():
     acknowledged = [o.message.submaps for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert acknowledged == [1, 2, 3, 4], "the robot has its credit"
     centre.hears(*SUBMAPS["r1"], done("r1"), done("r2"), END)
-    assert centre.final.members == (
-        m.VersionEntry(robot="r1", incarnation=1, sequence=3),
-        m.VersionEntry(robot="r2", incarnation=1, sequence=0),
-    )
+    assert centre.final.members == build.version(r1=3, r2=0)
     assert centre.node.status().figures["refused"] == 1.0
     assert "overlap" in centre.node.warnings[0]
 
@@ -317,16 +297,8 @@ FEEDBACK = CentralConfig(fusion="kalman-per-axis")
 
 
 def estimate(robot, number):
-    return m.MapEstimate(
-        stamp_ns=number,
-        robot=robot,
-        incarnation=1,
-        sequence=number,
-        exchange=number,
-        joint=False,
-        ids=b"",
-        means=b"",
-        covariance=b"",
+    return build.map_estimate(
+        stamp_ns=number, robot=robot, sequence=number, exchange=number, joint=False, means=b""
     )
 
 

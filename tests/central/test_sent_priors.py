@@ -1,4 +1,4 @@
-"""A prior is sent when it says what its robot can not know, and now and then."""
+"""A prior is sent when it adds information for its robot, and at a fixed interval."""
 
 import numpy as np
 

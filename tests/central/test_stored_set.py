@@ -29,7 +29,7 @@ def heard(found: list[Sample]) -> list[tuple[str, bytes]]:
 
 
 def kept_in(path: Path) -> list[tuple[str, bytes]]:
-    """What a next life finds."""
+    """Return the members that a restarted process reads."""
     with a_life(path) as kept:
         return heard(kept.samples())
 

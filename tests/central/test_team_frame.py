@@ -1,4 +1,4 @@
-"""Which poses are in the team's frame: in whatever order the robots' submaps arrive."""
+"""The frame of the robots' poses, for any order of arrival of their submaps."""
 
 from collections import deque
 

@@ -13,6 +13,7 @@ from team import translate
 from team.association import AssociationProfile
 from team.wire import messages as m
 from team.wire.codec import encoded
+from tests import build
 from tests.estimation.association.unnamed_worlds import circle, drive
 
 CONFIG = CentralConfig(association=AssociationProfile(recent=4), withdraw_above=None)
@@ -47,9 +48,7 @@ def two_robots() -> dict[str, list[m.Submap]]:
 def _rule() -> MapPublisher:
     rule = MapPublisher(SubmapFold(CONFIG, bytes(8)))
     for robot in two_robots():
-        start = m.InitialPose(
-            stamp_ns=0, robot=robot, incarnation=1, number=0, pose=b"", covariance=b""
-        )
+        start = build.initial_pose(robot=robot)
         rule.store.add_start(start)
     return rule
 

@@ -30,6 +30,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened
 from team.wire.codec import encoded
+from tests import build
 from tests.sim.reruns import written
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
@@ -191,9 +192,7 @@ def test_no_number_of_robots_withdraws_a_robot_by_what_they_report() -> None:
     never was."""
     node = CentralNode(CentralConfig(), ["r1", "r2", "r3", "r4"])
     for robot in ("r1", "r2", "r3", "r4"):
-        report = m.WithdrawalHeard(
-            stamp_ns=0, robot=robot, withdrawn="r2", by="operator", reason="it never was"
-        )
+        report = build.withdrawal_heard(robot=robot, withdrawn="r2", reason="it never was")
         assert node.handle(report, 0) == []
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="a flat wheel")
     (repeated,) = node.handle(order, 0)

@@ -30,7 +30,7 @@ def _cosine(x: Decimal) -> Decimal:
 
 
 def _arctangent(t: Decimal) -> Decimal:
-    """Of 0 ≤ t ≤ 1: halved four times, then the series."""
+    """Halve the angle of 0 ≤ t ≤ 1 four times, then sum the series."""
     for _ in range(4):
         t = t / (1 + (1 + t * t).sqrt())
     term, total = t, t

@@ -1,4 +1,4 @@
-"""Odometry in all its forms: parts compose to the whole, and the noise is what differences say."""
+"""All forms of odometry: parts compose to the whole, noise equals numerical derivatives."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Logs built by hand: what a world publishes, and beside it what a team would have said."""
+"""Logs built by hand: a world's publications and a team's messages."""
 
 from collections.abc import Sequence
 
@@ -49,7 +49,7 @@ def streams(of: Scenario) -> WorldStreams:
 
 
 def samples(out: Sequence[Outgoing]) -> list[Sample]:
-    """What a recorder makes of publications."""
+    """Return the samples that a recorder stores of publications."""
     return [Sample(o.key, encoded(o.message), o.message.stamp_ns, 0, i) for i, o in enumerate(out)]
 
 
@@ -90,7 +90,7 @@ def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: floa
 
 
 def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoing]:
-    """What robot r1 said of its pose at the end of each step, with unit covariance."""
+    """Build pose messages of r1 at the end of each step, with unit covariance."""
     ends = streams(of).streams[0].intervals.end_ns.tolist()
     unit = from_floats(np.eye(3))
     return [

@@ -1,4 +1,4 @@
-"""The bound of online poses is one: its errors are what its covariances say, and no less."""
+"""The last online poses are consistent with their covariances, and not with smaller ones."""
 
 import msgspec
 import numpy as np
@@ -38,7 +38,7 @@ def halved(scenario):
 
 
 def nees(robot, believed=lambda scenario: scenario):
-    """Of the robot's last pose, over all runs."""
+    """Compute the NEES per degree of freedom of the robot's last poses over all runs."""
     found = [bounds_of(seed, believed)[robot] for seed in SEEDS]
     errors = np.array([each.errors[-1] for each in found])
     covariances = np.array([each.covariances[-1] for each in found])

@@ -1,4 +1,4 @@
-"""The batch MAP: its factors mean what they say, its optimum is one, its covariance is right."""
+"""The batch MAP: its factors, its unique optimum, its covariance."""
 
 import sys
 from dataclasses import replace

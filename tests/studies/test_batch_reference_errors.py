@@ -1,4 +1,4 @@
-"""The batch under the profile's noise: its factors are the density, and it knows what lasts."""
+"""The batch with the profile's noise: factors of the declared density, persistent errors."""
 
 from dataclasses import replace
 

@@ -13,13 +13,8 @@ from sim.scenarios.source import streams_of
 from sim.studies.experiments import downs_minima
 from sim.studies.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
 from sim.studies.experiments.downs_joined import spherical_task
-from sim.studies.experiments.downs_printed import EKF_MAPS, JOINED_MAPS
 from sim.studies.experiments.downs_simulated import (
     SIMULATED_5_1,
-    SIMULATED_5_2,
-    SIMULATED_5_3,
-    SIMULATED_5_4,
-    SIMULATED_5_5,
     WORLDS,
 )
 from sim.studies.experiments.experiment import Dataset, Options, Results
@@ -78,14 +73,6 @@ def test_the_team_is_compared_set_by_set_and_one_set_has_no_p() -> None:
     assert tests["printed, all nine sets"]["p"] == pytest.approx(0.128, abs=1e-3)
 
 
-def test_what_is_printed_stands_beside_what_is_computed() -> None:
-    outcome = TABLE_5_1.outcome(Options((1,), datasets=(SET_1,)), Results({}))
-    assert outcome.figures["sets"]["MRCLAM_Dataset1"]["printed"] == EKF_MAPS["1"]
-    assert len(EKF_MAPS) == len(JOINED_MAPS) == 9
-    (picture,) = outcome.pictures
-    assert "logarithmic" in picture.caption
-
-
 def _map(points: np.ndarray, sigma: float) -> Figures:
     return {
         "ids": list(range(len(points))),
@@ -135,14 +122,6 @@ def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_pat
     for picture in outcome.pictures:
         picture.draw(tmp_path / "picture.png")
         assert (tmp_path / "picture.png").stat().st_size > 10_000
-
-
-def test_the_tables_share_the_simulators_runs() -> None:
-    options = Options((1,))
-    tables = (SIMULATED_5_1, SIMULATED_5_2, SIMULATED_5_3, SIMULATED_5_4, SIMULATED_5_5)
-    every = {task.name for table in tables for task in table.tasks(options)}
-    # The EKF, his protocol, ours alone and ours as a team.
-    assert len(every) == 4 * len(WORLDS)
 
 
 def test_his_simulator_is_written_as_a_data_set_that_reads_the_same(tmp_path: Path) -> None:

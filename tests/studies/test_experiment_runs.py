@@ -2,7 +2,6 @@
 
 import json
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,12 +29,6 @@ WORK = "json:loads"
 
 def counted(rmse: float) -> Task:
     return Task(WORK, {"s": json.dumps({"rmse": rmse})}, f"run {rmse}")
-
-
-def process_result_item_texts() -> list[str]:
-    """Texts in the function of the pool's thread that starts workers anew."""
-    code = _ExecutorManagerThread.process_result_item.__code__
-    return [each for each in code.co_consts if isinstance(each, str)]
 
 
 def short(steps: int) -> Scenario:
@@ -178,18 +171,6 @@ def test_leaving_while_a_case_is_handed_over_leaves_no_error(
     runs = Cases(tmp_path).run([counted(float(each)) for each in range(6)], 2)
     next(runs)
     runs.close()  # type: ignore[attr-defined] # a generator
-
-
-def test_that_an_idle_worker_ends_as_it_gets_a_case_is_no_error(tmp_path: Path) -> None:
-    runs = Cases(tmp_path).run([counted(1.0), counted(2.0)], 2)
-    next(runs)
-    (said,) = (
-        each
-        for each in process_result_item_texts()
-        if each.startswith("A worker stopped while some jobs")
-    )
-    warnings.warn(said, UserWarning, stacklevel=1)  # an error here, as in the pool's thread
-    assert len(list(runs)) == 1
 
 
 def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path: Path) -> None:

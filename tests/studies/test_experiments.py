@@ -1,8 +1,6 @@
-"""What experiments say: figures over seeds, goals, the page, the command line."""
+"""Experiments: figures over seeds, goals, the page, the command line."""
 
 import json
-from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -10,7 +8,7 @@ from typer.testing import CliRunner
 
 from sim.cli.main import app
 from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments import accuracy_few, accuracy_worlds, association
+from sim.studies.experiments import accuracy_few, accuracy_worlds
 from sim.studies.experiments.catalogue import ENTRIES, Entry
 from sim.studies.experiments.curves import curves_task
 from sim.studies.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
@@ -125,40 +123,6 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert json.loads((tmp_path / "some.json").read_text())["experiment"] == "some"
 
 
-class Parsed(HTMLParser):
-    """What a page links to, holds and leaves open."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.links: set[str] = set()
-        self.ids: set[str] = set()
-        self.images: list[str] = []
-        self.open: list[str] = []
-        self.feed(page)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = dict(attrs)
-        self.ids |= {found["id"] or ""} if "id" in found else set()
-        self.links |= {found["href"] or ""} if tag == "a" else set()
-        self.images += [found["src"] or ""] if tag == "img" else []
-        if tag not in ("img", "meta"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
-def test_the_page_of_all_is_sound_html_whose_links_and_pictures_are_in_it(tmp_path: Path) -> None:
-    first, second = concluded(), concluded()
-    other = replace(second, entry=Entry("other", "", "Another."), kinds=[("a run", 2, "a = 1")])
-    parsed = Parsed(write([first, other], tmp_path, "index", {"version.numpy": "2"}).read_text())
-    assert parsed.open == []
-    assert parsed.links == {"#some", "#other"} == {f"#{each}" for each in parsed.ids}
-    assert len(parsed.images) == 2
-    assert all(image.startswith("data:image/png;base64,") for image in parsed.images)
-
-
 def test_the_parameters_of_a_run_are_said_where_they_differ_from_its_scenario() -> None:
     scenario = with_particles(with_options(load("thesis"), seed=7, robots=1), 50)
     tasks = [curves_task(with_options(scenario, seed=seed), label="t") for seed in (1, 2)]
@@ -222,41 +186,3 @@ def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(
     figures = accuracy_few.few_figures([run])
     names = ("wrong", "silent", "beyond", "beyond_silent", "alarms")
     assert tuple(figures[name] for name in names) == (wrong, silent, beyond, untold, alarms)
-
-
-def test_a_system_has_one_colour_in_every_panel_of_the_pictures_of_association() -> None:
-    """With names there is no F1; its absence from a panel once shifted the colours of the rest."""
-    means: dict[str, float | None] = {name: 1.0 for name, *_ in association.FIGURES}
-    unscored = means | {"f1": None, "duplicates": None}
-    systems = [each.name for each in association.SYSTEMS]
-    of_axis = {
-        name: {"0": unscored if name == association.NAMED.name else means} for name in systems
-    }
-    made = association.drawn("clutter", of_axis)
-    (legend,) = made.legends
-    told = dict(
-        zip(
-            [text.get_text() for text in legend.get_texts()],
-            [line.get_color() for line in legend.get_lines()],
-            strict=True,
-        )
-    )
-    assert sorted(told) == sorted(systems)
-    assert len(set(told.values())) == len(systems)
-    for axes in made.axes:
-        colours = [line.get_color() for line in axes.get_lines() if len(line.get_xdata()) == 1]
-        missing = told[association.NAMED.name] if axes.get_title() in ("F1", "duplicates") else None
-        assert colours == [told[name] for name in systems if told[name] != missing]
-
-
-def test_the_pictures_of_association_name_the_values_that_were_run_and_count_from_zero() -> None:
-    axis = "spacing / noise"
-    means: dict[str, float | None] = {name: 0.0 for name, *_ in association.FIGURES}
-    means |= {"rmse": 1.0, "nees": 1.0}
-    values = association.AXES[axis]
-    made = association.drawn(axis, {"ours": {f"{value:g}": means for value in values}})
-    made.canvas.draw()
-    for axes in made.axes:
-        assert [each.get_text() for each in axes.get_xticklabels()] == ["4", "6", "10", "20", "40"]
-        if axes.get_title() in ("duplicates", "wrong merges"):
-            assert axes.get_ylim() == (0.0, 1.0)

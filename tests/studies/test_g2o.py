@@ -1,4 +1,4 @@
-"""The batch problem as a file of g2o: an optimiser that knows nothing of us finds the same map."""
+"""The batch problem as a g2o file: an independent optimiser finds the same map."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The thesis' figures: its measurements are told apart, and its filter's steps do what they say."""
+"""The thesis' figures: its readings of the measurements, and the steps of its filter."""
 
 import math
 from collections.abc import Mapping

@@ -16,6 +16,7 @@ from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from team.wire.codec import encoded
 from team.wire.digest import configured
+from tests import build
 from tests.support import examples
 
 ROBOTS = ("r1", "r2", "r3")
@@ -36,9 +37,7 @@ def concluded(robot: str, fused: m.FusedMap = TRUE, serial: int = 1) -> Sample:
     return sample(
         ch.CONCLUDED,
         robot,
-        m.Concluded(
-            stamp_ns=0, robot=robot, serial=serial, digest=fused.digest, sha256=sha256, submaps=2
-        ),
+        build.concluded(robot=robot, serial=serial, digest=fused.digest, sha256=sha256, submaps=2),
     )
 
 
@@ -161,9 +160,17 @@ def test_a_launch_is_over_when_every_peer_has_a_final_map_of_its_own() -> None:
         watch.take(own)
     assert watch.is_over
     assert watch.fused is None, "they do not agree"
-    robot.publish(Outgoing(ch.CONCLUDED, "r1", m.Concluded(
-        stamp_ns=0, robot="r1", serial=2, digest=TRUE.digest,
-        sha256=hashlib.sha256(encoded(TRUE)).digest(), submaps=2,
-    )))  # fmt: skip
+    robot.publish(
+        Outgoing(
+            ch.CONCLUDED,
+            "r1",
+            build.concluded(
+                serial=2,
+                digest=TRUE.digest,
+                sha256=hashlib.sha256(encoded(TRUE)).digest(),
+                submaps=2,
+            ),
+        )
+    )
     watch.take(own)
     assert watch.fused == TRUE

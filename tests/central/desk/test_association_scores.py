@@ -14,6 +14,7 @@ from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids, from_stamps
 from team.wire.bus import Outgoing, Sample
 from team.wire.codec import encoded
+from tests import build
 
 NONE = m.NO_LABEL
 TEN, UNKNOWN = 10**9, m.UNCONFIRMED
@@ -63,11 +64,7 @@ def final(table: dict[str, list[tuple[int, int, int]]]) -> Sample:
         )
         for robot, rows in table.items()
     )
-    message = m.FusedMap(
-        stamp_ns=0, rule="join", digest=bytes(8), frame="r1/1", final=True, provisional=False,
-        exchange=0, members=(), missing=(), joint=False, ids=b"", means=b"", covariance=b"",
-        chi2=0.0, dof=0, memberships=memberships,
-    )  # fmt: skip
+    message = build.fused_map(final=True, joint=False, means=b"", memberships=memberships)
     return sample(ch.FINAL_MAP, "", message)
 
 

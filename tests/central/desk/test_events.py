@@ -1,4 +1,4 @@
-"""The events of a run in words: each is told once, when it happens, to the report and the page."""
+"""The events of a run: each is reported once, when it happens."""
 
 import msgspec
 

@@ -1,15 +1,10 @@
-"""How a run went over its time: figures against what was put into the log, events in words."""
-
-from dataclasses import replace
-from pathlib import Path
+"""The history of a run: its figures equal those computed from the log."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.history import History, Latencies, history
-from central.desk.pictures import time
-from central.desk.pictures.time import BINS, binned, publisher
+from central.desk.evaluation.history import History, history
 from sim.in_memory.team import run_team
 from team import translate
 from team.wire import channels as ch
@@ -115,19 +110,6 @@ def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used
     np.testing.assert_allclose(found.first_s, [0.350, 0.700])
 
 
-def test_latencies_have_a_row_for_each_robot_in_the_order_in_which_people_count(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    found = history([])
-    of = Latencies(np.arange(3), np.full(3, 0.5), np.full(3, 0.4))
-    names = [f"r{k}" for k in range(12, 0, -1)]
-    figures = []
-    monkeypatch.setattr(time, "save", lambda figure, path: figures.append(figure))
-    assert time.latency_picture(replace(found, latencies=dict.fromkeys(names, of)), tmp_path)
-    _, rows = figures[0].axes
-    assert [label.get_text() for label in rows.get_yticklabels()] == names[::-1]
-
-
 def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
     log = [measurement(k, 10 * k) for k in range(12, 20)]
     log += [at(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")), 400) for k in range(2)]
@@ -144,24 +126,6 @@ def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
         ]
     )
     assert history([*log, *absurd]).end_ns == 19 * MS
-
-
-def test_bins_lose_nothing_and_take_what_lies_outside_at_the_ends(run: History) -> None:
-    rng = np.random.default_rng(1)
-    stamps = rng.integers(run.start_ns - 10**10, run.end_ns + 10**10, 500)
-    values = rng.normal(size=500)
-    centres, (sums, counts) = binned(run, stamps, values, np.ones(500))
-    assert counts.sum() == 500
-    assert sums.sum() == pytest.approx(values.sum())
-    assert len(centres) <= BINS
-    assert (np.diff(centres) > 0).all()
-
-
-def test_a_robot_speaks_on_its_nodes_keys_and_not_on_its_sensors() -> None:
-    assert publisher(ch.SUBMAP.key("r1")) == "r1"
-    assert publisher(ch.STATUS.key("robot/r1")) == "r1"
-    for key in (ch.ODOMETRY.key("r1"), ch.PRIOR.key("r1"), ch.STATUS.key("central"), "view/x"):
-        assert publisher(key) is None
 
 
 def test_without_truth_there_is_the_cost_and_no_nees() -> None:

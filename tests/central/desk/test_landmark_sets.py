@@ -1,19 +1,13 @@
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 
 from central.desk.evaluation.association import AssociationResult, Pairs
 from central.desk.evaluation.errors import map_errors
-from central.desk.evaluation.evaluation import evaluate
 from central.desk.evaluation.events import EventDetector
 from central.desk.report.identities import decision_sheet, score_sheet
-from central.desk.report.tables import in_words, team_rows
+from central.desk.report.tables import in_words
 from central.desk.view.landmark_sets import sets_of
-from team.wire import channels as ch
 from team.wire import messages as m
-from team.wire.bus import Sample
-from team.wire.codec import encoded
 from tests.support import examples
 
 FUSED = next(each for each in examples() if isinstance(each, m.FusedMap))
@@ -63,7 +57,7 @@ def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why() -
     assert rows[2][1:6] == ("0.0", "12", "40", "9", "5")
 
 
-def test_the_report_has_the_scores_inside_windows_and_over_all() -> None:
+def test_the_report_scores_pairs_inside_windows_and_over_all() -> None:
     def pairs(missed: int) -> Pairs:
         return Pairs(right=30, wrong=10, missed=missed, wrong_detections=1, detections=50)
 
@@ -86,17 +80,6 @@ def test_the_report_has_the_scores_inside_windows_and_over_all() -> None:
         ("over all", "0.75000", "0.5000", "0.6000", "2.000 %"),
     ]
     assert "4 rightly, 0 wrongly; 3 attempts wait" in score_sheet(found).note
-    final = Sample(ch.FINAL_MAP.key(), encoded(msgspec.structs.replace(FUSED, final=True)), 0, 0, 0)
-    run = evaluate([final])
-    rows = dict(team_rows(replace(run, association=found, gps_median_m=0.817)))
-    assert rows["landmarks"].endswith(" in the final map")
-    assert rows["association"] == (
-        "precision 0.7500, recall 0.500, F1 0.600; 2.000 % of the detections are in a wrong "
-        "landmark"
-    )
-    assert rows["duplicates"].startswith("2 of the 9 landmarks that all submaps have")
-    assert rows["distance from GPS"].startswith("0.82 m")
-    assert rows["pairs of robots merged"] == "4 right, 0 wrong; 3 attempts wait"
 
 
 def test_a_nees_outside_of_its_band_says_what_that_means() -> None:

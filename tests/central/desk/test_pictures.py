@@ -14,18 +14,13 @@ from rich.console import Console
 from central.desk.compare import compare_rows
 from central.desk.drawing import (
     ELLIPSE_SCALE,
-    colour_of,
     curve_through,
     ellipses,
-    robot_colours,
-    robot_labels,
 )
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.evaluation.history import history
-from central.desk.names import in_order
 from central.desk.pictures.run import (
     error_picture,
-    label_offsets,
     map_picture,
 )
 from central.desk.pictures.style import Form, Look, Picture, Style
@@ -71,22 +66,6 @@ def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed: float) 
     assert curve_through(on_the_spot).tolist() == on_the_spot[:, :2].tolist()
 
 
-def test_a_robot_has_the_same_colour_in_the_report_and_on_the_page() -> None:
-    names = [f"r{i}" for i in range(1, 12)]
-    colours = robot_colours(sorted(names))
-    assert [colours[name] for name in in_order(names)] == [colour_of(i) for i in range(11)]
-    assert colours["r10"] != colours["r2"]
-
-
-def test_a_legend_names_ten_robots_and_counts_more() -> None:
-    few, many = [f"r{i}" for i in range(1, 11)], [f"r{i}" for i in range(1, 51)]
-    assert robot_labels(few) == {name: name for name in few}
-    said = robot_labels(sorted(many))
-    assert said.pop("r1") == "50 robots"
-    assert set(said) == set(many[1:])
-    assert set(said.values()) == {"_"}
-
-
 def test_both_pictures_are_drawn(run: Evaluation, tmp_path: Path) -> None:
     assert map_picture(run, tmp_path / "map.png")
     assert error_picture(run, tmp_path / "errors.png")
@@ -112,21 +91,6 @@ def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path: Path) -> N
 
 def test_an_empty_run_draws_nothing(tmp_path: Path) -> None:
     assert not map_picture(evaluate([]), tmp_path / "map.png")
-
-
-def test_the_tables_name_their_units_and_cut_no_number(run: Evaluation) -> None:
-    console = Console(width=80, record=True, force_terminal=False)
-    tables = summary_tables(run)
-    for table in tables:
-        console.print(table)
-    text = console.export_text()
-    for words in ("RMSE [m]", "RMSE [°]", "0.141 m", "r1", "r2", "2 is right", "0% within 95 %"):
-        assert words in text
-    assert "…" not in text.partition(" robot ")[2]
-    for table in tables[1:]:  # a number that is cut is a wrong one
-        narrow = Console(width=50, record=True, force_terminal=False)
-        narrow.print(table)
-        assert "…" not in narrow.export_text()
 
 
 def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
@@ -159,12 +123,6 @@ def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
     assert "* of online ones" in " ".join(text.split())
 
 
-def test_a_star_is_explained_only_where_there_is_one(run: Evaluation) -> None:
-    console = Console(width=80, record=True, force_terminal=False)
-    console.print(summary_tables(run)[1])
-    assert "*" not in console.export_text()
-
-
 @pytest.mark.parametrize(
     ("fusion", "said"),
     [
@@ -188,14 +146,6 @@ def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
     (line,) = [x for x in console.export_text().splitlines() if "NEES per dof" in x]
     assert line.strip("│ ").partition("│")[2].strip() == said
     assert to_json(absurd)["map_nees_per_dof"] == 6e18
-
-
-def test_labels_point_away_from_their_neighbours() -> None:
-    points = np.array([[0.0, 0.0], [0.1, 0.0], [50.0, 50.0]])
-    left, right, alone = label_offsets(points)
-    assert left[0] < 0.0 < right[0]
-    assert left[1] == right[1] == 0.0
-    assert (alone > 0.0).all()
 
 
 def test_a_picture_for_a_paper_is_a_pdf_without_a_title(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
-"""What `teamslam status` advises."""
+"""Advice of `teamslam status` on clocks that differ."""
 
 import pytest
 
 from central.desk.presence import Presence
 from team.wire import messages as m
+from tests import build
 
 S = 10**9
 NOW_S = 1_763_800_000
@@ -19,9 +20,7 @@ def presence(*behind: tuple[float, float]) -> Presence:
         found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
         for wall_s, late_s in zip((NOW_S, NOW_S + 2), each, strict=True):
             stamp_ns = round((wall_s - late_s) * S)
-            status = m.Status(
-                stamp_ns=stamp_ns, node=node, state="measuring", figures={}, warnings=()
-            )
+            status = build.status(stamp_ns=stamp_ns, node=node, state="measuring", warnings=())
             found._take_message(status, wall_s * S)
     return found
 

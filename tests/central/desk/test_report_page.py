@@ -1,4 +1,4 @@
-"""The report: one page that needs nothing else, whatever the log lacks and whatever it says."""
+"""The report: one self-contained page for any log, incomplete or hostile."""
 
 import json
 import re

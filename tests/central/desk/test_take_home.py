@@ -1,4 +1,4 @@
-"""What a user takes home: paths at keyframe rate with true covariances, the map as tables."""
+"""Exported results: paths at keyframe rate with their covariances, the map as tables."""
 
 import csv
 import json
@@ -56,7 +56,7 @@ def test_a_path_has_every_keyframe_and_the_final_maps_ends(log: list[Sample]) ->
 
 
 def test_between_the_ends_the_covariance_is_that_of_the_errors(log: list[Sample]) -> None:
-    """Per pose, NEES/3 of two robots; as if the ends alone told where it was, it would be wrong."""
+    """NEES/3 per pose of two robots, between the ends of the submaps."""
     run = evaluate(log)
     within = []
     for robot, path in smoothed_paths(recorded_of(log)).items():

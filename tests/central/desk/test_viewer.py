@@ -12,6 +12,7 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
 from team.wire.codec import encoded
+from tests import build
 from tests.support import examples
 
 FINAL = next(message for message in examples() if isinstance(message, m.FusedMap))
@@ -28,13 +29,7 @@ def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
     router.answer(
         ch.KEPT,
         "",
-        lambda _: [
-            encoded(
-                m.Kept(
-                    stamp_ns=0, key="central/final", payload=encoded(final), wall_ns=0, counter=0
-                )
-            )
-        ],
+        lambda _: [encoded(build.kept(key="central/final", payload=encoded(final)))],
     )
     stop = threading.Event()
     timer = threading.Timer(20.0, stop.set)

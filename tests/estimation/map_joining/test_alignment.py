@@ -1,4 +1,4 @@
-"""A free stream joins the main frame when its landmarks say where it is, and not before."""
+"""A free stream joins the main frame once its landmarks determine its pose."""
 
 from dataclasses import replace
 
@@ -10,20 +10,16 @@ from hypothesis import strategies as st
 from team.estimation.contribution import InitialPoseFactor, moment
 from team.estimation.map_joining.alignment import SharedPoints, aligned, procrustes, refusal
 from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from team.estimation.map_joining.joining import converged
 from team.estimation.map_joining.marginals import landmark_map, trajectory
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, team, wrap
 
 OPTIONS = JoinSettings(step_tolerance=1e-10)
 
 
 def joined(submaps, starts, tick=2):
-    fold = EMPTY_FOLD
-    for start in starts:
-        fold = started(fold, start)
-    for begin in range(0, len(submaps), tick):
-        fold = folded(fold, submaps[begin : begin + tick], OPTIONS)
-    return fold
+    return joined_with(submaps, starts, (), OPTIONS, tick)
 
 
 def seeing_only(submaps, robot, ids):
@@ -99,14 +95,6 @@ def test_one_shared_landmark_is_not_enough_and_the_fold_says_so():
     assert len(fold.islands) == 2
 
 
-def test_none_shared_is_said_in_the_plural():
-    world = team(4, robots=2, submaps=6)
-    fold = joined(seeing_only(world.submaps, "r1", []), world.starts[:1])
-    assert list(fold.reasons.values()) == [
-        "r1 (incarnation 0) not joined: 0 shared landmarks, 2 needed"
-    ]
-
-
 def test_maps_that_disagree_are_not_merged():
     world = team(4, robots=2, submaps=6)
 
@@ -167,12 +155,6 @@ def test_a_free_stream_before_any_with_a_start_joins_the_frame_of_the_start():
     assert len(fold.islands) == 1
     assert fold.frame == ("r1", 0), "the stream whose known start fixes the frame names it"
     assert np.abs(found.means - world.landmarks[found.ids]).max() < 1.5
-
-
-def test_merging_is_the_same_bytes_each_time():
-    world = team(7, robots=3, submaps=6)
-    one, other = (joined(world.submaps, world.starts[:1]) for _ in range(2))
-    assert one.main.state.tobytes() == other.main.state.tobytes()
 
 
 # --- islands among themselves ---

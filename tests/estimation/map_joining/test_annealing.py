@@ -56,7 +56,7 @@ def after(ticks, island):
 
 
 def off_m(island):
-    """How far r1's node is from where it is seen."""
+    """Compute the distance of r1's node from its measured place [m]."""
     begin = island.graph.offset[island.graph.streams["r1", 0][1]]
     return abs(float(island.state[begin + 1]))
 

@@ -47,7 +47,7 @@ def both(world, settings):
 
 
 def apart(one, other):
-    """How far two maps are apart, in sigmas squared per degree of freedom of the first."""
+    """Compute the distance of two maps in σ² of the first per degree of freedom."""
     a, b = marginals.landmark_map(one), marginals.landmark_map(other)
     assert a.ids.tolist() == b.ids.tolist()
     difference = (a.means - b.means).ravel()

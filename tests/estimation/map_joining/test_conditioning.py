@@ -17,10 +17,10 @@ from team.estimation.map_joining.conditioning import (
     pose_now,
 )
 from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, settled
-from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from team.estimation.map_joining.marginals import prior_for, trajectory
 from team.estimation.map_joining.whole_map import without
 from team.estimation.submap import LocalMap
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import solved, team, wrap
 
 OPTIONS = JoinSettings(step_tolerance=1e-11)
@@ -28,10 +28,7 @@ LINEAR = (0.1, 1e-5, 0.2)
 
 
 def joined(submaps, starts, settings=OPTIONS):
-    fold = EMPTY_FOLD
-    for start in starts:
-        fold = started(fold, start)
-    return solved(folded(fold, submaps, settings), settings)
+    return solved(joined_with(submaps, starts, (), settings, len(submaps)), settings)
 
 
 def team_pose(prior, pending, open_window):

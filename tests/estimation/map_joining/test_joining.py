@@ -1,6 +1,4 @@
-"""Joined submaps equal the batch over all raw measurements, in any order of arrival, and are
-honest.
-"""
+"""Joined submaps equal the batch over all raw measurements, in any order of arrival."""
 
 from dataclasses import replace
 
@@ -13,7 +11,6 @@ from scipy.linalg import block_diag
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
 from team.estimation.map_joining.joining import (
-    EMPTY_FOLD,
     GapError,
     LateStartError,
     NotCanonicalError,
@@ -32,6 +29,7 @@ from team.estimation.map_joining.marginals import (
 )
 from team.estimation.map_joining.submap_factor import submap_normal
 from team.estimation.submap import LocalMap
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth, team, wrap
 
 EXACTLY = JoinSettings(step_tolerance=1e-11)
@@ -39,12 +37,7 @@ EXACTLY = JoinSettings(step_tolerance=1e-11)
 
 def joined(submaps, starts, options=EXACTLY, tick=4):
     """The fold over the submaps, `tick` at a time."""
-    fold = EMPTY_FOLD
-    for start in starts:
-        fold = started(fold, start)
-    for begin in range(0, len(submaps), tick):
-        fold = folded(fold, submaps[begin : begin + tick], options)
-    return fold
+    return joined_with(submaps, starts, (), options, tick)
 
 
 # --- the linear case: a robot that knows its heading, so raw measurements and submaps are linear
@@ -115,17 +108,6 @@ def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
     np.testing.assert_allclose(prior.covariance[np.ix_(keep, keep)], covariance, atol=1e-8)
 
 
-def test_a_chain_split_into_submaps_and_joined_equals_never_having_split_it():
-    steps, sights = raw_measurements(6)
-    start = [InitialPoseFactor("r0", 0, np.array([3.0, -2.0, 0.7]))]
-    whole, split = (
-        landmark_map(converged(joined(windows(steps, sights, length), start), EXACTLY))
-        for length in (12, 3)
-    )
-    np.testing.assert_allclose(split.means, whole.means, atol=2e-5)
-    np.testing.assert_allclose(split.covariance, whole.covariance, atol=1e-8)
-
-
 # --- the set decides, not the way it came ---
 
 
@@ -172,14 +154,6 @@ def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
     np.testing.assert_allclose(
         landmark_map(one_by_one).means, landmark_map(at_once).means, atol=1e-8
     )
-
-
-def test_two_iterations_a_tick_come_near_the_full_solution():
-    world = team(3, robots=3, submaps=12)
-    fold = joined(world.submaps, world.starts, tick=3)
-    running, final = landmark_map(fold), landmark_map(converged(fold, EXACTLY))
-    sigma = np.sqrt(np.diag(final.covariance)).reshape(-1, 2)
-    assert (np.abs(running.means - final.means) < 0.1 * sigma).all()
 
 
 def test_a_missing_submap_is_an_error_that_names_it():

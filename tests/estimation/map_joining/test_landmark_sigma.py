@@ -1,21 +1,19 @@
-"""What all robots see of a landmark is not quite where it is: that is said by the map alone."""
+"""The landmarks' own sigma widens the map's covariance and not the robots' priors."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
+from team.estimation.map_joining.joining import JoinSettings, converged
 from team.estimation.map_joining.marginals import landmark_blocks, landmark_map, prior_for
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 
 
 def test_the_map_has_the_landmarks_own_sigma_and_the_robots_priors_have_not():
     world = team(3)
     settings = JoinSettings()
-    fold = EMPTY_FOLD
-    for start in world.starts:
-        fold = started(fold, start)
-    fold = converged(folded(fold, world.submaps, settings), settings)
+    fold = converged(joined_with(world.submaps, world.starts, (), settings, 1000), settings)
     island = replace(fold.main, settings=replace(settings, landmark_sigma=0.03))
     wider = replace(fold, islands={**fold.islands, fold.main_key: island})
     before, after = landmark_map(fold), landmark_map(wider)

@@ -1,4 +1,4 @@
-"""A landmark that was mistaken for another is discounted by itself; the chain of poses holds."""
+"""A mistaken landmark is discounted alone; the chain of poses is unaffected."""
 
 import math
 from dataclasses import replace
@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining import joining, joining_kernel
+from team.estimation.map_joining import joining_kernel
 from team.estimation.map_joining.gauss_newton import LEAST_WEIGHT
-from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
+from team.estimation.map_joining.joining import JoinSettings, converged
 from team.estimation.map_joining.marginals import joint_cost, landmark_map
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, solved, team
 
 ROBUST = JoinSettings(robust_c=2.0)
 WHOLE = replace(ROBUST, landmark_gate=math.inf)
-"""The mutant: a submap is believed or doubted as a whole."""
+"""The mutant: one weight for a whole submap."""
 
 
 def mistaken(world, seed, share=0.3):
@@ -33,12 +34,7 @@ def mistaken(world, seed, share=0.3):
 
 
 def fold_of(world, submaps, options, full=converged):
-    fold = joining.EMPTY_FOLD
-    for start in world.starts:
-        fold = started(fold, start)
-    for begin in range(0, len(submaps), 4):
-        fold = folded(fold, submaps[begin : begin + 4], options)
-    return full(fold, options)
+    return full(joined_with(submaps, world.starts, (), options), options)
 
 
 def errors_of(world, fold):
@@ -85,7 +81,7 @@ def test_only_what_was_mistaken_is_discounted():
 
 
 def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
-    """w = min(1, g/rᵀP⁻¹r), r between what the submap says of it and where it is from there."""
+    """w = min(1, g/rᵀP⁻¹r), r the landmark's residual in the submap's frame."""
     world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
     island = fold_of(world, mistaken(world, 4), ROBUST, solved).main
     graph, state, expected = island.graph, island.state, []
@@ -129,7 +125,7 @@ def test_a_discounted_landmark_counts_as_if_its_own_error_were_larger():
 
 
 def test_a_factor_on_all_covariances_is_the_same_as_covariances_that_are_so_much_larger():
-    """Gates, weights, cost and redundancy too: the mutant's gate knows nothing of the factor."""
+    """Gates, weights, cost and redundancy agree; the mutant's gate ignores the factor."""
     world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
     submaps = mistaken(world, 4)
     larger = [

@@ -44,7 +44,7 @@ def _members(fold: Fold) -> set[frozenset[object]]:
 
 
 def _apart(one: Fold, other: Fold) -> float:
-    """How far two maps are apart, in sigmas squared per degree of freedom."""
+    """Compute the distance of two maps in σ² per degree of freedom."""
     a, b = marginals.landmark_map(one), marginals.landmark_map(other)
     assert a.ids.tolist() == b.ids.tolist()
     difference = (a.means - b.means).ravel()

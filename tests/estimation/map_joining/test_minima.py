@@ -89,11 +89,9 @@ def test_a_cost_that_the_degrees_of_freedom_do_not_allow_is_said():
         replace(each, local=replace(each.local, mean=mean)) if each is bad else each
         for each in world.submaps
     ]
-    fold = EMPTY_FOLD
-    for start in world.starts:
-        fold = started(fold, start)
     clean, told = (
-        converged(folded(fold, submaps, OPTIONS), OPTIONS) for submaps in (world.submaps, spoilt)
+        converged(joined_with(submaps, world.starts, (), OPTIONS, len(submaps)), OPTIONS)
+        for submaps in (world.submaps, spoilt)
     )
     assert clean.warnings == ()
     (text,) = told.warnings

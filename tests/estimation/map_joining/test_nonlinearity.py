@@ -1,4 +1,4 @@
-"""Where a covariance denies what the cost allows: a robot that drove long before a landmark."""
+"""Nonlinearity of the start pose of a robot that drove long before its first landmark."""
 
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
 
 @pytest.mark.parametrize(("blind", "least", "most"), [(14, 4, 24), (1, 0, 0)])
 def test_a_bent_ellipse_is_exceeded_and_another_one_is_not(blind, least, most):
-    """How often the true start lies beyond the 99.9 % of the motion's χ², in 24 worlds."""
+    """Count the worlds of 24 whose true start exceeds the 99.9 % bound of the motion's χ²."""
     ahead = 10.0 * blind * np.exp(0.3j)
     truth = np.array([[-3.0 - ahead.real, 2.0 - ahead.imag, 0.3]])
     beyond = 0

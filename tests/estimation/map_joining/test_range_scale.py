@@ -18,12 +18,13 @@ from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, conver
 from team.estimation.map_joining.markers import add_markers
 from team.estimation.map_joining.submap_graph import tied
 from team.estimation.submap import LocalMap, Unnamed
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth
 
 OWN, COMMON, MARKER = 0.03, 0.1, 0.04
 SIGMA = {"range_scale": OWN}
 SHARE = 0.1
-"""Of a range: the standard deviation of its error in one submap."""
+"""Standard deviation of a range's error in one submap, as a share of the range."""
 LANDMARKS = np.array([[4.0, 3.0], [6.0, -3.0], [9.0, 2.0], [3.0, -4.0], [11.0, -2.0]])
 
 
@@ -76,10 +77,7 @@ def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0)
 
 
 def fold_of(submaps, starts, options):
-    fold = EMPTY_FOLD
-    for start in starts:
-        fold = started(fold, start)
-    return converged(folded(fold, submaps, options), options)
+    return converged(joined_with(submaps, starts, (), options, len(submaps)), options)
 
 
 # --- noise at the joined map's ranges ---

@@ -67,7 +67,7 @@ def test_a_robot_that_was_carried_off_is_named_with_the_time_and_the_way_and_no_
 
 
 def test_two_equal_rooms_are_told_as_that_and_as_nothing_else() -> None:
-    """Nothing in the set tells such a building from a robot that was carried off."""
+    """The set does not distinguish such a building from a robot that was carried off."""
     rng, room = np.random.default_rng(5), field(5, 14, 8.0)
     rooms = np.concatenate((room, room + np.array([60.0, 0.0])))
     first, _ = drive("r1", circle((0.0, 0.0), 5.0, 8, 1.1), rooms, rng, reach=7.0)

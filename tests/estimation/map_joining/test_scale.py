@@ -55,7 +55,7 @@ def driven(robot, aside, rng):
 
 
 def too_long(seed):
-    """How much too far the far landmarks are, on average, in standard deviations of the map."""
+    """Compute the mean excess distance of the far landmarks, in the map's standard deviations."""
     rng = np.random.default_rng(seed)
     sides = {f"r{k}": float(rng.uniform(-3.0, 3.0)) for k in range(ROBOTS)}
     submaps = {robot: driven(robot, aside, rng) for robot, aside in sides.items()}

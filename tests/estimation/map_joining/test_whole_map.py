@@ -1,4 +1,4 @@
-"""One robot's Gaussian back end equals least squares where all is linear; what absorbing does."""
+"""One robot's Gaussian back end: equal to least squares in the linear case; absorbed maps."""
 
 from dataclasses import replace
 

@@ -4,14 +4,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path as File
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from central.desk.evaluation.errors import Path, on_circle
-from sim.calibration import join
 from sim.calibration.calibrate import Calibration, calibrate_models
 from sim.calibration.data import Reference, poses_at
 from sim.calibration.figures import (
@@ -35,19 +34,22 @@ from sim.world.config import SimulatedWorld, UtiasWorld
 from sim.world.streams import (
     Detections,
     Intervals,
-    RobotStream,
     WorldStreams,
     grouped,
 )
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.wire.bus import opened
 from tests.sim.logs import scenario, streams, world_log
 
 SECOND = 1_000_000_000
 SEEN = {i: np.array([3.0 * np.cos(i), 3.0 * np.sin(i)]) for i in range(1, 7)}
 NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np.empty(0))
+
+
+def reference(name: str, **fields: Any) -> Reference:
+    """Build one robot's data on a known path, by default without detections."""
+    nothing = {"seen": NOTHING, "sighted": NOTHING, "names": (), "teammates": {}}
+    return Reference(**(nothing | {"name": name, "gap_ns": SECOND, "landmarks": SEEN} | fields))
 
 
 def driven(
@@ -72,17 +74,7 @@ def driven(
     stamps = np.arange(n + 1, dtype=np.int64) * (SECOND // 10)
     path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
     intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
-    return Reference(
-        name=f"r{seed}",
-        intervals=intervals,
-        seen=NOTHING,
-        path=path,
-        gap_ns=SECOND,
-        landmarks=SEEN,
-        sighted=NOTHING,
-        names=(),
-        teammates={},
-    )
+    return reference(f"r{seed}", intervals=intervals, path=path)
 
 
 def seeing(seed: int) -> Reference:
@@ -115,16 +107,13 @@ def seeing(seed: int) -> Reference:
     ends = np.array([0, int(stamps[-1])], dtype=np.int64)
     intervals = Intervals(ends[1:], np.diff(ends), np.zeros(1), np.zeros(1))
     landmarks = {i: place * (0.5 + 0.25 * i) for i, place in SEEN.items()}
-    return Reference(
-        name=f"r{seed}",
+    return reference(
+        f"r{seed}",
         intervals=intervals,
         seen=seen,
         path=Path(ends, np.zeros((2, 3))),
         gap_ns=int(ends[1]),
         landmarks=landmarks,
-        sighted=NOTHING,
-        names=(),
-        teammates={},
     )
 
 
@@ -260,18 +249,7 @@ def spinning(seed: int, *, turns_first: bool) -> Reference:
     path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
     intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
     name = f"r{seed}"
-    return Reference(
-        name=name,
-        intervals=intervals,
-        seen=NOTHING,
-        path=path,
-        gap_ns=SECOND,
-        landmarks=SEEN,
-        sighted=NOTHING,
-        names=(),
-        teammates={},
-        turns_first=turns_first,
-    )
+    return reference(name, intervals=intervals, path=path, turns_first=turns_first)
 
 
 @pytest.mark.parametrize("turns_first", [True, False])
@@ -338,48 +316,6 @@ def test_a_team_without_submaps_is_an_error_with_a_text() -> None:
     ]
     with pytest.raises(CalibrationError, match="no robot has odometry and measurements"):
         joined_team(replace(world, streams=tuple(standing)), team)
-
-
-def logged_often(world: WorldStreams, pieces: int) -> WorldStreams:
-    """The same world whose odometry is logged so many times as often, by the same commands."""
-
-    def of(stream: RobotStream) -> RobotStream:
-        each = stream.intervals
-        step = each.duration_ns // pieces
-        ends = each.end_ns[:, np.newaxis] - step[:, np.newaxis] * np.arange(pieces)[::-1]
-        ends = ends.ravel()
-        durations = np.diff(ends, prepend=ends[0] - step[0])
-        often = Intervals(
-            ends, durations, np.repeat(each.forward, pieces), np.repeat(each.yaw_rate, pieces)
-        )
-        return replace(stream, start_ns=int(ends[0] - step[0]), intervals=often)
-
-    return replace(world, streams=tuple(of(each) for each in world.streams))
-
-
-def test_one_command_logged_many_times_is_one_interval(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = scenario(robots=2)
-    arcs = (
-        msgspec.structs.replace(each, motion=msgspec.structs.replace(each.motion, kind="velocity"))
-        for each in plain.robots
-    )
-    team = msgspec.structs.replace(plain, robots=tuple(arcs))
-    world = logged_often(streams(team), 8)
-    drives = []
-
-    def counted(self: HybridSlam, *interval: float) -> ClosedWindow | None:
-        drives.append(interval)
-        return drive(self, *interval)  # type: ignore[arg-type]
-
-    drive = HybridSlam.drive
-    monkeypatch.setattr(HybridSlam, "drive", counted)
-    merged = joined_team(world, team)
-    count = len(drives)
-    monkeypatch.setattr(join, "LONGEST_NS", 0)
-    each = joined_team(world, team)
-    assert len(drives) - count > 1.5 * count
-    for landmark, place in each.landmarks.items():
-        np.testing.assert_allclose(merged.landmarks[landmark], place, atol=5e-3)
 
 
 def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path: File) -> None:
@@ -459,7 +395,7 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
 
 @pytest.fixture(scope="module")
 def slipping() -> tuple[Scenario, WorldStreams]:
-    """A simulated team whose bases drive 10 % farther than their odometry says."""
+    """A simulated team whose bases drive 10 % farther than their odometry."""
     world = SimulatedWorld(
         steps=1000,
         step_s=0.25,

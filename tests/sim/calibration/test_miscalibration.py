@@ -1,4 +1,4 @@
-"""Models that do not fit the data: told from the team's own measurements, and a way through it."""
+"""Models that do not fit the data are detected from the team's own measurements."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, S
 from team.estimation.map_joining.marginals import BiasEstimate
 
 SPEED = 0.25
-"""[m/s]; the models below say that they were learnt at up to 0.09."""
+"""[m/s]; the models below were calibrated at up to 0.09."""
 
 
 def fast_team(biases: tuple[Bias, ...]) -> Scenario:

@@ -1,4 +1,4 @@
-"""Cameras that differ are told apart by calibration, and a depth from a distance."""
+"""Calibration distinguishes cameras that differ, and a depth from a distance."""
 
 from dataclasses import replace
 
@@ -11,14 +11,14 @@ from sim.calibration.data import Reference
 from sim.calibration.own import marker_spread, own_constants
 from sim.calibration.sensor import fit_sensor
 from sim.world.streams import Intervals, grouped
+from tests.sim.calibration.test_calibrate import reference
 
 PLACES = {i: (1.0 + 0.4 * i) * np.array([np.cos(a), np.sin(a)])
           for i, a in enumerate(np.linspace(-0.6, 0.6, 8), 1)}  # fmt: skip
-NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np.empty(0))
 CAMERAS = {"r1": (1.02, 0.05, 0.0), "r2": (1.05, 0.0, 0.01), "r3": (0.99, 0.1, -0.04)}
 """range_scale, range_offset [m], optical_axis [rad]."""
 BENT = -0.05
-"""What bearings read too much by their cube."""
+"""Cubic error of the bearings."""
 
 
 def looking(
@@ -51,16 +51,8 @@ def looking(
     intervals = Intervals(np.array([last]), np.array([last]), np.zeros(1), np.zeros(1))
     path = Path(np.array([0, last]), np.zeros((2, 3)))
     label = f"{world} {robot}"
-    return Reference(
-        name=label,
-        intervals=intervals,
-        seen=seen,
-        path=path,
-        gap_ns=last,
-        landmarks=PLACES,
-        sighted=NOTHING,
-        names=(),
-        teammates={},
+    return reference(
+        label, intervals=intervals, seen=seen, path=path, gap_ns=last, landmarks=PLACES
     )
 
 
@@ -119,7 +111,7 @@ def test_the_wrong_model_of_the_range_is_told(depth: bool) -> None:
 
 
 def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike() -> None:
-    """Of six worlds of eight landmarks, whose constants take up a part of what they differ by."""
+    """Six worlds of eight landmarks; the fitted constants absorb a part of the spread."""
     marked = [
         looking(r, world, camera, marker=0.02)
         for world in range(1, 7)

@@ -1,4 +1,4 @@
-"""What is left of a launch whose run is over, and which is interrupted as it is scored."""
+"""The end of a launch: interruption, full disk, and a router killed as the run ends."""
 
 import errno
 import os

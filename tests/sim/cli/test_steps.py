@@ -1,4 +1,4 @@
-"""What a long piece of work says of itself."""
+"""Progress of long work on standard error."""
 
 import pytest
 

@@ -176,13 +176,6 @@ def test_launch_checks_a_log_of_one_robot_before_any_process_starts(steps, car):
     assert "12 odometry intervals can not be cut into 13 pieces" in cut
 
 
-def test_half_of_a_log_of_one_robot_is_told_what_is_missing(steps, car):
-    (steps / "detections.csv").unlink()
-    assert "no detections.csv in it" in launched("--dataset", steps)
-    (car / "odometry.csv").unlink()
-    assert "no odometry.csv in it" in launched("--dataset", car)
-
-
 def test_times_in_milliseconds_are_warned_of_before_the_launch(car):
     rows = [f"{100 * i},1.0,0.1" for i in range(1, 41)]
     (car / "odometry.csv").write_text("t_s,rear_wheel_speed_m_s,steering_rad\n" + "\n".join(rows))

@@ -1,4 +1,4 @@
-"""UTIAS data sets: what is written is read again, repairs are counted, damage is named exactly."""
+"""UTIAS data sets: written sets read back equal, repairs are counted, damage is named."""
 
 import shutil
 import zipfile
@@ -90,13 +90,6 @@ def test_what_is_written_is_read_again(folder: Path, simulated: WorldStreams) ->
         assert_same_measurements(given, read_again, 5)
         assert read_again.start.covariance is None
         assert np.allclose(read_again.start.pose, given.start.pose, rtol=0, atol=1e-9)
-
-
-def test_a_written_set_has_the_files_of_the_format(folder: Path) -> None:
-    names = {path.name for path in folder.iterdir()}
-    kinds = ("Odometry", "Measurement", "Groundtruth")
-    robots = {f"Robot{i}_{kind}.dat" for i in (1, 2, 3) for kind in kinds}
-    assert names == {"Barcodes.dat", "Landmark_Groundtruth.dat"} | robots
 
 
 def test_a_set_of_another_rig_brings_its_own_models(folder: Path) -> None:
@@ -484,11 +477,6 @@ def test_damage_is_named_with_file_line_and_text(
     assert said in str(refused.value)
 
 
-def test_a_robot_of_another_name_is_refused(folder: Path) -> None:
-    with pytest.raises(DatasetError, match="no measurements of a robot alice; it has r1, r2, r3"):
-        utias(UtiasWorld(path=str(folder)), [RobotConfig(id="alice")])
-
-
 def test_a_missing_set_is_named_and_it_is_said_what_is_expected(tmp_path: Path) -> None:
     with pytest.raises(DatasetError) as refused:
         read(tmp_path / "MRCLAM1.zip")
@@ -514,14 +502,6 @@ def test_a_zip_with_a_damaged_member_is_refused(folder: Path, tmp_path: Path) ->
     at = content.index(b"written by teamslam")
     path.write_bytes(content[:at] + b"W" + content[at + 1 :])
     with pytest.raises(DatasetError, match="not a zip, or a damaged one"):
-        read(path)
-
-
-def test_a_zip_without_the_files_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "set.zip"
-    with zipfile.ZipFile(path, "w") as target:
-        target.writestr("readme.txt", "hello")
-    with pytest.raises(DatasetError, match=r"set\.zip: no Barcodes.dat in it; expected the folder"):
         read(path)
 
 

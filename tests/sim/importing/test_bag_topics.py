@@ -1,4 +1,4 @@
-"""Bags of other labs: which topics are a robot's, where its sensors sit, a clock that is set."""
+"""Bags of other labs: a robot's topics, its sensors' mounts, a clock that is set."""
 
 from pathlib import Path
 from typing import Any

@@ -70,15 +70,6 @@ def test_a_bag_becomes_tables(tmp_path: Path, db3: bool) -> None:
     np.testing.assert_allclose(stream.truth, [[1.0, 0.0, 0.1]], atol=1e-15)
 
 
-def test_the_file_of_a_bag_is_a_bag_too(tmp_path: Path) -> None:
-    bag = ros.write_bag(tmp_path / "bag", drive())
-    file = next(bag.glob("*.mcap"))
-    assert run(file, "-o", tmp_path / "a").exit_code == 0
-    assert run(bag, "-o", tmp_path / "b").exit_code == 0
-    tables = [(tmp_path / each / "r1" / "odometry.csv").read_bytes() for each in "ab"]
-    assert tables[0] == tables[1]
-
-
 def test_robots_are_the_namespaces_and_see_each_other_by_their_tags(tmp_path: Path) -> None:
     bag = ros.write_bag(tmp_path / "bag", [*drive("ann"), *drive("bob")])
     topics = tmp_path / "topics.toml"
@@ -251,13 +242,6 @@ def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_ex
             '|yaw_rate_rad_s = { column = "imu_gyro_z_dps", scale = 0.017453292519943295 }',
         ),
         (
-            "header.stamp,twist.twist.linear.x,twist.twist.angular.z",
-            "1763800000123456789,1,0",
-            'forward_m_s = "twist.twist.linear.x"|yaw_rate_rad_s = "twist.twist.angular.z"'
-            "|scale = 1e-9",
-        ),
-        ("timestamp,velX,yawRate", "2,1,0", 'forward_m_s = "velX"|yaw_rate_rad_s = "yawRate"'),
-        (
             "seconds,fiducial_id,distance_mm,bearing_degrees",
             "2,1,0,0",
             'landmark = "fiducial_id"|{ column = "distance_mm", scale = 1e-3 }|0.01745',
@@ -270,27 +254,6 @@ def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: s
     text, lacking = propose_map({"log.csv": CsvTable("log.csv", columns, [2])})
     assert not lacking
     assert [each for each in expected.split("|") if each not in text] == []
-
-
-@pytest.mark.parametrize(
-    ("stamp", "words"),
-    [
-        (
-            "1763800000000",
-            "to convert from milliseconds, add a column map (scale = 1e-3)",
-        ),
-        ("1763800000000000", "from microseconds, add a column map"),
-        ("1763800000000000000", "from nanoseconds, add a column map"),
-    ],
-)
-def test_times_in_another_unit_are_refused_with_that_unit(
-    tmp_path: Path, stamp: str, words: str
-) -> None:
-    odometry = tmp_path / "odometry.csv"
-    odometry.write_text(f"t_s,forward_m_s,yaw_rate_rad_s\n{stamp},1,0\n")
-    refused = run(tmp_path, "-o", tmp_path / "set").exception
-    assert isinstance(refused, DatasetError)
-    assert words in str(refused)
 
 
 def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(
@@ -310,20 +273,6 @@ def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(
     assert isinstance(refused, DatasetError)
     assert "no robot has odometry" in str(refused)
     assert not (tmp_path / "still").exists()
-
-
-def test_a_map_is_proposed_from_the_columns_names(tmp_path: Path) -> None:
-    wheels, *_ = files(tmp_path)
-    tags = tmp_path / "tags.csv"
-    tags.write_text("time,tag_id,range,bearing_deg\n1,7,2,90\n")
-    result = run(wheels, tags, "-o", tmp_path / "set")
-    assert isinstance(result.exception, DatasetError)
-    proposal = str(result.exception).partition("with this:\n\n")[2].partition("\nand type")[0]
-    assert 't_s = { column = "stamp_ns", scale = 1e-9 }' in proposal
-    columns = tmp_path / "columns.toml"
-    columns.write_text(proposal)
-    assert run(wheels, tags, "-o", tmp_path / "set", "--columns", columns).exit_code == 0
-    assert read(tmp_path / "set").streams[0].landmark_detections.bearings.tolist() == [np.pi / 2]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The examples of docs/your_data.md and docs/your_ros2_robot.md do what the pages say."""
+"""The examples of docs/your_data.md and docs/your_ros2_robot.md work as described."""
 
 import re
 import subprocess
@@ -113,7 +113,7 @@ def test_the_topics_of_the_page_are_sound(tmp_path: Path) -> None:
 def test_the_commands_of_a_team_over_wifi_are_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The certificates are made as the page says; the others find their files and options."""
+    """The page's command makes the certificates; the others find their files and options."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lab.toml").write_text(blocks("your_robot.md", "toml")[0])
     page = (ROOT / "docs" / "machines.md").read_text("utf-8")

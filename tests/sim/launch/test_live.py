@@ -12,11 +12,12 @@ from sim.launch import live, progress
 from sim.launch.watch import Watch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
+from tests import build
 from tests.support import fused_map
 
 
-def status(node: str, state: str, **figures: float) -> m.Status:
-    return m.Status(stamp_ns=0, node=node, state=state, figures=figures, warnings=())
+def status(node: str, state: str, *warnings: str, **figures: float) -> m.Status:
+    return build.status(node=node, state=state, figures=figures, warnings=warnings)
 
 
 def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
@@ -115,26 +116,6 @@ def printed(watch: Watch, width: int) -> list[str]:
     return out.getvalue().splitlines()
 
 
-def test_the_table_fits_eighty_columns_with_the_largest_figures() -> None:
-    lines = printed(told(5, truth=True), 80)
-    assert max(map(len, lines)) <= 80
-    assert not any("…" in line for line in lines)
-    row = next(line for line in lines if line.strip().startswith("r3")).split()
-    assert row == [
-        "r3", "12,345", "1,234", "1,000", "12.34", "1.05", "1,500", "150,000", "2.00", "50%",
-        "mapping",
-    ]  # fmt: skip
-    expected = "joint cost per dof 1.07, landmark NEES per dof 0.75, 100% within 95 %"
-    assert expected in lines
-
-
-def test_a_narrow_terminal_has_fewer_columns_and_cuts_no_number() -> None:
-    lines = printed(told(2, truth=True), 60)
-    assert not any("…" in line for line in lines)
-    row = next(line for line in lines if line.strip().startswith("r2")).split()
-    assert row == ["r2", "12,345", "1,234", "12.34", "1.05", "2.00", "50%", "mapping"]
-
-
 def test_without_truth_there_are_the_monitor_and_nis_alone() -> None:
     lines = printed(told(2, truth=False), 80)
     assert any("NIS" in line for line in lines)
@@ -142,35 +123,17 @@ def test_without_truth_there_are_the_monitor_and_nis_alone() -> None:
     assert "joint cost per dof 1.07" in lines
 
 
-def test_a_large_team_is_cut_before_the_terminal_cuts_it() -> None:
-    lines = printed(told(20, truth=False), 100)
-    assert any("8 more" in line for line in lines)
-    assert len(lines) < 24
-
-
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     watch = Watch(robots=("r1", "r2"))
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
-    watch.statuses["recorder"] = m.Status(
-        stamp_ns=0, node="recorder", state="recording", figures={}, warnings=missing
-    )
-    late = m.Status(
-        stamp_ns=0,
-        node="robot/r1",
-        state="waiting",
-        figures={},
-        warnings=("no measurements of this team yet",),
-    )
+    watch.statuses["recorder"] = status("recorder", "recording", *missing)
+    late = status("robot/r1", "waiting", "no measurements of this team yet")
     watch.statuses["robot/r1"] = late
     assert progress.warnings(watch) == [f"recorder: {'; '.join(missing)}"]
-    watch.statuses["world"] = m.Status(
-        stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
-    )
+    watch.statuses["world"] = status("world", "waiting", "waiting for robot/r2")
     assert progress.warnings(watch) == ["world: waiting for robot/r2"]
-    watch.statuses["world"] = m.Status(
-        stamp_ns=0, node="world", state="publishing", figures={}, warnings=()
-    )
+    watch.statuses["world"] = status("world", "publishing")
     assert "robot/r1: no measurements of this team yet" in progress.warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
     assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
@@ -184,9 +147,7 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
     watch.statuses["world"] = status("world", "publishing", measurements=1.0, of=2.0)
     for cost in ("8.8", "9.1", "9.4"):
         warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
-        watch.statuses["central"] = m.Status(
-            stamp_ns=0, node="central", state="joining", figures={}, warnings=(warning,)
-        )
+        watch.statuses["central"] = status("central", "joining", warning)
         lines.show(watch)
     assert "submap 20" not in out.getvalue()  # it could be taken back
     monkeypatch.setattr(live, "SETTLED_S", 0.0)
@@ -201,16 +162,10 @@ def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=("r1",), began=-1e9)
     watch.statuses["world"] = status("world", "waiting")
-    watch.statuses["world"] = m.Status(
-        stamp_ns=0, node="world", state="waiting", figures={}, warnings=("waiting for robot/r2",)
-    )
+    watch.statuses["world"] = status("world", "waiting", "waiting for robot/r2")
     lines.show(watch)
-    watch.statuses["world"] = m.Status(
-        stamp_ns=0, node="world", state="ended", figures={}, warnings=()
-    )
-    watch.statuses["central"] = m.Status(
-        stamp_ns=0, node="central", state="joining", figures={}, warnings=("two maps disagree",)
-    )
+    watch.statuses["world"] = status("world", "ended")
+    watch.statuses["central"] = status("central", "joining", "two maps disagree")
     lines.show(watch)
     assert "warning" not in out.getvalue()
     lines.end()
@@ -232,9 +187,7 @@ def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
         watch.fused = msgspec.structs.replace(
             watch.fused, reasons=reasons, joined=words, final=final
         )
-        watch.statuses["central"] = m.Status(
-            stamp_ns=0, node="central", state="joining", figures={}, warnings=reasons
-        )
+        watch.statuses["central"] = status("central", "joining", *reasons)
         lines.show(watch)
         return [line[11:] for line in out.getvalue()[begin:].splitlines()]
 
@@ -258,9 +211,7 @@ def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_n
     watch = told(2, truth=False)
     for k in range(6):
         slip = f"the odometry slipped by 0.1{k} m, -{k}° before {k}.00 s"
-        watch.statuses["robot/r1"] = m.Status(
-            stamp_ns=0, node="robot/r1", state="mapping", figures={}, warnings=(slip,)
-        )
+        watch.statuses["robot/r1"] = build.status(node="robot/r1", warnings=(slip,))
         lines.show(watch)
     warnings = [line for line in out.getvalue().splitlines() if "slipped" in line]
     assert len(warnings) == 3
@@ -272,10 +223,13 @@ def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_n
 
 def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
     watch = Watch()
-    watch.statuses["world"] = world = m.Status(
-        stamp_ns=310 * 10**9, node="world", state="ended", figures={"team_time_s": 300.0},
+    watch.statuses["world"] = world = build.status(
+        stamp_ns=310 * 10**9,
+        node="world",
+        state="ended",
+        figures={"team_time_s": 300.0},
         warnings=(),
-    )  # fmt: skip
+    )
     assert progress.times(watch, world) == "team time 0 s (the world is 300 s ahead of the map)"
     watch.fused = fused_map(stamp_ns=130 * 10**9)
     assert progress.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"

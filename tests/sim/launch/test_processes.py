@@ -1,4 +1,4 @@
-"""What is told of a process's resources."""
+"""The peak memory of a process."""
 
 import subprocess
 import sys

@@ -18,7 +18,7 @@ from team.wire.zenoh.bus import ZenohBus
 def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It listens where it had listened; only then is the rest of the team told where that is."""
+    """The router restarts at its former address before the team receives it."""
     monkeypatch.setattr(launching, "ROUTER_PATIENCE_S", 120.0)  # a busy machine
     with Starter(time.time_ns(), None, tmp_path / "template.log") as starter:
         router = Supervised("router", ["router", "--listen", "tcp/127.0.0.1:0"], tmp_path, starter)

@@ -1,4 +1,4 @@
-"""What a user reads of processes that say nothing."""
+"""Notes on silent processes."""
 
 import time
 
@@ -54,7 +54,7 @@ class Team:
             self.watch.last_message[f"robot/r{k}"] = self.now
 
     def after(self, seconds: float) -> list[str]:
-        """What is noted new, after this time."""
+        """Advance the clock and return the new notes."""
         self.now, known = self.now + seconds, len(self.watch.notes)
         self.silence.look(self.services, self.watch)
         return self.watch.notes[known:]

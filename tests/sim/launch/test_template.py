@@ -1,4 +1,4 @@
-"""The template: when it is started and ended, and when a process is forked from it."""
+"""The template process: start, end, and conditions of a fork."""
 
 import os
 import signal
@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import threading
-from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +14,7 @@ from sim.launch import ahead, template
 
 
 def test_nothing_is_forked_from_a_process_that_has_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that is forked from a process with threads could wait for a lock for ever."""
+    """A process forked from one with threads may deadlock on a lock."""
     forks: list[int] = []
     monkeypatch.setattr(os, "fork", lambda: forks.append(1))
     done = threading.Event()
@@ -29,43 +28,6 @@ def test_nothing_is_forked_from_a_process_that_has_threads(monkeypatch: pytest.M
         done.set()
         thread.join()
     assert forks == []
-
-
-def test_all_but_the_router_wait_until_what_they_share_is_imported_and_loaded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[str] = []
-
-    def served(request: template._Request, asked: socket.socket, launch: int) -> bool:
-        done.append(request.words[0])
-        os.close(request.output)
-        if request.words != ["record"]:
-            return False
-        asked.close()
-        return True
-
-    def noted(request: template._Request, launch: int) -> list[str]:
-        os.close(request.output)
-        return request.words[1:3]
-
-    asks, asked = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    number = asked.detach()
-    nothing = SimpleNamespace(disable=lambda: None, freeze=lambda: None)
-    monkeypatch.setattr(sys, "argv", ["teamslam", ahead.TEMPLATE, str(number)])
-    monkeypatch.setattr(sys, "orig_argv", sys.argv)
-    monkeypatch.setattr(template, "gc", nothing)
-    monkeypatch.setattr(template, "MODULES", ("router's", "all", "others"))
-    monkeypatch.setattr(template.importlib, "import_module", done.append)
-    monkeypatch.setattr(template, "end_with_parent", lambda number: None)
-    monkeypatch.setattr(template, "write_command_line", lambda words: None)
-    monkeypatch.setattr(template, "_noted", noted)
-    monkeypatch.setattr(template, "_load_kernels", lambda *pair: done.append(" ".join(pair[:2])))
-    monkeypatch.setattr(template, "_serve", served)
-    with asks:
-        for words in (b'["kernels", "hybrid", "join", "0"]', b'["router"]', b'["record"]'):
-            socket.send_fds(asks, [words], [asks.fileno()])
-        template.become_a_process(lambda: None)
-    assert done == ["router's", "router", "all", "others", "hybrid join", "record"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="there is a template on Linux alone")

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from sim.cli import launch
 from sim.launch import warm_up
 from team.estimation.geometry import wrapped
 from team.estimation.map_joining.marginals import landmark_map
@@ -44,17 +43,3 @@ def test_a_program_warms_its_kernels_up_once_and_another_program_its_own(
     finally:
         for stamp in stamps() - before:
             stamp.unlink()
-
-
-def test_how_long_compiling_takes_is_told_once_it_can_be_known(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = iter([0.0, 20.0, 24.0, 28.0])  # begun; the first kernel takes as long as ten others
-    monkeypatch.setattr(launch.time, "monotonic", lambda: next(clock))
-    compiling = launch._Compiling()
-    for done in (1, 3, 11):
-        compiling.tell(done, 31)
-    first, second, third = capsys.readouterr().err.splitlines()
-    assert first.endswith(": 1 of about 31")
-    assert second.endswith(": 3 of about 31")
-    assert third.endswith(": 11 of about 31, about 16 s left")

@@ -1,4 +1,4 @@
-"""What the others announce, against the world's scenario; and that the world waits for it."""
+"""The world compares the announced configurations with its scenario before it begins."""
 
 import msgspec
 import pytest

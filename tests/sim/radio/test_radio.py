@@ -1,4 +1,4 @@
-"""Who reaches whom, and a robot's door that keeps to it."""
+"""The radio: pairs of robots in range, and a bus that drops messages from out of range."""
 
 import msgspec
 import numpy as np

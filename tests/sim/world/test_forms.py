@@ -1,4 +1,4 @@
-"""The forms in which simulated sensors tell: errors of the size that is claimed, and circles."""
+"""Forms of simulated measurements: errors of the claimed size, and circles of a car."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""A world whose identities are hidden: what a detection brings with it, whatever form it was in."""
+"""A world with hidden identities: the covariances of its detections, in any form."""
 
 import msgspec
 import numpy as np

@@ -18,6 +18,7 @@ from team.estimation.geometry import compose, inverse, logarithm
 from team.estimation.models import increment_of
 from team.robot.node import RobotNode
 from team.wire import messages as m
+from tests import build
 from tests.teams import driven, published
 
 SLIP = {"lateral": MotionNoise(per_s=0.004), "final_turn": MotionNoise(per_s=0.003)}
@@ -53,7 +54,7 @@ def whitened(truth: MotionModel, filters: MotionModel) -> np.ndarray:
 
 
 def moments_agree(errors: np.ndarray) -> bool:
-    """Whether whitened errors have mean 0 and covariance 1: each entry within 99.9 %, all nine."""
+    """Test whitened errors for mean 0 and covariance 1: all nine entries within 99.9 %."""
     count = len(errors)
     mean = np.sqrt(count) * errors.mean(axis=0)
     second = errors.T @ errors / count - np.eye(3)
@@ -149,7 +150,7 @@ def test_a_clock_offset_that_the_robot_does_not_know_is_found_out() -> None:
 
 
 def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
-    """What the robot makes of its stream, without a centre."""
+    """Return the robot's submaps of its stream, without a centre."""
     sent = driven(RobotNode(robot), published(world.streams[0]))
     return [each.message for each in sent if isinstance(each.message, m.Submap)]
 
@@ -176,12 +177,7 @@ def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, b
     measurements = published(world.streams[0])
     for measurement in measurements:
         keyframes.put(measurement)
-    keyframes.end(
-        m.End(
-            stamp_ns=0,
-            streams=(m.StreamEnd(robot=robot.id, incarnation=1, measurements=len(measurements)),),
-        )
-    )
+    keyframes.end(build.end(**{robot.id: len(measurements)}))
     return [
         (each.stamp_ns, each.keyframe.increment.mean.tobytes(), each.keyframe.ranges.tobytes())
         for step in keyframes.steps()

@@ -1,4 +1,4 @@
-"""The simulated world: its noise is what the robots are told, its truth is what it says."""
+"""The simulated world: noise as configured, and consistent truth."""
 
 from itertools import pairwise
 
@@ -50,7 +50,7 @@ def true_detections(stream: RobotStream, landmarks: np.ndarray) -> tuple[np.ndar
 
 
 def inside_two_sided(normalised: np.ndarray) -> bool:
-    """Whether the sum of squares is in the two-sided 99.9 % chi-square interval."""
+    """Test the sum of squares against the two-sided 99.9 % chi-square interval."""
     low, high = chi2.ppf([0.0005, 0.9995], normalised.size)
     return bool(low < np.sum(normalised**2) < high)
 
@@ -327,12 +327,6 @@ def test_an_arc_is_the_limit_of_many_small_turns_and_drives(
     assert np.exp(1j * end) == pytest.approx(np.exp(1j * (heading + turn)))
 
 
-@given(st.floats(-1e3, 1e3))
-def test_a_wrapped_angle_is_on_the_half_open_circle_and_the_same_direction(angle: float) -> None:
-    assert -np.pi < wrapped(angle) <= np.pi
-    assert np.exp(1j * wrapped(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)
-
-
 @pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
 def test_a_driven_robot_reaches_its_way_points_within_its_limits_and_then_stands(
     kind: str,
@@ -383,7 +377,7 @@ def errors_by_landmark(sensor: Sensor) -> list[np.ndarray]:
 
 
 def correlation(errors: list[np.ndarray], steps: int) -> np.ndarray:
-    """Of each error with the one so many steps later, in units of the declared variance."""
+    """Correlate each error with the one `steps` later, in units of the declared variance."""
     return np.mean([np.mean(e[:-steps] * e[steps:], axis=0) for e in errors], axis=0)
 
 
@@ -447,7 +441,7 @@ def test_in_downs_world_a_step_turns_or_drives_and_the_hundredth_way_point_ends_
 def true_detections_from_start(
     stream: RobotStream, landmarks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `true_detections`, of a stream whose first message is before the first step."""
+    """Return `true_detections` for a stream whose first message precedes the first step."""
     seen = stream.landmark_detections
     step = np.repeat(np.arange(len(seen.offsets) - 1), np.diff(seen.offsets))
     across = landmarks[seen.ids.astype(int) - 1] - stream.truth[step, :2]

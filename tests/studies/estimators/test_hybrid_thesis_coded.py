@@ -1,4 +1,4 @@
-"""The program of the thesis' appendix: what it does otherwise than the thesis' text."""
+"""The program of the thesis' appendix: its differences from the thesis' text."""
 
 import numpy as np
 import pytest

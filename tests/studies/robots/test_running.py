@@ -116,6 +116,16 @@ def test_a_member_gives_what_its_estimator_gives_on_the_streams_keyframes(estima
     np.testing.assert_allclose(own.covariance, landmarks.covariance, atol=1e-12)
 
 
+@pytest.mark.parametrize("estimator", WHOLE)
+def test_the_same_measurements_give_the_same_bits(estimator):
+    given = []
+    for _ in range(2):
+        member = estimator_of(of_name(estimator), 1, InitialPose(np.zeros(3), None), KNOWN)
+        fed(member)
+        given.append([each.tobytes() for each in (*member.own_pose(), *member.own_map())])
+    assert given[0] == given[1]
+
+
 def test_an_uncertain_start_is_turned_into_the_axes_of_the_pose():
     """A start that is uncertain across the heading alone stays so, wherever it points."""
     turned = np.array([3.0, 1.0, np.pi / 2])

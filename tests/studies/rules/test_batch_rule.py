@@ -1,6 +1,4 @@
-"""The rule `batch`: what GTSAM finds on the same measurements, and what it does not know is
-said.
-"""
+"""The rule `batch`: equal to GTSAM on the same measurements; it names what it neglects."""
 
 import msgspec
 import numpy as np
@@ -18,12 +16,13 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import floats
 from team.wire.digest import configured
+from tests import build
 from tests.sim.reruns import messages, team_samples
 from tests.teams import config, of, published, stream
 
 
 def team_run(world, fusion, estimator, steps):
-    """A run in memory; few particles, which the measurements do not know of."""
+    """Run a team in memory with few particles, on which the measurements do not depend."""
     scenario = with_options(load(world), fusion=fusion, estimator=estimator)
     robots = tuple(
         msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, particles=50))
@@ -68,23 +67,9 @@ def heard(configs, **options):
         out += node.handle(configured(ch.robot_node(name), 0, 0, told), 0)
         for measurement in MEASUREMENTS[name]:
             out += node.handle(measurement, 0)
-        out += node.handle(
-            m.Done(
-                stamp_ns=0,
-                robot=name,
-                incarnation=1,
-                measurements=len(MEASUREMENTS[name]),
-                steps=0,
-                submaps=0,
-                ledger=(),
-            ),
-            0,
-        )
-    ends = tuple(
-        m.StreamEnd(robot=name, incarnation=1, measurements=len(each))
-        for name, each in MEASUREMENTS.items()
-    )
-    return node, out + node.handle(m.End(stamp_ns=0, streams=ends), 0)
+        out += node.handle(build.done(robot=name, measurements=len(MEASUREMENTS[name])), 0)
+    end = build.end(**{name: len(each) for name, each in MEASUREMENTS.items()})
+    return node, out + node.handle(end, 0)
 
 
 def pose_times(out, name):

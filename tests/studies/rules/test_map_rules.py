@@ -1,4 +1,4 @@
-"""Whole maps without feedback: fused once as they are, or left alone."""
+"""Whole maps without feedback: fused once, or not at all."""
 
 import numpy as np
 import pytest
@@ -15,28 +15,16 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.codec import encoded
+from tests import build
 from tests.support import packed, spd
 from tests.teams import of
 
-END = m.End(
-    stamp_ns=0,
-    streams=(
-        m.StreamEnd(robot="r1", incarnation=1, measurements=9),
-        m.StreamEnd(robot="r2", incarnation=1, measurements=9),
-    ),
-)
+END = build.end(r1=9, r2=9)
 ALIVE = [m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True) for name in ("r1", "r2")]
 
 
 def start(robot, *, known=True):
-    return m.InitialPose(
-        stamp_ns=0,
-        robot=robot,
-        incarnation=1,
-        number=0,
-        pose=from_floats(np.zeros(3)) if known else b"",
-        covariance=b"",
-    )
+    return build.initial_pose(robot=robot, pose=from_floats(np.zeros(3)) if known else b"")
 
 
 def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
@@ -44,12 +32,10 @@ def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
     content = packed(spd(n)) if joint else from_floats([2.0, 0.5, 1.0] * len(ids))
     means = from_floats(at + np.arange(n))
     stamp_ns = sequence * 10**9
-    return m.MapEstimate(
+    return build.map_estimate(
         stamp_ns=stamp_ns,
         robot=robot,
-        incarnation=1,
         sequence=sequence,
-        exchange=0,
         joint=joint,
         ids=from_ids(ids),
         means=means,
@@ -58,16 +44,7 @@ def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
 
 
 def done(robot, last_map):
-    return m.Done(
-        stamp_ns=9,
-        robot=robot,
-        incarnation=1,
-        measurements=9,
-        steps=3,
-        submaps=0,
-        ledger=(),
-        last_map=last_map,
-    )
+    return build.done(stamp_ns=9, robot=robot, measurements=9, steps=3, last_map=last_map)
 
 
 def value(message):
@@ -105,10 +82,7 @@ def test_the_final_map_is_kalmans_of_the_last_maps_in_whatever_order_they_come(o
     np.testing.assert_array_equal(translate.landmarks_of(node.final)[1], expected.means)
     covariance = translate.landmark_covariance_of(node.final)
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12)
-    assert node.final.members == (
-        m.VersionEntry(robot="r1", incarnation=1, sequence=4),
-        m.VersionEntry(robot="r2", incarnation=1, sequence=6),
-    )
+    assert node.final.members == build.version(r1=4, r2=6)
     assert encoded(node.final) == encoded(heard("latest", TEAM)[0].final)
 
 
@@ -138,7 +112,7 @@ def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
 def test_a_map_in_a_frame_of_its_own_is_left_out_and_named():
     free = [start("r2", known=False) if x == start("r2") else x for x in TEAM]
     node, _ = heard("latest", free)
-    assert node.final.members == (m.VersionEntry(robot="r1", incarnation=1, sequence=4),)
+    assert node.final.members == build.version(r1=4)
     assert node.final.means == LAST[0].means
     assert node.final.reasons == ("r2: its start pose is not known",)
 
@@ -147,14 +121,7 @@ def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
     maps = [estimate("r1", k) for k in range(1, 8)]
     again = [
         maps[-1],
-        m.Progress(
-            stamp_ns=60 * 10**9,
-            node="robot/r1",
-            robot="r1",
-            incarnation=1,
-            measurements=5,
-            submaps=0,
-        ),
+        build.progress(stamp_ns=60 * 10**9, node="robot/r1", measurements=5),
     ]
     _, out = heard("latest", [start("r1"), *maps, *again], broadcast_s=3.0)
     said = [x.stamp_ns // 10**9 for x in of(out, ch.FUSED_MAP)]
@@ -165,8 +132,7 @@ def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
 @pytest.mark.parametrize("joint", [True, False])
 def test_alone_the_map_of_one_robot_is_the_final_one(joint):
     last = estimate("r1", 5, at=2.0, joint=joint)
-    end = m.End(stamp_ns=0, streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=9),))
-    messages = [start("r1"), estimate("r1", 4), last, done("r1", 5), end]
+    messages = [start("r1"), estimate("r1", 4), last, done("r1", 5), build.end(r1=9)]
     node, _ = heard("alone", messages, robots=["r1"])
     assert (node.final.means, node.final.covariance) == (last.means, last.covariance)
     assert (node.final.joint, node.final.reasons) == (joint, ())

@@ -1,4 +1,4 @@
-"""Rules on raw measurements: a function of the streams alone, whatever comes when."""
+"""Rules on raw measurements are functions of the streams, for any order of arrival."""
 
 from functools import cache
 
@@ -22,6 +22,7 @@ from team.wire.arrays import floats
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
 from team.wire.digest import configured
+from tests import build
 from tests.teams import config, of, published, stream
 
 PARTICLES = 20
@@ -29,12 +30,7 @@ RULES = ["joint-fastslam", "batch"]
 STREAMS = {"r1": stream("r1", 9), "r2": stream("r2", 7, y=1.0)}
 CONFIGS = {name: config(name) for name in STREAMS}
 MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
-LAST_WORDS = [
-    m.Done(
-        stamp_ns=0, robot=name, incarnation=1, measurements=len(each), steps=0, submaps=0, ledger=()
-    )
-    for name, each in MEASUREMENTS.items()
-]
+LAST_WORDS = [build.done(robot=name, measurements=len(each)) for name, each in MEASUREMENTS.items()]
 
 
 def announced(name):
@@ -131,13 +127,8 @@ def test_maps_name_the_last_measurement_of_each_robot_in_them(fusion):
 @pytest.mark.parametrize("fusion", RULES)
 def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
     messages = everything()
-    for last in (
-        announced("r2"),
-        MEASUREMENTS["r2"][0],
-        MEASUREMENTS["r1"][5],
-        LAST_WORDS[0],
-        end(),
-    ):
+    start, measurement = MEASUREMENTS["r2"][0], MEASUREMENTS["r1"][5]
+    for last in (announced("r2"), start, measurement, LAST_WORDS[0], end()):
         node, out = heard(fusion, (x for x in messages if x != last))
         assert not node.finished
         out += node.handle(last, 0)
@@ -149,9 +140,7 @@ def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
 def test_missing_measurements_are_asked_for(fusion):
     node, _ = heard(fusion, (x for x in everything() if x not in MEASUREMENTS["r1"][4:6]))
     assert node.requests() == [
-        m.MeasurementsRequest(
-            stamp_ns=node.status().stamp_ns, robot="r1", incarnation=1, first=4, last=5
-        )
+        build.measurements_request(stamp_ns=node.status().stamp_ns, first=4, last=5)
     ]
     for measurement in MEASUREMENTS["r1"][4:6]:
         node.handle(measurement, 0)
@@ -175,9 +164,7 @@ def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
 @pytest.mark.parametrize("fusion", RULES)
 def test_a_stream_that_begins_anew_ends_there(fusion):
     later = [msgspec.structs.replace(x, incarnation=2) for x in MEASUREMENTS["r2"]]
-    later[0] = m.InitialPose(
-        stamp_ns=later[0].stamp_ns, robot="r2", incarnation=2, number=0, pose=b"", covariance=b""
-    )
+    later[0] = build.initial_pose(stamp_ns=later[0].stamp_ns, robot="r2", incarnation=2)
     whole = {"r1": MEASUREMENTS["r1"], "r2": [*MEASUREMENTS["r2"][:8], *later]}
     ends = m.End(
         stamp_ns=0,
@@ -187,18 +174,7 @@ def test_a_stream_that_begins_anew_ends_there(fusion):
         ),
     )
     messages = [x for x in everything(whole) if not isinstance(x, m.End | m.Done)]
-    dones = [
-        LAST_WORDS[0],
-        m.Done(
-            stamp_ns=0,
-            robot="r2",
-            incarnation=2,
-            measurements=len(later),
-            steps=0,
-            submaps=0,
-            ledger=(),
-        ),
-    ]
+    dones = [LAST_WORDS[0], build.done(robot="r2", incarnation=2, measurements=len(later))]
     node, _ = heard(fusion, [*messages, *dones, ends])
     assert node.finished
     assert node.final.reasons == ("r2: its stream began anew",)

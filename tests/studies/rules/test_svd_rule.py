@@ -17,20 +17,15 @@ from team.estimation.contribution import Stream
 from team.estimation.gaussian import LandmarkGaussian
 from team.estimation.geometry import inverse, transformed
 from team.wire import channels as ch
-from team.wire import messages as m
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded
+from tests import build
 from tests.teams import Submaps, of, published, stream, submaps_of
 
 STREAMS = {"r1": stream("r1", 12), "r2": stream("r2", 10, y=1.0)}
 SUBMAPS = Submaps(list(STREAMS.values()))
 STARTS = {name: published(each)[0] for name, each in STREAMS.items()}
-END = m.End(
-    stamp_ns=0,
-    streams=tuple(
-        m.StreamEnd(robot=n, incarnation=1, measurements=len(s)) for n, s in STREAMS.items()
-    ),
-)
+END = build.end(**{name: len(each) for name, each in STREAMS.items()})
 RULES = ["svd-join", "svd-join-spherical"]
 
 
@@ -38,15 +33,7 @@ def messages(submaps=SUBMAPS, starts=STARTS):
     return [
         *(x for name in submaps for x in (starts[name], *submaps[name])),
         *(
-            m.Done(
-                stamp_ns=0,
-                robot=name,
-                incarnation=1,
-                measurements=1,
-                steps=1,
-                submaps=len(each),
-                ledger=(),
-            )
+            build.done(robot=name, measurements=1, steps=1, submaps=len(each))
             for name, each in submaps.items()
         ),
         END,
@@ -81,10 +68,7 @@ def test_the_final_map_is_downs_exchange_of_the_robots_own_joined_maps(rule):
     covariance = translate.landmark_covariance_of(found)
     np.testing.assert_allclose(covariance, expected.covariance, rtol=1e-12, atol=1e-15)
     assert found.frame == "r1/1"
-    assert found.members == (
-        m.VersionEntry(robot="r1", incarnation=1, sequence=3),
-        m.VersionEntry(robot="r2", incarnation=1, sequence=3),
-    )
+    assert found.members == build.version(r1=3, r2=3)
     assert of(out, ch.FUSED_MAP)
     credit: list[Outgoing] = [o for o in out if o.channel is ch.CENTRAL_PROGRESS]
     assert len(credit) == 8, "every submap is acknowledged"
