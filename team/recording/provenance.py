@@ -32,7 +32,7 @@ def provenance() -> dict[str, str]:
 
 
 def kernel_fingerprint() -> str:
-    """SHA-256 of the core's build and all `team.estimation` sources in path order; 16 hex digits."""
+    """SHA-256 of the core and all `team.estimation` sources in path order; 16 hex digits."""
     digest = hashlib.sha256(core.digest.encode())
     for source in sorted(ESTIMATION.rglob("*.py")):
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
