@@ -8,14 +8,8 @@ import pytest
 from central.monitor import finding
 from team.estimation.consistency import covariance_scale
 from team.estimation.map_joining import marginals
-from team.estimation.map_joining.joining import (
-    EMPTY_FOLD,
-    Contribution,
-    JoinSettings,
-    converged,
-    folded,
-    started,
-)
+from team.estimation.map_joining.joining import JoinSettings, converged
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 
 SETTINGS = JoinSettings()
@@ -25,21 +19,27 @@ ROBUST = JoinSettings(robust_c=1.0)
 def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
     """The finding of a joined team; `claim` changes a contribution before it is joined."""
     world = team(seed, robots=3, submaps=30, landmarks=8)
-    fold = EMPTY_FOLD
-    for start in world.starts:
-        fold = started(fold, start)
     submaps = [claim(s) if claim else s for s in world.submaps]
-    solved = converged(folded(fold, submaps, settings), settings)
+    fold = joined_with(submaps, world.starts, (), settings, len(submaps))
+    solved = converged(fold, settings)
     return finding(marginals.joint_cost(solved), normal, final=final)
 
 
 def with_covariance_times(factor, of):
     def claim(contribution):
-        if not of(contribution):
-            return contribution
-        local = replace(contribution.local, covariance=factor * contribution.local.covariance)
-        c = contribution
-        return Contribution(c.robot, c.incarnation, c.sequence, c.end_ns, local)
+        local = contribution.local
+        larger = replace(local, covariance=factor * local.covariance)
+        return replace(contribution, local=larger) if of(contribution) else contribution
+
+    return claim
+
+
+def with_landmarks_moved(offset, of):
+    def claim(contribution):
+        mean = contribution.local.mean.copy()
+        mean[3:] += offset
+        moved = replace(contribution, local=replace(contribution.local, mean=mean))
+        return moved if of(contribution) else contribution
 
     return claim
 
@@ -62,15 +62,7 @@ def test_a_robot_that_halves_its_sigmas_is_named_in_every_seed_of_ten():
 
 
 def test_one_submap_that_the_rest_contradicts_is_named():
-    def shifted(c):
-        if (c.robot, c.sequence) != ("r2", 12):
-            return c
-        mean = c.local.mean.copy()
-        mean[3:] += 3.0
-        return Contribution(
-            c.robot, c.incarnation, c.sequence, c.end_ns, replace(c.local, mean=mean)
-        )
-
+    shifted = with_landmarks_moved(3.0, lambda c: (c.robot, c.sequence) == ("r2", 12))
     named = [w for w in watched(3, shifted).warnings if "disagrees" in w]
     assert named[0].startswith("r2: submap 12 disagrees")
     assert "% of its information" in named[0]
@@ -108,15 +100,7 @@ def test_no_loss_bounds_the_covariance_scale(factor):
 
 
 def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
-    def shifted(c):
-        if c.sequence % 5:
-            return c
-        mean = c.local.mean.copy()
-        mean[3:] += 10.0
-        return Contribution(
-            c.robot, c.incarnation, c.sequence, c.end_ns, replace(c.local, mean=mean)
-        )
-
+    shifted = with_landmarks_moved(10.0, lambda c: c.sequence % 5 == 0)
     clean, spoilt = watched(3, settings=ROBUST), watched(3, shifted, ROBUST)
     of = "covariance_scale"
     assert spoilt.figures[of] == pytest.approx(clean.figures[of], rel=0.35)
@@ -132,7 +116,7 @@ def test_a_profile_says_which_scale_is_normal():
 
 @pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])
 def test_the_covariance_scale_of_drawn_terms_is_theirs(dof, scale):
-    """Against draws: its mean and its scatter are what it says of itself."""
+    """The scale's mean and scatter over draws equal its claimed ones."""
     rng = np.random.default_rng(0)
     draws = scale * rng.chisquare(dof, (400, 60))
     found = [covariance_scale(terms, np.full(60, dof)) for terms in draws]

@@ -1,4 +1,4 @@
-"""A robot that goes wrong is withdrawn: the map is, bit for bit, that of a team without it."""
+"""After a withdrawal the map equals, bit for bit, that of a team without the robot."""
 
 import math
 from dataclasses import replace
@@ -223,7 +223,7 @@ UNTIL_S = 40
 
 
 def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[MapPublisher, bytes]:
-    """A rule that takes messages in an order, is told a watermark [s] after so many, and ends."""
+    """Feed a rule messages in an order, with a watermark [s] after some of them, to its end."""
     rule = MapPublisher(SubmapFold(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8)))
     for start in one_closes_windows_often():
         if isinstance(start, m.InitialPose):
@@ -294,7 +294,7 @@ def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
 
 
 @pytest.mark.parametrize("kind", ["measurement", "identity"])
-@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("seed", [3, 4])
 def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(
     kind: OutlierKind, seed: int
 ) -> None:

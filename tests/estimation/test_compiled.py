@@ -1,17 +1,14 @@
 """A kernel's cached machine code is that of its sources, near and far."""
 
-import ast
 import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from team.estimation import geometry
 from team.estimation.cached_code import unpickled
 from team.estimation.compiled import (
     CircularKernelsError,
@@ -20,8 +17,6 @@ from team.estimation.compiled import (
     compiled,
     program_of,
 )
-from tests import kernels
-from tests.support import ROOT
 
 INNER = """
 from team.estimation.compiled import compiled
@@ -46,15 +41,8 @@ if __name__ == "__main__":
 """
 
 
-def test_no_kernel_is_called_while_the_tests_are_imported(pytestconfig: pytest.Config) -> None:
-    """In a fresh clone one worker would compile it, and all others wait before their first test."""
-    assert pytestconfig.stash[kernels.AT_IMPORT] == []
-    geometry.wrapped(4.0)
-    assert "team.estimation.geometry.wrapped" in kernels.called()
-
-
 def computed(folder: Path, processes: int = 1) -> list[tuple[float, int]]:
-    """What processes of their own compute at once, and how much of it was in the cache."""
+    """Run processes concurrently; return each result with its number of cache hits."""
     started = [
         subprocess.Popen(
             [sys.executable, "-m", "kernels.outer"], cwd=folder, text=True,
@@ -75,74 +63,6 @@ def computed(folder: Path, processes: int = 1) -> list[tuple[float, int]]:
         process.stdin.flush()
     told = [process.communicate()[0].split() for process in started]
     return sorted((float(value), int(hits)) for value, hits in told)
-
-
-ALLOCATING = """
-import sys
-from collections.abc import Iterator
-from pathlib import Path
-import numpy as np
-from team.estimation.compiled import compiled
-
-@compiled
-def row(x: float):
-    made = np.zeros(3)
-    made[1:] = np.cumsum(np.array([x, -3.0]))
-    return made, made.sum()
-
-@compiled
-def rows(x: float):
-    made = np.empty((2, 3))
-    for k in range(2):
-        made[k], total = row(x + k)
-    if total < 0.0:
-        raise ValueError("negative")
-    return made
-
-for kernel in {}:
-    value = getattr(sys.modules[__name__], kernel)(4.0)
-    print(np.sum(value[0]), end=" ")
-try:
-    print(kernel, rows(-9.0) if kernel == "rows" else "positive", end=" ")
-except ValueError as error:
-    print(kernel, error, end=" ")
-print("numba.core.boxing" in sys.modules, "scipy.linalg" in sys.modules, end=" ")
-kb, is_compilers = 0, False
-for line in Path("/proc/self/smaps").read_text().splitlines():
-    if line[0].islower() or line[0].isdigit():  # a mapping
-        is_compilers = line.endswith("/libllvmlite.so")
-    kb += int(line.split()[1]) if is_compilers and line.startswith("Rss:") else 0
-print("small" if kb < 20_000 else "large")
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="memory is read as Linux tells it")
-def test_cached_code_is_loaded_without_what_only_compiling_needs(tmp_path: Path) -> None:
-    """Also where a kernel is compiled that calls one whose code came from the cache, and where one
-    that came from the cache as a part of others is called from Python.
-    """
-
-    def run(*kernels: str) -> list[str]:
-        (tmp_path / "allocating.py").write_text(ALLOCATING.format(list(kernels)))
-        environment = {
-            **os.environ,
-            "PYTHONPATH": f"{tmp_path}:{Path.cwd()}",
-            "NUMBA_CACHE_DIR": str(tmp_path / "cached"),
-        }
-        command = [sys.executable, "-m", "allocating"]
-        ran = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
-        assert ran.returncode == 0, ran.stderr
-        return ran.stdout.split()
-
-    assert run("row") == ["5.0", "row", "positive", "True", "True", "large"]
-    assert run("row") == ["5.0", "row", "positive", "False", "False", "small"]
-    assert run("row", "rows") == ["5.0", "5.0", "rows", "negative", "True", "True", "large"]
-    assert run("row", "rows") == ["5.0", "5.0", "rows", "negative", "False", "False", "small"]
-    for index in tmp_path.rglob("*.nbi"):
-        if "-part." not in index.name:
-            index.unlink()
-    assert run("row") == ["5.0", "row", "positive", "True", "True", "large"]
-    assert run("row") == ["5.0", "row", "positive", "False", "False", "small"]
 
 
 SORTING = """
@@ -196,7 +116,7 @@ def test_kernels_that_two_processes_compiled_do_not_share_parts_that_are_called_
 
 
 def machine_code(file: Path) -> bool:
-    """Whether a file of the cache holds machine code; otherwise it holds bit code."""
+    """Test whether a cache file holds machine code rather than bit code."""
     with file.open("rb") as opened:
         (_, _, (code, bit_code)), *_ = unpickled(opened)
     assert bool(code) != bool(bit_code)
@@ -356,22 +276,6 @@ def test_a_kernel_that_calls_itself_and_a_circle_of_kernels_are_named(
         program_of(module.even.py_func)
 
 
-def test_code_that_names_a_class_that_is_gone_is_compiled_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A record of a kernel's arguments got another name: every command with an older cache
-    failed.
-    """
-    module = ModuleType("records_of_kernels")
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    exec("class Record: pass", vars(module))
-    index = _CacheFile(str(tmp_path), "kernel", "program")
-    index._save_index({("signature", module.Record): "kernel.1.nbc"})
-    assert list(index._load_index().values()) == ["kernel.1.nbc"]
-    del module.Record
-    assert index._load_index() == {}
-
-
 def test_code_that_can_not_be_read_counts_as_not_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -392,31 +296,3 @@ def test_code_that_can_not_be_read_counts_as_not_there(
     code.write_bytes(whole)
     del module.Record
     assert files.load("form") is None
-
-
-def assigned_slices(path: Path) -> Iterator[str]:
-    """Assignments to slices in a module's kernels, other than of one number as it stands."""
-    for kernel in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if not isinstance(kernel, ast.FunctionDef):
-            continue
-        if not {"compiled", "inlined"} & {ast.unparse(each) for each in kernel.decorator_list}:
-            continue
-        for step in ast.walk(kernel):
-            if not isinstance(step, ast.Assign | ast.AugAssign):
-                continue
-            targets = step.targets if isinstance(step, ast.Assign) else [step.target]
-            values = [step.value]
-            if isinstance(targets[0], ast.Tuple) and isinstance(step.value, ast.Tuple):
-                targets, values = targets[0].elts, step.value.elts
-            for target, value in zip(targets, values, strict=False):
-                parts = ast.walk(target.slice) if isinstance(target, ast.Subscript) else ()
-                if any(isinstance(p, ast.Slice) for p in parts) and not isinstance(
-                    value, ast.Constant
-                ):
-                    yield f"{path.relative_to(ROOT)}:{step.lineno}: {ast.unparse(step)}"
-
-
-def test_no_kernel_of_the_product_assigns_arrays_to_slices() -> None:
-    """It took seconds to compile in each process, for the words of an error: `placing`."""
-    modules = (ROOT / "team" / "estimation").rglob("*.py")
-    assert [each for path in modules for each in assigned_slices(path)] == []

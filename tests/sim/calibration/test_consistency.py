@@ -19,8 +19,8 @@ from team.estimation.map_joining.joining import (
     JoinSettings,
     converged,
     folded,
-    started,
 )
+from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 
 SIGMAS = (0.05, 0.01, 0.1)
@@ -28,15 +28,13 @@ SIGMAS = (0.05, 0.01, 0.1)
 
 @cache
 def folds_of(seeds, claimed=1.0):
-    """Teams of four whose submaps say `claimed` times the variance that they have."""
+    """Build teams of four whose submaps claim `claimed` times their true variance."""
     folds: list[Fold] = []
     for seed in seeds:
         world = team(seed, robots=4, submaps=8, landmarks=8, reach=30.0, sigmas=SIGMAS)
-        fold = EMPTY_FOLD
-        for start in world.starts:
-            fold = started(fold, start)
         submaps = [told(each, claimed) for each in world.submaps]
-        folds.append(converged(folded(fold, submaps, JoinSettings()), JoinSettings()))
+        fold = joined_with(submaps, world.starts, (), JoinSettings(), len(submaps))
+        folds.append(converged(fold, JoinSettings()))
     return folds
 
 

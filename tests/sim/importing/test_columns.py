@@ -27,7 +27,7 @@ def proposal(folder: Path, **files: str) -> str:
     "name",
     ["gt", "truth", "ref", "my_reference", "mocap", "optitrack_1", "vicon", "groundTruth", "r1-gt"],
 )
-@pytest.mark.parametrize("odometry", ["odom", "wheel_log", "zz_encoders"])
+@pytest.mark.parametrize("odometry", ["odom", "zz_encoders"])
 def test_a_reference_is_proposed_as_the_truth_and_never_as_odometry(
     tmp_path: Path, name: str, odometry: str
 ) -> None:
