@@ -321,7 +321,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
             "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,1,0,1\n2,1,1,1,1,,\n",
             "line 3, column c_xy: no number here; a covariance has all of c_xx,c_xy,c_yy, or none",
         ),
-        ("observations", SEEN + '3,7,"2,5",0\n', "'2,5' is not a number; decimals have a point"),
+        ("observations", SEEN + '3,7,"2,5",0\n', "'2,5' is not a number; use a decimal point"),
         ("observations", SEEN + "3,door,1,0\n", "give each landmark a number"),
         ("observations", SEEN + "2024-05-01T12:00:00Z,7,1,0\n", "times are in seconds, since 1970"),
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
