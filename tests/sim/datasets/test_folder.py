@@ -483,7 +483,7 @@ def test_tables_as_other_programs_write_them_are_the_same(tmp_path: Path, odomet
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("1,7,2.5", '1,7,"2,5"', "column range_m: '2,5' is not a number; decimals have a point"),
+        ("1,7,2.5", '1,7,"2,5"', "column range_m: '2,5' is not a number; use a decimal point"),
         ("1,7,2.5", "1,door,2.5", "give each landmark a number"),
         ("1,7,2.5", "2024-05-01T12:00:00Z,7,2.5", "times are in seconds, since 1970 or since"),
     ],
