@@ -42,9 +42,9 @@ def keys(
         typer.Option("--replay", help="One for `teamslam replay`, which may publish on all keys."),
     ] = False,
 ) -> None:
-    """Make the certificates of a team: an authority, and one for each process and robot.
+    """Make a team's certificates: an authority, and one for each process and robot.
 
-    Existing certificates are kept, so a robot is added by naming it. docs/security.md says which
+    Existing certificates are kept, so a robot is added by naming it. docs/security.md lists which
     files go where.
     """
     from team.keys.authority import make_keys
