@@ -30,7 +30,8 @@ def calibrate(
 ) -> None:
     """Calibrate odometry and sensor models from measurements, each figure with its uncertainty.
 
-    With ground truth also clock_offset_s, the delay of detections against odometry.
+    With ground truth also clock_offset_s, the delay of detections against
+    odometry.
     """
     from dataclasses import asdict, replace
 

@@ -44,8 +44,8 @@ def keys(
 ) -> None:
     """Make a team's certificates: an authority, and one for each process and robot.
 
-    Existing certificates are kept, so a robot is added by naming it. docs/security.md lists which
-    files go where.
+    Existing certificates are kept, so a robot is added by naming it.
+    docs/security.md lists which files go where.
     """
     from team.keys.authority import make_keys
     from team.keys.roster import REPLAY, ROBOT, TEAM, nodes_of

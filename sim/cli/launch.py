@@ -122,8 +122,9 @@ def launch(
 ) -> None:
     """Launch a whole team, watch it, and end with a report and a log.
 
-    Robots, world, central computer, recorder and router are processes. Exit status 0 only if every
-    process ended well and every robot is in the final map; else 1. 2: wrong use; 130: interrupted.
+    Robots, world, central computer, recorder and router are processes. Exit
+    status 0 only if every process ended well and every robot is in the final map;
+    else 1. 2: wrong use; 130: interrupted.
     """
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)

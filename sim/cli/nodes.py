@@ -63,9 +63,11 @@ def router(
         ),
     ] = False,
 ) -> None:
-    """Run the team's Zenoh router, of which every other process is a client, until it is stopped.
+    """Run the team's Zenoh router, of which every other process is a client, until it is
+    stopped.
 
-    With --keys it admits nodes with a certificate, each of which may publish on its own keys only.
+    With --keys it admits nodes with a certificate, each of which may publish on
+    its own keys only.
     """
     from team.keys.roster import load_roster
     from team.shell import process
@@ -156,10 +158,11 @@ def robot(
         ),
     ] = "always",
 ) -> None:
-    """Run a robot, which estimates from its sensor stream and publishes submaps, maps and poses.
+    """Run a robot, which estimates from its sensor stream and publishes submaps, maps and
+    poses.
 
-    After a crash it resumes after its last submap. With --peers it keeps the whole team's submaps
-    and computes the team's map itself.
+    After a crash it resumes after its last submap. With --peers it keeps the
+    whole team's submaps and computes the team's map itself.
     """
     from contextlib import nullcontext
 
@@ -327,8 +330,9 @@ def record(
 ) -> None:
     """Record every message of the team to one MCAP file, until the team has left.
 
-    Restarted during the run, it writes a further part and requests missed messages; at the end the
-    parts are joined. Restarted after the end, it completes an interrupted join.
+    Restarted during the run, it writes a further part and requests missed
+    messages; at the end the parts are joined. Restarted after the end, it
+    completes an interrupted join.
     """
     from sim.scenarios.scenario import dumps
     from team.recording.part_files import parts_of

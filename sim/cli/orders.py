@@ -100,8 +100,8 @@ def verdict(
 ) -> None:
     """Give a running team the verdict that two unnamed landmarks are one, or two.
 
-    The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
-    until it is withdrawn.
+    The page of `teamslam view` shows their names at a click. The verdict is
+    recorded and holds until it is withdrawn.
     """
     from central.desk.evaluation.verdicts import contradicting, in_words
     from central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
@@ -160,9 +160,10 @@ def end(
 ) -> None:
     """End a live team: every driver ends its stream, and the centre publishes the final map.
 
-    With --without: end a running team without a lost robot. Its submaps stay in the map, which
-    names it as lost and is provisional, and every process ends with status 1. The router keeps the
-    order until the end of the run, for a restarted centre.
+    With --without: end a running team without a lost robot. Its submaps stay in
+    the map, which names it as lost and is provisional, and every process ends
+    with status 1. The router keeps the order until the end of the run, for a
+    restarted centre.
     """
     from central.desk.orders import WithdrawError, end_team, give_up
 

@@ -88,10 +88,11 @@ def rerun(
 ) -> None:
     """Recompute a log, to verify it or to compare it under other conditions.
 
-    With --verify every message is recomputed from the inputs that it names. Otherwise the recorded
-    measurements pass through the same nodes again, with the given changes; without a change, as if
-    every message arrived at once. For a data set, the reference run is computed, too. No process is
-    started. Exit status 0 only if every robot that is not left out is in the final map, with
+    With --verify every message is recomputed from the inputs that it names.
+    Otherwise the recorded measurements pass through the same nodes again, with
+    the given changes; without a change, as if every message arrived at once. For
+    a data set, the reference run is computed, too. No process is started. Exit
+    status 0 only if every robot that is not left out is in the final map, with
     --verify only if all is equal; else 1. 2: wrong use.
     """
     changes = Changes(

@@ -83,8 +83,9 @@ def view(
 ) -> None:
     """Show a log, or a running team by its log, on a page in a browser.
 
-    Map with uncertainty, robots, paths, errors with bounds, consistency, traffic and events,
-    without remote content. Foxglove and Lichtblick can connect, too. Ends with Ctrl-C.
+    Map with uncertainty, robots, paths, errors with bounds, consistency, traffic
+    and events, without remote content. Foxglove and Lichtblick can connect, too.
+    Ends with Ctrl-C.
     """
     from team.recording.reader import log_file, open_log
     from team.shell import process
