@@ -28,9 +28,10 @@ def calibrate(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Learn odometry and sensor models from measurements; every figure with its uncertainty.
+    """Calibrate odometry and sensor models from measurements, each figure with its uncertainty.
 
-    With a ground truth also clock_offset_s, by which detections are stamped late.
+    With ground truth also clock_offset_s, the delay of detections against
+    odometry.
     """
     from dataclasses import asdict, replace
 

@@ -70,11 +70,12 @@ def driver(
         ),
     ] = Back.ALL,
 ) -> None:
-    """Drive a robot of a live team by its ROS 2 topics, with no ROS here; Ctrl-C ends its stream.
+    """Drive a robot of a live team by its ROS 2 topics, without ROS here; Ctrl-C ends its
+    stream.
 
-    Topics come by rmw_zenoh or by zenoh-bridge-ros2dds. Published back beside
-    the odometry: team_pose, team_path, smoothed_path, team_landmarks, team_map,
-    the transform map → odom, and /diagnostics.
+    Topics come by rmw_zenoh or by zenoh-bridge-ros2dds. Published back beside the
+    odometry: team_pose, team_path, smoothed_path, team_landmarks, team_map, the
+    transform map → odom, and /diagnostics.
     """
     import numpy as np
 

@@ -49,7 +49,7 @@ def import_(
         typer.Option(help="The robot's true path: CSV, or TUM's format.", metavar="FILE"),
     ] = None,
 ) -> None:
-    """Turn logs into a data set that launch, calibrate, rerun and batch-reference take."""
+    """Convert logs to a data set for launch, calibrate, rerun and batch-reference."""
     import re
 
     from sim.datasets.folder_files import ROBOT_NAME

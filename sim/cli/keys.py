@@ -42,10 +42,10 @@ def keys(
         typer.Option("--replay", help="One for `teamslam replay`, which may publish on all keys."),
     ] = False,
 ) -> None:
-    """Make the certificates of a team: an authority, and one for each process and robot.
+    """Make a team's certificates: an authority, and one for each process and robot.
 
-    Existing certificates are kept, so a robot is added by naming it. docs/security.md says which
-    files go where.
+    Existing certificates are kept, so a robot is added by naming it.
+    docs/security.md lists which files go where.
     """
     from team.keys.authority import make_keys
     from team.keys.roster import REPLAY, ROBOT, TEAM, nodes_of

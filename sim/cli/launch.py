@@ -120,11 +120,11 @@ def launch(
     foxglove_port: FoxglovePort = 8765,
     browser: Open = None,
 ) -> None:
-    """Launch a whole team here, watch it, and end with a report and a log.
+    """Launch a whole team, watch it, and end with a report and a log.
 
-    Every robot, the world, the central computer, the recorder and the router are processes. Exit
-    status 0 only if every process ended well and every robot is in the final map; else 1. 2: wrong
-    use; 130: interrupted.
+    Robots, world, central computer, recorder and router are processes. Exit
+    status 0 only if every process ended well and every robot is in the final map;
+    else 1. 2: wrong use; 130: interrupted.
     """
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)

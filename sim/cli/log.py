@@ -102,9 +102,9 @@ def info(
 
 @app.command()
 def check(log: LogArgument) -> None:
-    """Check that a log is whole and sound: checksums, schemas, counters, order, every message.
+    """Check that a log is whole and valid: checksums, schemas, counters, order, every message.
 
-    Exit status 1 when anything is wrong; each finding is one line.
+    Exit status 1 if anything is wrong; each finding is one line.
     """
     from team.recording.check import check_log
     from team.recording.reader import open_log
@@ -129,9 +129,9 @@ def cut(
     ] = None,
     channels: ChannelNames = None,
 ) -> None:
-    """Write a stretch of team time, or some channels, as a log of its own.
+    """Write an interval of team time, or some channels, as a log of its own.
 
-    Configurations and true landmarks from before the stretch are kept, since they hold in it.
+    Earlier configurations and true landmarks are kept, since they stay valid.
     """
     import math
 
@@ -154,7 +154,7 @@ def merge(
     logs: Annotated[list[Path], typer.Argument(help="Logs of one team: of robots, or parts.")],
     output: NewLog,
 ) -> None:
-    """Merge logs by team time; messages that several of them have are written once."""
+    """Merge logs by team time; messages that several logs have are written once."""
     from team.recording.merge import merge as merge_logs
     from team.recording.reader import open_log
 

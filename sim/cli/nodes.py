@@ -63,9 +63,11 @@ def router(
         ),
     ] = False,
 ) -> None:
-    """The team's Zenoh router: every other process is its client. Runs until it is stopped.
+    """Run the team's Zenoh router, of which every other process is a client, until it is
+    stopped.
 
-    With --keys it admits nodes with a certificate, each of which may publish on its own keys only.
+    With --keys it admits nodes with a certificate, each of which may publish on
+    its own keys only.
     """
     from team.keys.roster import load_roster
     from team.shell import process
@@ -107,7 +109,7 @@ def world(
     seed: Seed = None,
     dataset: Dataset = None,
 ) -> None:
-    """The world: a simulator or a data set that publishes every robot's measurements."""
+    """Run the world: a simulator or a data set that publishes every robot's measurements."""
     from sim.publisher.main import run_world
     from sim.scenarios.source import streams_of
     from team.shell import process
@@ -156,10 +158,11 @@ def robot(
         ),
     ] = "always",
 ) -> None:
-    """A robot: runs its estimator on its sensor stream and publishes submaps, maps and poses.
+    """Run a robot, which estimates from its sensor stream and publishes submaps, maps and
+    poses.
 
-    Started again after a crash, it continues after its last submap. With --peers it keeps the whole
-    team's submaps and computes the team's map itself.
+    After a crash it resumes after its last submap. With --peers it keeps the
+    whole team's submaps and computes the team's map itself.
     """
     from contextlib import nullcontext
 
@@ -255,7 +258,7 @@ def central(
         ),
     ] = None,
 ) -> None:
-    """The central computer: fuses the robots' maps and broadcasts the fused map back.
+    """Run the central computer, which fuses the robots' maps and broadcasts the fused map back.
 
     With --peers it is one more peer, which may join and leave at any time.
     """
@@ -325,10 +328,11 @@ def record(
         bool, typer.Option("--join/--no-join", help="Join the parts of the log at the end.")
     ] = True,
 ) -> None:
-    """The recorder: every message of the team to one MCAP file, until the team has left.
+    """Record every message of the team to one MCAP file, until the team has left.
 
-    Started again while the team runs, it writes a further part and requests what it has missed; at
-    the end the parts are joined. Started again after the end, it completes an interrupted joining.
+    Restarted during the run, it writes a further part and requests missed
+    messages; at the end the parts are joined. Restarted after the end, it
+    completes an interrupted join.
     """
     from sim.scenarios.scenario import dumps
     from team.recording.part_files import parts_of

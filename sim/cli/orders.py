@@ -33,7 +33,7 @@ def map_(
         float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
     ] = 60.0,
 ) -> None:
-    """Ask a peer to fold the set that it has now (`--fold request`), and print the map as CSV."""
+    """Request a peer's fold of its present set (`--fold request`), and print the map as CSV."""
     from team.wire.arrays import floats
     from team.wire.bus import BusError
     from team.wire.channels import FOLD
@@ -65,9 +65,9 @@ def withdraw(
         float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """Withdraw a robot from a running team: the map becomes that of a team that never had it.
+    """Withdraw a robot from a running team: the map becomes that of a team without it.
 
-    The order is recorded and can not be undone.
+    The order is recorded and cannot be undone.
     """
     from central.desk.orders import WithdrawError
     from central.desk.orders import withdraw as order
@@ -98,10 +98,10 @@ def verdict(
         float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
     ] = 60.0,
 ) -> None:
-    """Give a running team the verdict that two landmarks without names are one, or two.
+    """Give a running team the verdict that two unnamed landmarks are one, or two.
 
-    The page of `teamslam view` shows their names at a click. The verdict is recorded and holds
-    until it is withdrawn.
+    The page of `teamslam view` shows their names at a click. The verdict is
+    recorded and holds until it is withdrawn.
     """
     from central.desk.evaluation.verdicts import contradicting, in_words
     from central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
@@ -160,9 +160,10 @@ def end(
 ) -> None:
     """End a live team: every driver ends its stream, and the centre publishes the final map.
 
-    With --without: end a running team without a lost robot. Its submaps so far stay in the map,
-    which names it as lost and is provisional, and every process ends with status 1. The router
-    keeps the order until the run is over, for a centre that is started again.
+    With --without: end a running team without a lost robot. Its submaps stay in
+    the map, which names it as lost and is provisional, and every process ends
+    with status 1. The router keeps the order until the end of the run, for a
+    restarted centre.
     """
     from central.desk.orders import WithdrawError, end_team, give_up
 

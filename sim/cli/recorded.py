@@ -52,7 +52,7 @@ def replay(
         float, typer.Option(help="Seconds between the router's start and the first message.")
     ] = 1.0,
 ) -> None:
-    """Publish a log's traffic again: same bytes, same order, same spacing in team time."""
+    """Publish a log's traffic again, with equal bytes, order and spacing in team time."""
     from contextlib import nullcontext
 
     from team.recording.reader import open_log
@@ -107,7 +107,7 @@ def report(
         ),
     ] = None,
 ) -> None:
-    """A page, pictures, tables and figures of a run, from its log alone."""
+    """Write page, pictures, tables and figures of a run from its log."""
     from rich.console import Console
 
     from central.desk.evaluation.evaluation import add_holes, evaluate, to_json

@@ -86,13 +86,14 @@ def rerun(
         Path | None, typer.Option("--output", "-o", help="Folder for a picture of both maps.")
     ] = None,
 ) -> None:
-    """Compute a log again: to verify it, or under other conditions to compare.
+    """Recompute a log, to verify it or to compare it under other conditions.
 
-    With --verify every message is computed again from the inputs that it names. Otherwise the
-    recorded measurements go through the same nodes again, with the given changes; without a change,
-    as if every message arrived at once. For a data set, the run to compare with is computed, too.
-    No process is started. Exit status 0 only if every robot that is not left out is in the final
-    map, with --verify only if all is equal; else 1. 2: wrong use.
+    With --verify every message is recomputed from the inputs that it names.
+    Otherwise the recorded measurements pass through the same nodes again, with
+    the given changes; without a change, as if every message arrived at once. For
+    a data set, the reference run is computed, too. No process is started. Exit
+    status 0 only if every robot that is not left out is in the final map, with
+    --verify only if all is equal; else 1. 2: wrong use.
     """
     changes = Changes(
         without=tuple(without or ()),

@@ -51,8 +51,9 @@ def simulate(
 ) -> None:
     """Write a scenario's world as a data set, with a scenario that runs it.
 
-    In the UTIAS format; as CSV tables where that does not have the measurements: motions,
-    points, covariances, detections without identities (their labels are in a file of their own).
+    In the UTIAS format; as CSV tables if that lacks the measurements: motions,
+    points, covariances, detections without identities (their labels are in a
+    separate file).
     """
     from sim.datasets.folder_writer import write_folder
     from sim.datasets.utias_writer import beyond_utias, write_utias

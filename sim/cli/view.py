@@ -44,9 +44,9 @@ app = typer.Typer()
 
 @app.command()
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
-    """Publish the views for Foxglove, Lichtblick and Rerun, once a second of team time.
+    """Publish views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
-    The recorder stores it beside the team's own messages. It ends after the final map.
+    The recorder stores them beside the team's messages. Ends after the final map.
     """
     from central.desk.view.viewer import run_viewer
     from team.shell import process
@@ -83,9 +83,9 @@ def view(
 ) -> None:
     """Show a log, or a running team by its log, on a page in a browser.
 
-    The map with its uncertainty, robots, paths, errors within their bounds, consistency, traffic
-    and events; nothing is loaded from elsewhere. Foxglove and Lichtblick can connect, too. It ends
-    with Ctrl-C.
+    Map with uncertainty, robots, paths, errors with bounds, consistency, traffic
+    and events, without remote content. Foxglove and Lichtblick can connect, too.
+    Ends with Ctrl-C.
     """
     from team.recording.reader import log_file, open_log
     from team.shell import process

@@ -74,7 +74,7 @@ def test_a_measurement_that_no_submap_took_is_named(samples: list[Sample], tmp_p
     offenders = ledger_of(skipped, tmp_path).offenders
     name = f"measurement {second.first_measurement} of r1, incarnation 1"
     assert offenders[0] == f"{name} is behind its submaps and in none of them"
-    assert "r1, incarnation 1 says" in offenders[1]
+    assert "r1, incarnation 1 reports" in offenders[1]
 
 
 def test_a_submap_of_measurements_that_are_not_there_is_named(

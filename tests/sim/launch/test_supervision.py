@@ -100,7 +100,7 @@ def test_of_many_silent_processes_one_line_says_how_many(monkeypatch: pytest.Mon
     team = Team(monkeypatch, 50)
     team.hears(*range(50))
     (said,) = team.after(11.0)
-    assert "50 processes, robot-r0, robot-r1, robot-r2 among them, have said nothing" in said
+    assert "50 processes, robot-r0, robot-r1, robot-r2 among them, have sent no message" in said
     lines = 0
     for k in range(100):  # an overloaded computer: each speaks now and then, at times of its own
         team.hears(k % 50)
