@@ -101,7 +101,7 @@ def _run(
     from rich.console import Console
 
     try:
-        import joblib  # noqa: F401 - said before the work, not after it
+        import joblib  # noqa: F401 - reported before the work, not after it
     except ModuleNotFoundError:
         fail(f"experiments need joblib: {install_command('studies')}", WRONG_USE)
 

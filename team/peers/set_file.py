@@ -213,7 +213,7 @@ def _replace(path: Path, content: bytes) -> None:
 def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> str:
     places, damaged = max(len(holes), 1), sum(holes)
     lacks = missing_in(members)
-    missing = f"; it lacks at least {', '.join(lacks)}" if lacks else ""
+    missing = f"; it lacks {', '.join(lacks)}, as far as known" if lacks else ""
     return (
         f"{path} was damaged in {places} place{'s' * (places != 1)}: {damaged} bytes are lost, "
         f"{len(members)} members are intact{missing}; the rest of the set is requested again"

@@ -108,8 +108,8 @@ def outcome(options: Options, results: Results) -> Outcome:
         tuple(tables),
         remarks=(
             f"Not implemented, so without numbers: {absent}.",
-            "Associations are known here, as in the thesis' own experiments: what tables 2.1 and "
-            "2.2 say of data association is not measured.",
+            "Associations are known here, as in the thesis' own experiments: the statements of "
+            "tables 2.1 and 2.2 on data association are not measured.",
         ),
     )
 
