@@ -123,11 +123,10 @@ def _landmarks(
 class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
-    undecided: left out, since each may be the same as a landmark that is shown. weak: left out,
-    since only submaps of a poorly known heading observed them. missed: left out, since nearly all
-    submaps that look there miss them. headings: largest heading standard deviation [rad] of each
-    stream that was lost. repeated: parts of the map that repeat others; their landmarks are left
-    out.
+    Left out: undecided, possible duplicates of a shown one; weak, observed only by submaps of a
+    poorly known heading; missed, by nearly all submaps that look there; those of `repeated`, parts
+    of the map that repeat others. headings: largest heading standard deviation [rad] of each lost
+    stream.
     """
 
     ids: Sequence[int] = ()

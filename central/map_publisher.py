@@ -88,8 +88,7 @@ class MapPublisher:
         """Publish the map of the closed ticks, or of the whole set if that has more submaps.
 
         A teammate's new submap helps most the robots that measure the same landmarks, so it need
-        not wait for the end of its tick. No map has less than the one before it: submaps ahead of
-        the watermark are in a provisional map but not yet in a closed one.
+        not wait for the end of its tick. No map has less than the one before it.
         """
         ticks_end_ns = closed_ns
         if math.isfinite(closed_ns):  # a tick has the submaps that end in (a, b]

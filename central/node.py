@@ -139,9 +139,9 @@ class CentralNode:
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue after an exception in the handling of a message, and give its sender the credit.
 
-        A member that could not be filed counts as refused. If a running map raises, the final one
-        is unaffected; if the final one raises, the newest computable map replaces it, provisional
-        and with the reason.
+        A member that could not be filed counts as refused. A running map that raises does not
+        affect the final one, which the newest computable map replaces if it raises, provisional and
+        with the reason.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)

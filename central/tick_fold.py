@@ -8,17 +8,16 @@ tick has arrived, so the fold is final.
                                    │ without the robot    └────fold─────┤
                                    └── Conviction <── agreement(fold) <─┘
 
-There are three pieces of state, each with one owner. The inputs depend on no fold. The checkpoints
-are a stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back to the last
-checkpoint before it, and the ticks are folded again. The conviction, the robots that contradict the
-rest beyond chance (`central.withdrawal`), is replaced as a whole; a change folds all ticks again
-without these robots. Agreement is tested after the first tick of each broadcast's time and after
-the full solution, so a withdrawal depends on the set alone, not on order or time of arrival.
+Each of the three pieces of state has one owner. The inputs depend on no fold. The checkpoints are a
+stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back, and the ticks are
+folded again. The conviction, the robots that contradict the rest beyond chance
+(`central.withdrawal`), is replaced as a whole; a change folds all ticks again without these robots.
+Agreement is tested after the first tick of each broadcast's time and after the full solution, so a
+withdrawal depends on the set alone, not on order or time of arrival.
 
-A robot with few submaps is suspended: running maps leave it out at once, so that it does not move
-its teammates' poses, but it is withdrawn only once it has enough of them, or by the full solution.
-Until then it is tested again, with all its submaps, whenever the set has grown by GROWTH. A
-provisional map is tested by itself.
+A robot with few submaps is suspended: running maps leave it out at once, but it is withdrawn only
+once it has enough of them, or by the full solution. Until then it is tested again, with all its
+submaps, whenever the set has grown by GROWTH. A provisional map is tested by itself.
 
 The running fold is bounded (`condensing`): its old submaps are condensed before each tick. A tick
 that contradicts them is folded with all of them restored (`relinearising`), and so is the full

@@ -1,14 +1,13 @@
 """The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
 
-Every submap adds its unnamed landmarks to the map as landmarks of their own; here they are merged.
-The steps of a tick, in order: *tracking* against the last submaps of the same robot; *near*,
-landmarks of older submaps where the standard deviation of the difference is small, submap by
-submap; *sweep*, landmarks that were split. Closures and merges of islands follow (`closure`).
+Every submap adds its unnamed landmarks to the map as landmarks of their own. The steps of a tick:
+*tracking* against the last submaps of the same robot; *near*, landmarks of older submaps where the
+standard deviation of the difference is small, submap by submap; *sweep*, landmarks that were split.
+Closures and merges of islands follow (`closure`).
 
-The landmarks of one submap are distinct. Those of the whole map are not, while some are unmerged:
-fragments of one landmark are candidates for each other, and the assignments to all of them at once
-do not agree on any. So the landmarks of a submap are assigned to those of one other submap at a
-time, with landmarks that are certainly different from these.
+The landmarks of one submap are distinct. Unmerged fragments of one landmark are candidates for each
+other, and the assignments to all of them at once do not agree on any. So the landmarks of a submap
+are assigned to those of one other submap at a time, with landmarks certainly different from these.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,10 +1,9 @@
 """Fold a tick, and undo a closure that later submaps contradict.
 
-For some ticks after a closure, or a merge of robots, the share of matched landmarks among those
-near its places that both sides observed is computed again. Where it falls below the bound of the
-settings, the same ticks are folded again without the closure, from the state before it, as if it
-had never been accepted. The fold before a closure and the ticks since are part of the fold, so the
-outcome depends on the set of submaps alone.
+For some ticks after a closure, or a merge of robots, the matched share of the landmarks near its
+places that both sides observed is computed again. Where it falls below the bound of the settings,
+these ticks are folded again without the closure. The fold before a closure and the ticks since are
+part of the fold, so the outcome depends on the set of submaps alone.
 """
 
 from dataclasses import replace

@@ -60,19 +60,18 @@ class JoinSettings:
     iterations_per_tick: Gauss-Newton iterations of `folded`. robust_c: Cauchy's scale on √(χ²/dim)
     of a factor; None for least squares. The scale begins at robust_start · c and is multiplied by
     robust_decay with each iteration until it is c. landmark_gate: χ² of two numbers from which a
-    submap's landmark is discounted by itself, with a robust loss; it narrows with the scale.
+    submap's landmark is discounted, with a robust loss; it narrows with the scale.
     covariance_factor: factor on every submap's covariance. max_iterations, step_tolerance: a full
     solve ends when no unknown changes by more than step_tolerance [m, rad], or after
-    max_iterations. alignment_confidence: quantile of the χ² test that an island must pass before it
-    is merged. alignment_heading_sigma: largest standard deviation [rad] of the heading from the
-    shape of the shared landmarks for a merge of islands. bias_sigma: prior standard deviation of
-    each error that a robot's submaps share. common_bias_sigma: the same for errors that all robots
-    share, in addition to each robot's own. "marker": the share of the range by which all robots
-    measure one landmark too far, for each landmark by itself. joined_ranges: whether errors of
-    ranges are proportional to the range in the joined map (`joining_kernel.with_joined_ranges`).
-    landmark_sigma: standard deviation [m], per direction, of the measured point, the same for all
-    robots, about the landmark's place: part of a map's covariance, not of the measurements'
-    weights. association: thresholds for unnamed landmarks.
+    max_iterations. alignment_confidence: quantile of the χ² test for a merge of islands.
+    alignment_heading_sigma: for the same, largest standard deviation [rad] of the heading from the
+    shape of the shared landmarks. bias_sigma: prior standard deviation of each error that a robot's
+    submaps share. common_bias_sigma: the same for errors that all robots share, in addition;
+    "marker": the share of the range by which all robots measure one landmark too far.
+    joined_ranges: whether errors of ranges are proportional to the range in the joined map
+    (`joining_kernel.with_joined_ranges`). landmark_sigma: standard deviation [m], per direction, of
+    the measured point, the same for all robots, about the landmark's place: part of a map's
+    covariance, not of the measurements' weights.
     """
 
     iterations_per_tick: int = 2

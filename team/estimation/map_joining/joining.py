@@ -142,21 +142,19 @@ class Audit:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """The state of the fold: the islands solved so far, and the bookkeeping of their submaps.
+    """The islands solved so far, and the bookkeeping of their submaps.
 
     home: island (a key of `islands`) of each stream. reasons: why an island other than the main one
-    is not merged, by its frame. joined: record of each merge and its certainty, by the former
-    frame. warnings: signs of another minimum that the full solution found. waiting: inter-robot
-    measurements whose pose nodes are not both in one island, in canonical order. judged: number of
-    submaps of two islands at their last failed merge attempt, and its reason. searched_at: number
-    of submaps of an island at its last failed search for a lower minimum. iterations, change: the
-    number of iterations and the last step [m, rad] of the main island's last full solution.
-    refused: submaps that are not in the map, in canonical order, with the reason (`refusal`).
-    motion_only: submaps of which only the motion is in the map. left_out: inter-robot measurements
-    with which the map has no solution. set_aside: other refusals in words: initial poses,
-    inter-robot measurements, landmarks of submaps. landmarks: which unnamed landmarks of which
-    submaps are one, with the evidence (`associating`). audits: closures that may still be undone
-    (`auditing`).
+    is not merged, by its frame. joined: each merge and its certainty, by the former frame.
+    warnings: signs of another minimum of the full solution. waiting: inter-robot measurements
+    between two islands, in canonical order. judged: number of submaps of two islands at their last
+    failed merge attempt, and its reason. searched_at: number of submaps of an island at its last
+    failed search for a lower minimum. iterations, change: iterations and last step [m, rad] of the
+    main island's last full solution. refused: submaps that are not in the map, in canonical order,
+    with the reason (`refusal`). motion_only: submaps of which only the motion is in the map.
+    left_out: inter-robot measurements with which the map has no solution. set_aside: other refusals
+    in words. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
+    still be undone (`auditing`).
     """
 
     contributions: tuple[Contribution, ...]

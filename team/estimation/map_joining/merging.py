@@ -1,10 +1,9 @@
 """Merge two islands when their common points leave a single likely place of one in the other.
 
-A merge is tried from every place that the shared points propose: from all of them, from the
-landmarks alone, from the inter-robot measurements alone, and at every heading at which the points
-fit well. Each attempt is solved in full, and so is a start independent of them (`minima`). The
-solution of lowest cost is accepted if the two maps agree there and no other place is about as
-likely; else the merge is deferred, with the reason.
+A merge is tried from every place that the shared points propose: all of them, the landmarks alone,
+the inter-robot measurements alone, and every heading at which they fit well. Each is solved in
+full, and so is a start independent of them (`minima`). The solution of lowest cost is accepted if
+the two maps agree there and no other place is about as likely; else the merge is deferred.
 """
 
 from collections.abc import Sequence

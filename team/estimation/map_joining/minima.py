@@ -1,9 +1,8 @@
 """The search for the lowest minimum: one island solved from several starts.
 
 Headings give map joining many minima: after a long way without a landmark Gauss-Newton may fold a
-chain wrongly and stay there. A cost far above its degrees of freedom reveals that; so does another
-start that ends lower. A second minimum of about the same cost is a second map that the same submaps
-allow.
+chain wrongly. A cost far above its degrees of freedom, or another start that ends lower, reveals
+that. A second minimum of about the same cost is a second map that the same submaps allow.
 """
 
 import math
