@@ -162,7 +162,7 @@ class TeamAttendance:
         ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
-            return f"an end that does not know of {', '.join(silent)}"
+            return f"an end without {', '.join(silent)}"
         for name, robot in self.robots.items():
             progress = robot.progress
             last = None if progress is None else ends.get((name, progress.incarnation))

@@ -77,7 +77,7 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     if ways is not None:
         found.append(
             "odometry not calibrated at these speeds: by the ranges, the robots drive "
-            f"{100.0 * ways:+.1f} % farther than it says; taken into account"
+            f"{100.0 * ways:+.1f} % farther than it reports; corrected for"
         )
     return tuple(found)
 

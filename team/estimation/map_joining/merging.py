@@ -78,7 +78,7 @@ def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> M
         with np.errstate(all="ignore"):
             return _merge(main, other, waiting)
     except UNSOLVABLE as error:
-        return Waits(f"can not be solved for: {error}", after_search=True)
+        return Waits(f"cannot be solved for: {error}", after_search=True)
 
 
 def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:

@@ -285,11 +285,11 @@ def warnings(search: Search) -> list[str]:
     found += [
         f"{named(stream)} is placed weakly: its heading is known to {np.degrees(sigma):.0f}° at "
         f"best, {np.degrees(limit):.0f}° needed; the map may be bent by more than its covariance "
-        "says"
+        "allows"
         for stream, sigma in sorted(_heading_sigmas(island).items())
         if sigma > limit
     ]
-    with suppress(*UNSOLVABLE):  # a heading that can not be moved bends nothing
+    with suppress(*UNSOLVABLE):  # a heading that cannot be moved bends nothing
         found += nonlinearity_warnings(island)
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)

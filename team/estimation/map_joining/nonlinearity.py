@@ -132,7 +132,7 @@ def nonlinearity_warnings(island: Island) -> list[str]:
         found = understated_uncertainty(island, node)
         if found is not None:
             texts.append(
-                f"{named(stream)} may have {where} farther off than its covariance says: "
+                f"{named(stream)} may have {where} farther off than its covariance allows: "
                 f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
                 f"covariance {found.chi2:.0f}"
             )
