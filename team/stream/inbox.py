@@ -76,7 +76,7 @@ class Inbox:
             if stream.robot == robot
         }
         if not ends and self.next_measurement:
-            return f"an end that does not know of {robot}"
+            return f"an end without {robot}"
         last = ends.get(self.incarnation)
         if last is not None and last < self.next_measurement:
             return (
