@@ -39,8 +39,8 @@ Tail = Literal["final", "closed", "provisional"]
 PRIOR_LANDMARKS = 30
 """Most landmarks in a robot's prior: the nearest ones."""
 CONFIRMED_BY = 2
-"""Least number of submaps of a landmark without identity in the final map: a few false detections
-in a row look like a landmark in one window. Running maps show tentative ones, too.
+"""Least submaps of an unnamed landmark in the final map: a few false detections in a row look like
+a landmark in one window. Running maps show tentative ones, too.
 """
 NAMED = 10
 """Most names in a list of omitted landmarks, refusals, or robots of an island."""
@@ -171,7 +171,7 @@ def reasons(
     *,
     final: bool,
 ) -> tuple[str, ...]:
-    """List the reasons why robots and landmarks are not in the map, and warnings about it."""
+    """List why robots and landmarks are not in the map, and warnings about it."""
     return (
         *_apart(fold),
         *_worded(refusals(fold)),

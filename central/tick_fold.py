@@ -55,7 +55,7 @@ from team.wire.messages import SightingFactor, Submap
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""
 GROWTH = 1.25
-"""Growth of the number of submaps after which suspects that were not withdrawn are tested again."""
+"""Growth of the set after which suspects that were not withdrawn are tested again."""
 FULL_UNNAMED = 1000
 """Most submaps without landmark names for which the full solution folds all ticks again, since the
 ticks decide which observations are one landmark. With more, which would take hours, it starts from
@@ -151,7 +151,7 @@ class TickFold:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
 
     def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
-        """Fold the ticks from this one on again, with other robots withdrawn if there are any."""
+        """Fold the ticks from this one on again, without withdrawn robots."""
         until_ns = self._until_ns
         if math.isfinite(tick):
             self._roll_back(tick)
@@ -211,7 +211,7 @@ class TickFold:
         return folded
 
     def _open_ticks(self, watermark_ns: float = math.inf) -> list[int]:
-        """List the ticks up to the watermark that are not folded, withdrawn robots left out."""
+        """List the unfolded ticks up to the watermark, withdrawn robots left out."""
         ticks = self._inputs.ticks_after(self.checkpoints.tick, self._gone)
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
@@ -305,7 +305,7 @@ class TickFold:
         return hold_trial(self._agreement_at_rest(fold), limit, without)
 
     def _agreement_at_rest(self, fold: Fold) -> Agreement:
-        """Return the agreement of a raw fold's full solution, of a condensed one as it is."""
+        """Return the agreement of a raw fold's full solution, or of a condensed fold as it is."""
         at_rest = fold if fold.condensed_count else converged(fold, self.settings)
         return marginals.joint_cost(at_rest)
 
@@ -393,7 +393,7 @@ class TickFold:
 
     @property
     def raised(self) -> Mapping[str, int]:
-        """By robot, number of folded submaps whose covariance was raised to the least one."""
+        """Number of folded submaps with a raised covariance, by robot."""
         return self._inputs.raised(self._gone)
 
     # The names of a fold.

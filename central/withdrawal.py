@@ -21,8 +21,8 @@ from statistics import median
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""Least number of submaps of a robot for a median over all of them, and for its withdrawal before
-the final map; with fewer it is suspended.
+"""Least submaps of a robot for a median over all of them, and for its withdrawal before the final
+map.
 """
 NEWEST, MOST_OF = 4, 3
 """With fewer submaps a robot is judged by its newest ones: the disagreement that MOST_OF of NEWEST

@@ -321,8 +321,8 @@ def patch_step(profile: AssociationProfile) -> int:
 
 
 def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None:
-    """Search an island for a closure of a stream's submaps up to `last`; its pairs are indices in
-    the view.
+    """Search an island for a closure of a stream's submaps up to `last`; pairs are indices in the
+    view.
     """
     profile = view.profile
     submaps = view.find_latest(stream, last)

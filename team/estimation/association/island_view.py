@@ -42,8 +42,8 @@ from team.estimation.contribution import Observation, Stream
 COMPARED = 6
 """Number of submaps that one submap is compared with: those with the most candidates."""
 REEXAMINED = 8
-"""Number of older submaps with undecided landmarks that a tick examines again: the newest half, and
-the others by turns.
+"""Number of older undecided submaps that a tick examines again: the newest half, others by
+turns.
 """
 REEXAMINED_WITHIN = 10.0
 """Distance in object radii between undecided landmarks of an older submap and the tick's within
@@ -170,7 +170,7 @@ class IslandView:
         ]
 
     def record_merges(self, found: MergedPairs, kind: str) -> None:
-        """Record the pairs that a step (`kind`) merged, and the joint Gaussian given them."""
+        """Record the pairs merged by a step (`kind`), and the joint Gaussian given them."""
         self.joint = found.joint
         for pair in found.pairs:
             tie = MergeRecord(
@@ -233,8 +233,8 @@ class IslandView:
             self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:
-        """Merge pairs of submap k and each other submap on which all likely joint assignments of
-        the two agree.
+        """Merge pairs of submap k and each other submap on which all likely joint assignments
+        agree.
         """
         own = self._resolve(self.submaps[k].unnamed)
         others = self.sees.copy()

@@ -33,8 +33,8 @@ from team.estimation.association.gating import (
 PREGATE = 4.0
 """Multiple of the gate beyond which a pair is excluded for good."""
 SURE_AFTER = 3
-"""Number of pairs after which an alignment grows only by pairs of small standard deviation: others
-connect landmarks to neighbours one spacing off.
+"""Number of pairs after which an alignment grows only by pairs of small standard deviation, since
+others connect landmarks one spacing off.
 """
 MOST_ASSIGNED = 10
 """Number of landmarks that are assigned together: those with the most certain candidates."""

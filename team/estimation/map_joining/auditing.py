@@ -19,7 +19,7 @@ from team.estimation.map_joining.refusal import add_members
 
 
 def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Fold one tick: add its members, then undo the closures that they contradict."""
+    """Fold one tick: add its members, then undo closures that they contradict."""
     if tick.verdicts:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
@@ -27,7 +27,7 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Undo a closure that the tick between two folds contradicts; else extend the audits by it."""
+    """Undo a closure that the tick between two folds contradicts, else extend its audit."""
     if not after.landmarks.opened and not fold.audits:
         return after
     length = settings.association.audited

@@ -131,7 +131,7 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
 
 
 def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
-    """Attach the memory, numbered as in the graph before, to the condensed island."""
+    """Attach the memory, numbered as in the graph before."""
     graph = smaller.graph
     node_of = np.full(len(before.fixed), -1, np.int64)
     for id_, node in before.landmarks.items():
@@ -143,9 +143,7 @@ def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: boo
 
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
-    """Mark the submaps to condense: more than `lag` before their stream's last, at their final
-    robust scale.
-    """
+    """Mark the submaps to condense: `lag` or more behind, at their final robust scale."""
     graph, c = island.graph, island.settings.robust_c
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
     narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c

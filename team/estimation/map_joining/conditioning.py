@@ -230,7 +230,7 @@ def _disputed(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
 
 
 def is_majority(refused: int, known: int) -> bool:
-    """Whether so many known landmarks are refused that the fault is not with single landmarks."""
+    """Whether so many known landmarks are refused that the fault is not in single ones."""
     return refused >= FEWEST and 2 * refused > known
 
 

@@ -100,7 +100,7 @@ class NotDeterminedError(ValueError):
 
 
 UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
-"""Exceptions of a solve where the numbers allow no solution: a case to decide on, not a defect."""
+"""Exceptions of a solve without a solution: a case to decide on, not a defect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class Island:
 
     @cached_property
     def landmark_weight(self) -> Float[np.ndarray, " B"]:
-        """Weight of each landmark of each submap: 1 up to its gate, 1 without a robust loss."""
+        """Weight of each landmark of each submap: 1 up to its gate or without a robust loss."""
         chi2, gate = self._landmark_chi2_and_gate
         weight, beyond = np.ones(len(chi2)), chi2 > gate
         weight[beyond] = np.maximum(gate[beyond] / chi2[beyond], LEAST_WEIGHT)
@@ -378,7 +378,7 @@ class Island:
 
     @cached_property
     def resting_points(self) -> Float[np.ndarray, "L 2"]:
-        """The positions [m] of the landmarks at rest; for islands that have some."""
+        """Positions [m] of the landmarks at rest, if there are some."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -388,7 +388,7 @@ class Island:
 
     @cached_property
     def boundary_covariance(self) -> Float[np.ndarray, "n n"]:
-        """The joint covariance of the condensed factor's nodes, if there is such a factor."""
+        """Joint covariance of the condensed factor's nodes, if there is one."""
         graph, old = self.graph, self.graph.condensed
         assert old is not None
         return symmetric_of(
@@ -414,7 +414,7 @@ class Island:
 
     @cached_property
     def resting_blocks(self) -> Float[np.ndarray, "L 2 2"]:
-        """The covariance [m²] of each landmark at rest; for islands that have some."""
+        """Covariance [m²] of each landmark at rest, if there are some."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -431,7 +431,7 @@ def aged(island: Island, iterations: int | None) -> Island:
 
 
 def final_cost(island: Island) -> float:
-    """Evaluate the cost with every robust scale at its final value, for comparison of islands."""
+    """Evaluate the cost with final robust scales, for comparison of islands."""
     return aged(island, FULL_AGE).cost
 
 

@@ -90,7 +90,7 @@ class NotCanonicalError(ValueError):
 
 
 class GapError(ValueError):
-    """Submaps of a stream are missing before this one, so the graph lacks its start pose."""
+    """Submaps of a stream are missing before this one."""
 
     def __init__(self, contribution: Contribution, expected: int) -> None:
         super().__init__(
@@ -131,9 +131,7 @@ class Tick:
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """A closure that may still be undone: the fold before it, and the ticks since, its own
-    included.
-    """
+    """A closure that may still be undone: the fold before it, and the ticks from it on."""
 
     opened: Opened
     before: "Fold"
@@ -366,8 +364,7 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
 
 
 def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
-    """Merge islands while any two can be merged, into the one with known initial poses or the
-    smallest frame.
+    """Merge islands while any two can be merged, into the main one or the smallest frame.
 
     A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
     """

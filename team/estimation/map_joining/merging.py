@@ -37,9 +37,7 @@ class Merge(NamedTuple):
 
 
 class Waits(NamedTuple):
-    """The reason for two separate islands; after_search: whether it took a (slow) search over
-    places.
-    """
+    """Why two islands stay separate; after_search: whether it took a (slow) search over places."""
 
     why: str
     after_search: bool
@@ -53,9 +51,7 @@ def ages(count: int) -> Int64[np.ndarray, " count"]:
 def sighted(
     island: Island, waiting: Sequence[InterRobotFactor]
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """Add the inter-robot measurements between an island's own pose nodes; return the remaining
-    ones.
-    """
+    """Add the inter-robot measurements within an island; return the remaining ones."""
     candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
     found = [between for _, between in candidates if between is not None]
     if not found:
@@ -137,7 +133,7 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
-    """Word the reason to defer a merge: another place is about as likely."""
+    """Word the reason to defer a merge with two likely places."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
         f"{shared} leave two places {elementwise.hypot(away[0], away[1]):.1f} m apart: "
@@ -146,7 +142,7 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
 
 
 def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
-    """Describe the ties by which an island was merged, and the certainty of its place."""
+    """Describe the ties of a merged island, and the certainty of its place."""
     node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
     sigma_m = deviation(covariance[0, 0] + covariance[1, 1])

@@ -65,8 +65,8 @@ class Minimum(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The lowest minimum; its distance in cost below that of the first start, and below a second
-    minimum (None where none was found).
+    """The lowest minimum; its cost below the first start's, and below a second minimum (None
+    without).
     """
 
     best: Minimum
@@ -183,9 +183,7 @@ def _mirrored(island: Island) -> Iterator[Island]:
 
 
 def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
-    """List pairs of landmarks, by their indices in the state, that a stream observes in
-    succession.
-    """
+    """List pairs of landmarks, by index in the state, that a stream observes in succession."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
     for submap in graph.submaps:
