@@ -118,7 +118,7 @@ class TeamAttendance:
 
     @property
     def is_live(self) -> bool:
-        """Whether drivers, each with its own end, publish the measurements, instead of a world."""
+        """Whether drivers, not a world, publish the measurements and ends."""
         return self.ordered or self._has_head
 
     @property
@@ -158,11 +158,15 @@ class TeamAttendance:
         )
 
     def contradicts(self, end: m.End) -> str | None:
-        """Give the reason why this cannot be the end of the team's streams; None if it can."""
+        """Give the reason why this cannot be the end of the team's streams, if any."""
         ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
+<<<<<<< HEAD
             return f"an end that omits {', '.join(silent)}"
+=======
+            return f"an end without {', '.join(silent)}"
+>>>>>>> refs/heads/lang-est
         for name, robot in self.robots.items():
             progress = robot.progress
             last = None if progress is None else ends.get((name, progress.incarnation))
@@ -294,8 +298,8 @@ class TeamAttendance:
         return progress.stamp_ns
 
     def _is_away(self, robot: Attendance) -> bool:
-        """Whether a robot of a live team has not begun or has no driver; its later messages roll
-        the fold back.
+        """Whether a robot of a live team has not begun or has no driver; late messages roll the
+        fold back.
         """
         if not self.is_live:
             return False

@@ -1,12 +1,11 @@
 """Find where a withdrawn robot was carried off, or slipped, and by how much.
 
 Each submap of the robot that shares enough named landmarks with the map of the others is aligned to
-that map twice: in the frame of its start pose, and in that of its end pose. The end of one submap
-and the start of the next are one pose: a seam. A robot that was carried off contradicts the map at
-exactly one seam; before and after it every submap fits the map and every seam is closed. A wrong
-sensor or odometry deforms the submaps, or opens many seams: then nothing is found.
-
-A submap absorbs a small motion shortly before its end: the seam after it shows only a part.
+it in the frame of its start pose and in that of its end pose. The end of one submap and the start
+of the next are one pose: a seam. A robot that was carried off contradicts the map at exactly one
+seam; every submap fits the map and every other seam is closed. A wrong sensor or odometry deforms
+the submaps, or opens many seams: then nothing is found. A submap absorbs a small motion shortly
+before its end: the seam after it shows only a part.
 """
 
 import math

@@ -41,29 +41,27 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fusion rule and its parameters.
 
     fusion: `join` joins submaps by least squares; `team.pairs` lists the inputs of the others.
-    Under rules with feedback the robots absorb the map again: their covariance counts measurements
-    more than once, save that of `covariance-intersection`. tick_s: span of team time that is folded
-    at once. broadcast_s: least team time between two broadcasts of the map. robust_c: scale of the
-    Cauchy loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2) of each measurement (a
-    range and a bearing); absent: plain squares. landmark_submaps: number of consistent submaps that
-    a landmark needs to enter the map; above 1 where outliers are expected. covariance_factor:
-    scales the submaps' covariances; 1 for errors independent from measurement to measurement.
-    normal_scale: the monitor's covariance scale where the covariances are right: 1 where the errors
-    of windows are independent; less where part of them outlasts a window, since a common error of
-    two windows does not show in their difference. particles: of `joint-fastslam`. bias_sigma: of
-    the errors whose sensitivities robots send. common_bias_sigma: of the part of them that all
-    robots share, in addition. joined_ranges: for errors proportional to the range, weight a
-    submap's landmarks by the range in the joined map: weighted by the measured range, short
-    measurements weigh more and the map shrinks. landmark_sigma [m]: standard deviation, per
+    Under rules with feedback the robots' covariance counts measurements more than once, save that
+    of `covariance-intersection`. tick_s: span of team time that is folded at once. broadcast_s:
+    least team time between two broadcasts of the map. robust_c: scale of the Cauchy loss on
+    sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2) of each measurement (a range and a
+    bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a landmark
+    needs to enter the map; above 1 where outliers are expected. covariance_factor: scales the
+    submaps' covariances; 1 for errors independent from measurement to measurement. normal_scale:
+    the monitor's covariance scale where the covariances are right: 1 where the errors of windows
+    are independent; less where part of them outlasts a window. particles: of `joint-fastslam`.
+    bias_sigma: of the errors whose sensitivities robots send. common_bias_sigma: of the part of
+    them that all robots share, in addition. joined_ranges: for errors proportional to the range,
+    weight a submap's landmarks by the range in the joined map: weighted by the measured range,
+    short measurements weigh more and the map shrinks. landmark_sigma [m]: standard deviation, per
     direction, of the measured point of a landmark, the same for all robots, about the landmark's
-    own place (the front of a cylinder, a marker beside its post); added to the covariance of each
-    landmark of the map. withdraw_above: a robot is withdrawn if the cost of the team's submaps per
-    degree of freedom is above this with it, and the rest of the team agrees without it and without
-    no other robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of
-    one submap's estimate; one below them has its covariance raised by them, and is named; 0: none.
-    bounds: submaps, inter-robot measurements and initial poses beyond them are refused.
-    association: thresholds for merging landmarks without identities: a profile for each kind of
-    sensor.
+    place (the front of a cylinder, a marker beside its post); added to the map's covariance of each
+    landmark. withdraw_above: a robot is withdrawn if the cost of the team's submaps per degree of
+    freedom exceeds this with it, and the rest of the team agrees without it and without no other
+    robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of one
+    submap; one below them has its covariance raised by them, and is named; 0: none. bounds:
+    submaps, inter-robot measurements and initial poses beyond them are refused. association:
+    thresholds for merging landmarks without identities, by kind of sensor.
     """
 
     fusion: FusionRule = "join"

@@ -51,17 +51,13 @@ class FoldInputs:
         return min((tick for tick in ticks if tick is not None), default=math.inf)
 
     def _tick_judging(self, verdict: Verdict) -> int | None:
-        """Return the first tick by which both landmarks' submaps have arrived; None while one is
-        missing.
-        """
+        """Return the first tick with both landmarks' submaps; None while one is missing."""
         ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
         known = [tick for tick in ticks if tick is not None]
         return max(known) if len(known) == len(ticks) else None
 
     def first_tick_of(self, robot: str) -> float:
-        """Return the first tick with a submap of a robot or an inter-robot measurement of it, else
-        infinity.
-        """
+        """Return the first tick with a submap or a measurement of a robot, else infinity."""
         ticks = self._members.behind(-math.inf)
         return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
 

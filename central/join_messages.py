@@ -39,8 +39,8 @@ Tail = Literal["final", "closed", "provisional"]
 PRIOR_LANDMARKS = 30
 """Most landmarks in a robot's prior: the nearest ones."""
 CONFIRMED_BY = 2
-"""Least number of submaps of a landmark without identity in the final map: a few false detections
-in a row look like a landmark in one window. Running maps show tentative ones, too.
+"""Least submaps of an unnamed landmark in the final map: a few false detections in a row look like
+a landmark in one window. Running maps show tentative ones, too.
 """
 NAMED = 10
 """Most names in a list of omitted landmarks, refusals, or robots of an island."""
@@ -123,11 +123,10 @@ def _landmarks(
 class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
-    undecided: left out, since each may be the same as a landmark that is shown. weak: left out,
-    since only submaps of a poorly known heading observed them. missed: left out, since nearly all
-    submaps that look there miss them. headings: largest heading standard deviation [rad] of each
-    stream that was lost. repeated: parts of the map that repeat others; their landmarks are left
-    out.
+    Left out: undecided, possible duplicates of a shown one; weak, observed only by submaps of a
+    poorly known heading; missed, by nearly all submaps that look there; those of `repeated`, parts
+    of the map that repeat others. headings: largest heading standard deviation [rad] of each lost
+    stream.
     """
 
     ids: Sequence[int] = ()
@@ -172,7 +171,7 @@ def reasons(
     *,
     final: bool,
 ) -> tuple[str, ...]:
-    """List the reasons why robots and landmarks are not in the map, and warnings about it."""
+    """List why robots and landmarks are not in the map, and warnings about it."""
     return (
         *_apart(fold),
         *_worded(refusals(fold)),

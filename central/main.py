@@ -21,8 +21,7 @@ from team.wire.patience import Patience
 LOST_S = 3.0
 """Time [s] after which a lost robot delays no broadcast; the final map still waits for it."""
 FRESH_SHARE = 1.0 / 3.0
-"""Share of the time for maps that are not due, so that a due map waits for at most two
-solutions."""
+"""Share of the time for maps that are not due: a due map waits for at most two solutions."""
 FAREWELL_S = 10.0
 """Longest delay [s] of the centre's exit after its final map: it leaves after the others."""
 ORDERS_S = 30.0
@@ -104,9 +103,7 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Restore the set that an earlier process has stored, so that robots need not send it
-        again.
-        """
+        """Restore the set of an earlier process."""
         if self._stored is None or not self._shell.going:
             return
         stored = self._stored.samples()
@@ -204,9 +201,7 @@ class CentralShell:
             self._bus.request(ch.SENT, stream[0], requested[stream])
 
     def _leave_last(self) -> None:
-        """Wait until robots and world have left at the final map, since one that missed it may
-        request it.
-        """
+        """Wait until all have left, since one that missed the final map may request it."""
         deadline = time.monotonic() + FAREWELL_S
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._shell.note(self._patient(self._bus.receive(WAIT_S)))

@@ -17,8 +17,8 @@ from team.wire import messages as m
 from team.wire.bus import Outgoing
 
 PATIENCE = 3.0
-"""Number of broadcasts, or of ticks where these are longer, after which a provisional map is
-published despite a stalled robot.
+"""Broadcasts, or ticks if longer, after which a provisional map is published despite a stalled
+robot.
 """
 
 
@@ -88,8 +88,7 @@ class MapPublisher:
         """Publish the map of the closed ticks, or of the whole set if that has more submaps.
 
         A teammate's new submap helps most the robots that measure the same landmarks, so it need
-        not wait for the end of its tick. No map has less than the one before it: submaps ahead of
-        the watermark are in a provisional map but not yet in a closed one.
+        not wait for the end of its tick. No map has less than the one before it.
         """
         ticks_end_ns = closed_ns
         if math.isfinite(closed_ns):  # a tick has the submaps that end in (a, b]
@@ -119,9 +118,7 @@ class MapPublisher:
     # Version vectors.
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
-        """Return the last submap of each stream that ends up to a time, without the robots left
-        out.
-        """
+        """Return the last submap of each stream up to a time, without the robots left out."""
         left_out = self._left_out
         lasts = (
             (stream, bisect_right(chain, until_ns, key=_end_ns) - 1)

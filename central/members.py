@@ -74,7 +74,7 @@ class Members:
         return any(key[1] not in gone for key in self._ticks[tick])
 
     def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
-        """List the submaps of a tick in canonical order, without those of withdrawn robots."""
+        """List the submaps of a tick in canonical order, without withdrawn robots."""
         return sorted(key for key in self._ticks[tick] if key[1] not in gone)
 
     def contribution(self, key: Key) -> Contribution:
@@ -90,7 +90,7 @@ class Members:
         return found
 
     def raised(self, gone: Collection[str]) -> Mapping[str, int]:
-        """Count, by robot, the decoded submaps whose covariance was below the least one."""
+        """Count, by robot, the decoded submaps with a raised covariance."""
         robots = sorted(key[1] for key in self._raised if key[1] not in gone)
         return Counter(robots)
 

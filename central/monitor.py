@@ -1,12 +1,11 @@
 """The consistency monitor: tests the robots' covariances by their submaps, without the truth.
 
-Two figures, both 1 where every covariance is right. The joint cost per degree of freedom is the
-minimised quantity; it is sharp (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2),
-but a robust loss bounds it, since it down-weights large terms as outliers. The covariance scale is
-the median of the submaps' unweighted χ² relative to its expectation: no loss bounds it, a minority
-of outliers does not change it, and it also shows covariances that are too large. docs/decisions/22
-has its distribution. With few degrees of freedom both scatter, so a warning needs a level that
-chance alone reaches less than once in a thousand.
+Two figures, both 1 where every covariance is right. The joint cost per degree of freedom is sharp
+(1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but a robust loss bounds it. The
+covariance scale, the median of the submaps' unweighted χ² relative to its expectation
+(docs/decisions/22), is unbounded, insensitive to a minority of outliers, and also shows covariances
+that are too large. With few degrees of freedom both scatter, so a warning needs a level that chance
+alone reaches less than once in a thousand.
 """
 
 import math
@@ -78,7 +77,7 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     if ways is not None:
         found.append(
             "odometry not calibrated at these speeds: by the ranges, the robots drive "
-            f"{100.0 * ways:+.1f} % farther than it says; taken into account"
+            f"{100.0 * ways:+.1f} % farther than it reports; corrected for"
         )
     return tuple(found)
 

@@ -96,8 +96,8 @@ class CentralNode:
     # Receive.
 
     def refusal(self, message: m.Message) -> str | None:
-        """Give the reason why a message cannot be true of this team: its robots, counters, stamps
-        or end.
+        """Give the reason why a message cannot be true of this team: robots, counters, stamps or
+        end.
         """
         self._admit(message)
         refused = self._door.refusal(message)
@@ -139,9 +139,9 @@ class CentralNode:
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue after an exception in the handling of a message, and give its sender the credit.
 
-        A member that could not be filed counts as refused. If a running map raises, the final one
-        is unaffected; if the final one raises, the newest computable map replaces it, provisional
-        and with the reason.
+        A member that could not be filed counts as refused. A running map that raises does not
+        affect the final one, which the newest computable map replaces if it raises, provisional and
+        with the reason.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)
@@ -185,8 +185,8 @@ class CentralNode:
         return self._credit_of(sighting, count) if count > before else []
 
     def _refuse(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Mark a submap as refused if its handling, or that of an inter-robot measurement from it,
-        raised, so that it holds up nothing.
+        """Mark a submap as refused if its handling, or that of its inter-robot measurements,
+        raised.
         """
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
@@ -199,7 +199,7 @@ class CentralNode:
             self.warnings.append(f"refused: {reason}")
 
     def _credit_of(self, member: m.Submap | m.SightingFactor, count: int) -> list[Outgoing]:
-        """Make the message that this many submaps of a member's stream need not be sent again."""
+        """Acknowledge this many submaps of a member's stream."""
         progress = m.Progress(
             stamp_ns=self.attendance.now_ns,
             node="central",
@@ -250,7 +250,7 @@ class CentralNode:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """Make a map of the whole set, if the last one lacks a member, when there is time."""
+        """Make a map of the whole set when there is time, if the last one lacks a member."""
         return [] if self.finished else self._counted(self.publish_newest())
 
     # Conclude.

@@ -2,11 +2,10 @@
 
 A robot joins its last prior with its own later submaps, so a new prior is worth its bytes only for
 information from teammates (moved landmarks, inter-robot measurements), or for landmarks that it
-comes near to. Priors are most of the centre's traffic; in a map that does not change, most of them
-contain nothing new.
+comes near to. Priors are most of the centre's traffic.
 
-A robot outside the team's map gets one message that withdraws its earlier priors; a restarted
-centre, which has sent none, sends it, too.
+A robot outside the team's map gets one message that withdraws its earlier priors, also from a
+restarted centre, which has sent none.
 """
 
 from collections.abc import Iterable, Sequence

@@ -107,7 +107,7 @@ class SubmapFold:
         return self._messages(ticks, fold, tail, recorded)
 
     def _file_members(self) -> None:
-        """Add the store's new members to the ticks; a folded tick is folded again with them."""
+        """Add the store's new members to the ticks; folded ticks are folded again."""
         store, ticks = self.store, self._ticks
         for robot in sorted(store.withdrawals.keys() - self._without):
             ticks.withdraw_robot(robot)
@@ -207,7 +207,7 @@ class SubmapFold:
     def _streams_for_priors(
         self, fold: Fold, fused: m.FusedMap, shown: Sequence[int]
     ) -> Collection[Stream]:
-        """Select the latest stream of each robot with news, to publish its prior with a map."""
+        """Select the latest stream of each robot whose prior has news."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
         for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
@@ -218,7 +218,7 @@ class SubmapFold:
         return self._sent_priors.worth(fold, streams, shown)
 
     def _receivable(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """Keep the messages that every receiver accepts; withhold others with a warning."""
+        """Withhold messages that not every receiver accepts, with a warning."""
         accepted = []
         for each in out:
             why = unsound(each.message)

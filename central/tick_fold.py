@@ -8,17 +8,16 @@ tick has arrived, so the fold is final.
                                    │ without the robot    └────fold─────┤
                                    └── Conviction <── agreement(fold) <─┘
 
-There are three pieces of state, each with one owner. The inputs depend on no fold. The checkpoints
-are a stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back to the last
-checkpoint before it, and the ticks are folded again. The conviction, the robots that contradict the
-rest beyond chance (`central.withdrawal`), is replaced as a whole; a change folds all ticks again
-without these robots. Agreement is tested after the first tick of each broadcast's time and after
-the full solution, so a withdrawal depends on the set alone, not on order or time of arrival.
+Each of the three pieces of state has one owner. The inputs depend on no fold. The checkpoints are a
+stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back, and the ticks are
+folded again. The conviction, the robots that contradict the rest beyond chance
+(`central.withdrawal`), is replaced as a whole; a change folds all ticks again without these robots.
+Agreement is tested after the first tick of each broadcast's time and after the full solution, so a
+withdrawal depends on the set alone, not on order or time of arrival.
 
-A robot with few submaps is suspended: running maps leave it out at once, so that it does not move
-its teammates' poses, but it is withdrawn only once it has enough of them, or by the full solution.
-Until then it is tested again, with all its submaps, whenever the set has grown by GROWTH. A
-provisional map is tested by itself.
+A robot with few submaps is suspended: running maps leave it out at once, but it is withdrawn only
+once it has enough of them, or by the full solution. Until then it is tested again, with all its
+submaps, whenever the set has grown by GROWTH. A provisional map is tested by itself.
 
 The running fold is bounded (`condensing`): its old submaps are condensed before each tick. A tick
 that contradicts them is folded with all of them restored (`relinearising`), and so is the full
@@ -56,7 +55,7 @@ from team.wire.messages import SightingFactor, Submap
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""
 GROWTH = 1.25
-"""Growth of the number of submaps after which suspects that were not withdrawn are tested again."""
+"""Growth of the set after which suspects that were not withdrawn are tested again."""
 FULL_UNNAMED = 1000
 """Most submaps without landmark names for which the full solution folds all ticks again, since the
 ticks decide which observations are one landmark. With more, which would take hours, it starts from
@@ -152,7 +151,7 @@ class TickFold:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
 
     def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
-        """Fold the ticks from this one on again, with other robots withdrawn if there are any."""
+        """Fold the ticks from this one on again, without withdrawn robots."""
         until_ns = self._until_ns
         if math.isfinite(tick):
             self._roll_back(tick)
@@ -212,7 +211,7 @@ class TickFold:
         return folded
 
     def _open_ticks(self, watermark_ns: float = math.inf) -> list[int]:
-        """List the ticks up to the watermark that are not folded, withdrawn robots left out."""
+        """List the unfolded ticks up to the watermark, withdrawn robots left out."""
         ticks = self._inputs.ticks_after(self.checkpoints.tick, self._gone)
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
@@ -306,7 +305,7 @@ class TickFold:
         return hold_trial(self._agreement_at_rest(fold), limit, without)
 
     def _agreement_at_rest(self, fold: Fold) -> Agreement:
-        """Return the agreement of a raw fold's full solution, of a condensed one as it is."""
+        """Return the agreement of a raw fold's full solution, or of a condensed fold as it is."""
         at_rest = fold if fold.condensed_count else converged(fold, self.settings)
         return marginals.joint_cost(at_rest)
 
@@ -394,7 +393,7 @@ class TickFold:
 
     @property
     def raised(self) -> Mapping[str, int]:
-        """By robot, number of folded submaps whose covariance was raised to the least one."""
+        """Number of folded submaps with a raised covariance, by robot."""
         return self._inputs.raised(self._gone)
 
     # The names of a fold.

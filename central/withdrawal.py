@@ -2,16 +2,15 @@
 
 A robot's disagreement is the larger of two figures, both near or below 1 where its covariances are
 right, each counted where it is beyond chance: its share of the joint cost per degree of freedom,
-and the χ²/dof that most of its submaps exceed. The first detects a single contradiction that enters
-the map at full weight, but a robust loss bounds it; the second detects a robot whose submaps
-disagree in the majority: over all of them if there are many, over the newest ones if there are few.
+and the χ²/dof that most of its submaps exceed, the newest ones if it has few. The first detects a
+single contradiction at full weight, but a robust loss bounds it; the second detects a robot whose
+submaps disagree in the majority.
 
 One wrong robot distorts the map and makes others disagree, too; one with overconfident covariances,
-or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement.
-Each robot is left out in turn, which compares the joint cost of the rest with and without it in
-whatever frame the rest has: a robot is withdrawn only if the rest agree without it, and without no
-other. Two robots that contradict each other, and no third, are reported and both stay, unless one
-of them contradicts itself when alone.
+or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement:
+each is left out in turn, and withdrawn only if the rest agree without it, and without no other. Two
+robots that contradict each other, and no third, are reported and both stay, unless one of them
+contradicts itself when alone.
 """
 
 import math
@@ -22,8 +21,8 @@ from statistics import median
 from team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
-"""Least number of submaps of a robot for a median over all of them, and for its withdrawal before
-the final map; with fewer it is suspended.
+"""Least submaps of a robot for a median over all of them, and for its withdrawal before the final
+map.
 """
 NEWEST, MOST_OF = 4, 3
 """With fewer submaps a robot is judged by its newest ones: the disagreement that MOST_OF of NEWEST

@@ -4,7 +4,7 @@ The set holds submaps, the inter-robot measurements from them, initial poses, or
 robot, and an operator's verdicts on landmarks. A submap is complete when all inter-robot
 measurements that it announces are stored. Admission enforces law 1: a submap whose measurements
 overlap another's, or that differs from a stored one of the same name, is refused with the reason.
-The centre, a peer's fold and the verification fold the same class.
+Centre, peers and verification use the same class.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

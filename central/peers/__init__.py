@@ -9,8 +9,7 @@
       ├──> PeerNode                   the set, and requests between peers     team/peers
       └──> PeerFold ──> CentralNode   the fold: attendance, maps, priors      fold.py, central
 
-Calls go down only, and messages are returned. The estimator receives a measurement; its submap
-enters the set and is published; the fold reads the set's new members and passes them to its own
-centre's node; the map is published under the peer's name, and the estimator uses the prior for
-`team/pose`. The three nodes are independent, except that the fold reads the set.
+Calls go down only, and messages are returned. The estimator's submaps enter the set and are
+published; the fold reads the set's new members; its map is published under the peer's name, and the
+estimator uses its prior for `team/pose`. The three nodes are otherwise independent.
 """

@@ -2,9 +2,9 @@
 messages.
 
 Its maps are the centre's, byte for byte, wherever the set is the same. The fold restarts where a
-folded member changes (a robot contradicts itself), or where the set grows after the final map. For
-a changed member it does so when there is time, or once the set is complete, so that a robot that
-keeps contradicting itself does not block its peers.
+folded member changes (a robot contradicts itself), or where the set grows after the final map; for
+a changed member only when there is time, or once the set is complete, so that a robot that keeps
+contradicting itself does not block its peers.
 """
 
 import hashlib

@@ -22,7 +22,7 @@ from team.wire import messages as m
 from team.wire.bus import Bus, Tap
 
 LINGER_S = 5.0
-"""Time [s] for which a robot stays once all others have concluded, so that they receive its own
+"""Time [s] for which a robot stays once all have concluded, so that others receive its
 conclusion.
 """
 FRESH_SHARE = 0.2
@@ -133,8 +133,8 @@ class PeerShell(RobotShell):
         self._peer.finished = self._may_leave(now)
 
     def _log_carried(self) -> None:
-        """Log members that others have forwarded, under their first publisher's name, so that the
-        log proves the robot's maps, and logs of a team can be merged.
+        """Log forwarded members under their first publisher's name: the log proves the robot's
+        maps, and logs of a team can be merged.
         """
         members, self._peer.carried = self._peer.carried, []
         self._log(members)

@@ -211,8 +211,8 @@ class Peer:
         return [] if self.newest is None else [encoded(self.newest)]
 
     def set_figures(self) -> dict[str, float]:
-        """Figures of the set: its size, newest submap by robot, sources, and the peers with the
-        same set.
+        """Figures of the set: size, newest submap by robot, sources, and peers with the same
+        set.
         """
         replica = self.peer.replica
         figures = {

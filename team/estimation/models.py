@@ -182,14 +182,17 @@ def increment_of(
 def course_of(model: CourseModel, duration_s: float, forward: float, yaw_rate: float) -> Course:
     """Compute the path length [m] and turn [rad] of an interval, and their `_variances`.
 
-    With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below), ω =
-    clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the path length d = sign(v) max(|v| − turn_drag·|ω|,
-    0)·t, the turn φ = ω t + veer·d and the noises a (forward, on d), b (turn, on φ), c (final
-    turn), l (lateral): all others: Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al.
-    table 5.3 and Ma & Ma eq. 1-4, with its limit φ → 0. "turn-then-drive": turn φ + b, drive d + a,
-    then (0, l, c): the thesis, section 4.3.1. Each variance is the density's per_s² t + per_m² |d|
-    + per_rad² |φ|, plus the terms of `_of_alphas`, `_of_wheels` and the shares; only the wheels
-    correlate a and b.
+    With v = forward_scale·forward (slow_scale·forward where |forward| < slow_below),
+    ω = clip(yaw_scale·yaw_rate, ±yaw_rate_limit), the path length
+    d = sign(v) max(|v| − turn_drag·|ω|, 0)·t, the turn φ = ω t + veer·d and the noises a (forward,
+    on d), b (turn, on φ), c (final turn), l (lateral), the motion is
+
+    - "turn-then-drive": turn φ + b, drive d + a, then (0, l, c): the thesis, section 4.3.1;
+    - all others: Exp(d + a, 0, φ + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma &
+      Ma eq. 1-4, with its limit φ → 0.
+
+    Each variance is the density's per_s² t + per_m² |d| + per_rad² |φ|, plus the terms of
+    `_of_alphas`, `_of_wheels` and the shares; only the wheels correlate a and b.
     """
     rate = _clipped(model.yaw_scale * yaw_rate, model.yaw_rate_limit)
     lost = model.turn_drag * abs(rate) * duration_s

@@ -1,10 +1,9 @@
 """A sensor mounted off the origin of the robot's base.
 
-The front end follows the sensor: within a window poses and motions are the sensor's, so that a
-measurement is range and bearing from the pose, whatever its noise. For a motion T of the base the
-sensor at m moves by m⁻¹ ∘ T ∘ m. At the window's end the poses become the base's again, particle by
-particle: with S the sensor's pose since the window's start, the base's is m ∘ S ∘ m⁻¹, and a point
-p in the frame of the sensor's start is m p in that of the base's.
+Within a window poses and motions are the sensor's, so that a measurement is range and bearing from
+the pose. For a motion T of the base the sensor at m moves by m⁻¹ ∘ T ∘ m. At the window's end the
+poses become the base's, particle by particle: with S the sensor's pose since the window's start,
+the base's is m ∘ S ∘ m⁻¹, and a point p in the frame of the sensor's start is m p in the base's.
 """
 
 import numpy as np

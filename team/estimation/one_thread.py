@@ -1,9 +1,8 @@
 """Limit BLAS to one thread, so that a map's bits do not depend on how the process was started.
 
 A BLAS that divides a product among threads sums it in another order. Environment variables are read
-only when such a library is loaded: a user's script may have loaded NumPy's before, so loaded ones
-are configured directly when estimation is imported. SciPy's, which robots do not load, then reads
-the variables.
+only when such a library is loaded: loaded ones are configured directly when estimation is imported;
+SciPy's, which robots do not load, then reads the variables.
 """
 
 import os

@@ -20,7 +20,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
-    """Give the reason why a submap is refused; None if it is within the bounds."""
+    """Give the reason why a submap is refused, if any."""
     if len(local.ids) > bounds.submap_landmarks:
         return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
     angles = _angles_of(local)
@@ -56,15 +56,13 @@ def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
 
 
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
-    """Give the reason why an inter-robot measurement is refused; None if it is within the
-    bounds.
-    """
+    """Give the reason why an inter-robot measurement is refused, if any."""
     why = _far(sighting.measurement[:1], bounds.extent_m, "of its observer")
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)
 
 
 def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
-    """Give the reason why an initial pose is refused; None if it is within the bounds."""
+    """Give the reason why an initial pose is refused, if any."""
     if abs(start.pose[2]) > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(start.pose[:2], bounds.coordinate_m, "of the origin")
@@ -74,7 +72,7 @@ def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
 
 
 def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None:
-    """Give the reason why a prior (x, y, θ, x₁, y₁, …) is refused; None if it is within the bounds.
+    """Give the reason why a prior (x, y, θ, x₁, y₁, …) is refused, if any.
 
     A variance of zero is a known constant; the agreement of many submaps allows any small one.
     """

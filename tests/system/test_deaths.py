@@ -88,12 +88,18 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
         *("--json", "result.json"),
     )
     await endpoint_of(folder)
-    pids = set[int]()
-    for _ in range(FRUITLESS):
-        await until(lambda: other(team, ("robot", "r1")) not in (None, *pids), "r1")
-        pid = other(team, ("robot", "r1"))
-        assert pid is not None
-        pids.add(pid)
+    pids, killed = set[int](), set[int]()
+    for life in range(1, FRUITLESS + 1):
+
+        def starts(life: int = life) -> bool:
+            pid = other(team, ("robot", "r1"))
+            if pid is not None:
+                pids.add(pid)
+            return len(pids) == life
+
+        await until(starts, "r1")
+        (pid,) = {*pids} - killed
+        killed.add(pid)
         os.kill(pid, signal.SIGKILL)
     assert await launch.ended() == 1
     await team.none_left(0.0)

@@ -1,15 +1,14 @@
 """Closures: a patch of landmarks found at a place of another part of the map, or of another map.
 
 The patch, the landmarks of a stream's last submaps, is compared with the rest of its island, or
-with another island, in which its place is unknown. Pair voting proposes alignments; each is grown
-from two of its pairs under the joint covariance. Its evidence is the log-likelihood ratio of its
-pairs less a penalty for absent landmarks: those of one side that the other side viewed without
-having one. The best alignment is a closure only if it passes the tests of `verification`, among
-them a margin to every other alignment.
+with another island. Pair voting proposes alignments; each is grown from two of its pairs under the
+joint covariance. Its evidence is the log-likelihood ratio of its pairs less a penalty for absent
+landmarks: those of one side that the other side viewed without having one. The best alignment is a
+closure only if it passes the tests of `verification`, among them a margin to every other alignment.
 
 Voting needs many pairs, since it searches everywhere. Where the place of a submap is uncertain by
-only a few metres, `assign_nearby` weighs all joint assignments to the landmarks there: three pairs
-on which they agree suffice, if together they have the evidence required of one uncertain pair.
+only a few metres, `assign_nearby` weighs all joint assignments to the landmarks there: three common
+pairs suffice, with the evidence required of one uncertain pair.
 """
 
 from collections.abc import Callable, Sequence
@@ -322,8 +321,8 @@ def patch_step(profile: AssociationProfile) -> int:
 
 
 def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None:
-    """Search an island for a closure of a stream's submaps up to `last`; its pairs are indices in
-    the view.
+    """Search an island for a closure of a stream's submaps up to `last`; pairs are indices in the
+    view.
     """
     profile = view.profile
     submaps = view.find_latest(stream, last)

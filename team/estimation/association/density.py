@@ -1,11 +1,10 @@
 """The local density λ of landmarks, and the lengths that follow from their spacing.
 
-Landmarks observed by one keyframe are distinct, whatever else is uncertain. Their distances give
-the density of further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J.
-Appl. Prob. 13). In groups of landmarks it is far above the map's mean density: a pair whose
-difference is as uncertain as the spacing within a group may be either of its members. The
-observations of one keyframe lack neighbours that hide each other: these are counted in the map,
-among the landmarks that several submaps have observed.
+Landmarks observed by one keyframe are distinct. Their distances give the density of further
+landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13). In groups
+of landmarks it is far above the map's mean density: a pair whose difference is as uncertain as the
+spacing within a group may be either of its members. Neighbours that hide each other in one keyframe
+are counted in the map, among the landmarks of several submaps.
 
 The distances also bound the lengths of a profile: two landmarks farther apart than their neighbours
 are not one landmark that was split.

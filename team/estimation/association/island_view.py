@@ -1,14 +1,13 @@
 """The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
 
-Every submap adds its unnamed landmarks to the map as landmarks of their own; here they are merged.
-The steps of a tick, in order: *tracking* against the last submaps of the same robot; *near*,
-landmarks of older submaps where the standard deviation of the difference is small, submap by
-submap; *sweep*, landmarks that were split. Closures and merges of islands follow (`closure`).
+Every submap adds its unnamed landmarks to the map as landmarks of their own. The steps of a tick:
+*tracking* against the last submaps of the same robot; *near*, landmarks of older submaps where the
+standard deviation of the difference is small, submap by submap; *sweep*, landmarks that were split.
+Closures and merges of islands follow (`closure`).
 
-The landmarks of one submap are distinct. Those of the whole map are not, while some are unmerged:
-fragments of one landmark are candidates for each other, and the assignments to all of them at once
-do not agree on any. So the landmarks of a submap are assigned to those of one other submap at a
-time, with landmarks that are certainly different from these.
+The landmarks of one submap are distinct. Unmerged fragments of one landmark are candidates for each
+other, and the assignments to all of them at once do not agree on any. So the landmarks of a submap
+are assigned to those of one other submap at a time, with landmarks certainly different from these.
 """
 
 from collections.abc import Iterable, Sequence
@@ -43,8 +42,8 @@ from team.estimation.contribution import Observation, Stream
 COMPARED = 6
 """Number of submaps that one submap is compared with: those with the most candidates."""
 REEXAMINED = 8
-"""Number of older submaps with undecided landmarks that a tick examines again: the newest half, and
-the others by turns.
+"""Number of older undecided submaps that a tick examines again: the newest half, others by
+turns.
 """
 REEXAMINED_WITHIN = 10.0
 """Distance in object radii between undecided landmarks of an older submap and the tick's within
@@ -171,7 +170,7 @@ class IslandView:
         ]
 
     def record_merges(self, found: MergedPairs, kind: str) -> None:
-        """Record the pairs that a step (`kind`) merged, and the joint Gaussian given them."""
+        """Record the pairs merged by a step (`kind`), and the joint Gaussian given them."""
         self.joint = found.joint
         for pair in found.pairs:
             tie = MergeRecord(
@@ -234,8 +233,8 @@ class IslandView:
             self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:
-        """Merge pairs of submap k and each other submap on which all likely joint assignments of
-        the two agree.
+        """Merge pairs of submap k and each other submap on which all likely joint assignments
+        agree.
         """
         own = self._resolve(self.submaps[k].unnamed)
         others = self.sees.copy()

@@ -3,14 +3,13 @@
 A merged pair conditions the joint Gaussian for the pairs after it, so the sum of the log-likelihood
 ratios (`gating`) is the ratio of all of them together.
 
-`grow_pairs` merges the likeliest pair first, as long as it has no rival. `assign_jointly` is for
-pairs with rivals: two neighbouring landmarks, each of which may be either of two mapped ones, are
-distinguished by each other, since their relative position is far more certain than their absolute
-ones. Landmarks are assigned one by one, each to a mapped landmark given the pairs before it, or to
-a new one. An assignment has the weight exp(Σ LLR) of its pairs, and a pair is accepted when the
-assignments that contain it outweigh all others. Joint compatibility branch and bound (Neira and
-Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with the most pairs; here it also has to be the
-only likely one.
+`grow_pairs` merges the likeliest pair first, while it has no rival. `assign_jointly` is for pairs
+with rivals: two neighbouring landmarks, each of which may be either of two mapped ones, are
+distinguished by their far more certain relative position. Landmarks are assigned one by one to a
+mapped landmark given the pairs before, or to a new one. An assignment has the weight exp(Σ LLR) of
+its pairs, and a pair is accepted when the assignments that contain it outweigh all others. Joint
+compatibility branch and bound (Neira and Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with
+the most pairs; here it also has to be the only likely one.
 """
 
 from collections.abc import Iterable, Sequence
@@ -34,8 +33,8 @@ from team.estimation.association.gating import (
 PREGATE = 4.0
 """Multiple of the gate beyond which a pair is excluded for good."""
 SURE_AFTER = 3
-"""Number of pairs after which an alignment grows only by pairs of small standard deviation: others
-connect landmarks to neighbours one spacing off.
+"""Number of pairs after which an alignment grows only by pairs of small standard deviation, since
+others connect landmarks one spacing off.
 """
 MOST_ASSIGNED = 10
 """Number of landmarks that are assigned together: those with the most certain candidates."""

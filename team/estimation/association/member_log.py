@@ -1,9 +1,8 @@
 """Append-only log of the members of all unnamed landmarks, in few bytes and shared arrays.
 
-A member is a local landmark of a submap. It starts with a number of its own, which it loses when
-its landmark is merged with another. Written rows are final: a longer log shares all but its last
-rows with the log before, so checkpoints store no row twice, and the time of a tick depends on its
-own submaps only.
+A member, a local landmark of a submap, has a number of its own until its landmark is merged with
+another. A longer log shares all but its last rows with the log before, so checkpoints store no row
+twice, and the time of a tick depends on its own submaps only.
 """
 
 from collections.abc import Iterator, Sequence

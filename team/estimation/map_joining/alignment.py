@@ -174,10 +174,7 @@ class SharedPoints(NamedTuple):
 
 
 def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: float) -> str | None:
-    """Give the reason why the shared points cannot place one map in the other; None if they can.
-
-    alignment: None with fewer than NEEDED points.
-    """
+    """Give the reason why the shared points cannot place one map in the other; None if they can."""
     if alignment is None:
         return f"{shared}, {NEEDED} needed"
     if alignment.heading_sigma == np.inf:

@@ -1,10 +1,9 @@
 """Fold a tick, and undo a closure that later submaps contradict.
 
-For some ticks after a closure, or a merge of robots, the share of matched landmarks among those
-near its places that both sides observed is computed again. Where it falls below the bound of the
-settings, the same ticks are folded again without the closure, from the state before it, as if it
-had never been accepted. The fold before a closure and the ticks since are part of the fold, so the
-outcome depends on the set of submaps alone.
+For some ticks after a closure, or a merge of robots, the matched share of the landmarks near its
+places that both sides observed is computed again. Where it falls below the bound of the settings,
+these ticks are folded again without the closure. The fold before a closure and the ticks since are
+part of the fold, so the outcome depends on the set of submaps alone.
 """
 
 from dataclasses import replace
@@ -20,7 +19,7 @@ from team.estimation.map_joining.refusal import add_members
 
 
 def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Fold one tick: add its members, then undo the closures that they contradict."""
+    """Fold one tick: add its members, then undo closures that they contradict."""
     if tick.verdicts:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
@@ -28,7 +27,7 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Undo a closure that the tick between two folds contradicts; else extend the audits by it."""
+    """Undo a closure that the tick between two folds contradicts, else extend its audit."""
     if not after.landmarks.opened and not fold.audits:
         return after
     length = settings.association.audited

@@ -73,9 +73,7 @@ class SolvedChain(NamedTuple):
 
 @compiled
 def solved_chain(chain: Chain, gate: float, iterations: int, tolerance: float) -> SolvedChain:
-    """Minimise over all poses and landmarks, as `gauss_newton.settled` without robust losses: full,
-    shorter or damped steps until none exceeds the tolerance [m, rad].
-    """
+    """Minimise over all poses and landmarks as `gauss_newton.settled`, without robust losses."""
     ids = np.unique(chain.ids)
     slots = np.searchsorted(ids, chain.ids)
     maps = len(chain.id_start) - 1
@@ -272,7 +270,7 @@ def _moved(state: Values, offset: Indices, step: Float[np.ndarray, "n 1"], share
 
 @compiled
 def _shared(chain: Chain, slots: Indices, landmarks: int) -> Indices:
-    """Count, for each map after the first, its landmarks that another map has, too."""
+    """Count, for each map after the first, its landmarks that another map has."""
     counts = np.zeros(landmarks, np.int64)
     for slot in slots:
         counts[slot] += 1

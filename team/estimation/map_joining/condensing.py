@@ -1,14 +1,13 @@
 """The bounded fold: old submaps are condensed into one quadratic, selected by sequence number only.
 
-The last `lag` submaps of each stream of the main island stay factors of their own. Older ones are
-linearised at the current state, with their current robust weights, and become one quadratic over
-landmarks, biases and the pose at each stream's boundary (`condensed_factor`); their other poses are
-eliminated. The cost of a tick therefore depends on the number of landmarks and robots, not on the
-duration of the run. A fold stays a pure function of its ticks.
+The last `lag` submaps of each stream of the main island stay factors. Older ones are linearised at
+the current state with their current robust weights, and become one quadratic over landmarks, biases
+and the pose at each stream's boundary (`condensed_factor`). The cost of a tick therefore depends on
+the number of landmarks and robots, not on the duration of the run. A fold stays a pure function of
+its ticks.
 
-No submap is condensed before the fold has `begin` submaps, nor before the submap's robust scale has
-reached its final value. Unmerged islands are not condensed, since their frame will still be
-transformed.
+No submap is condensed before the fold has `begin` submaps, nor before its own robust scale is
+final, nor in an unmerged island, whose frame will still be transformed.
 """
 
 from collections import defaultdict
@@ -67,9 +66,9 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     """Condense the old submaps of the fold's main island; return the same fold if there are none.
 
     Submaps whose poses cannot be eliminated stay raw. Unnamed landmarks stay nodes: a team that has
-    some condenses only once it has as many submaps as landmarks. Association keeps the observations
-    of condensed submaps (`memory`), all of them until the last closure can no longer be undone;
-    landmarks that few submaps confirm are dropped.
+    some condenses only once it has as many submaps as landmarks. Association keeps observations of
+    condensed submaps (`memory`), all of them while a closure can be undone; landmarks that few
+    submaps confirm are dropped.
     """
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:
@@ -132,7 +131,7 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
 
 
 def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
-    """Attach the memory, numbered as in the graph before, to the condensed island."""
+    """Attach the memory, numbered as in the graph before."""
     graph = smaller.graph
     node_of = np.full(len(before.fixed), -1, np.int64)
     for id_, node in before.landmarks.items():
@@ -144,9 +143,7 @@ def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: boo
 
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
-    """Mark the submaps to condense: more than `lag` before their stream's last, at their final
-    robust scale.
-    """
+    """Mark the submaps to condense: `lag` or more behind, at their final robust scale."""
     graph, c = island.graph, island.settings.robust_c
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
     narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c

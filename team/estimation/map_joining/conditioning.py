@@ -1,15 +1,13 @@
 """Estimate a robot's pose in the team's map: the broadcast prior times the robot's later submaps.
 
 The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
-that it does not contain are independent, so their product is exact; the errors that all submaps of
-a robot share are first corrected by the centre's estimates. The product is the centre's
-least-squares problem, with the prior in place of all earlier submaps. It is solved at once, so that
-every submap is linearised where all of them agree; joined one by one, the first would be linearised
-at the pose of a poor prior (decision 21).
+after it are independent, so their product is exact, once the centre's estimates have corrected the
+errors that all submaps of a robot share. It is the centre's least-squares problem, with the prior
+in place of all earlier submaps, solved at once: joined one by one, the first submap would be
+linearised at the pose of a poor prior (decision 21).
 
-A submap's observation of a landmark that everything else contradicts (a misread barcode) is left
-out, for this solution only; the next submap and prior judge all of them anew. The result is for
-display and control; it never enters a message that is fused.
+A landmark observation that everything else contradicts (a misread barcode) is left out, for this
+solution only. The result is for display and control; it never enters a message that is fused.
 """
 
 import math
@@ -232,7 +230,7 @@ def _disputed(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
 
 
 def is_majority(refused: int, known: int) -> bool:
-    """Whether so many known landmarks are refused that the fault is not with single landmarks."""
+    """Whether so many known landmarks are refused that the fault is not in single ones."""
     return refused >= FEWEST and 2 * refused > known
 
 

@@ -60,19 +60,18 @@ class JoinSettings:
     iterations_per_tick: Gauss-Newton iterations of `folded`. robust_c: Cauchy's scale on √(χ²/dim)
     of a factor; None for least squares. The scale begins at robust_start · c and is multiplied by
     robust_decay with each iteration until it is c. landmark_gate: χ² of two numbers from which a
-    submap's landmark is discounted by itself, with a robust loss; it narrows with the scale.
+    submap's landmark is discounted, with a robust loss; it narrows with the scale.
     covariance_factor: factor on every submap's covariance. max_iterations, step_tolerance: a full
     solve ends when no unknown changes by more than step_tolerance [m, rad], or after
-    max_iterations. alignment_confidence: quantile of the χ² test that an island must pass before it
-    is merged. alignment_heading_sigma: largest standard deviation [rad] of the heading from the
-    shape of the shared landmarks for a merge of islands. bias_sigma: prior standard deviation of
-    each error that a robot's submaps share. common_bias_sigma: the same for errors that all robots
-    share, in addition to each robot's own. "marker": the share of the range by which all robots
-    measure one landmark too far, for each landmark by itself. joined_ranges: whether errors of
-    ranges are proportional to the range in the joined map (`joining_kernel.with_joined_ranges`).
-    landmark_sigma: standard deviation [m], per direction, of the measured point, the same for all
-    robots, about the landmark's place: part of a map's covariance, not of the measurements'
-    weights. association: thresholds for unnamed landmarks.
+    max_iterations. alignment_confidence: quantile of the χ² test for a merge of islands.
+    alignment_heading_sigma: for the same, largest standard deviation [rad] of the heading from the
+    shape of the shared landmarks. bias_sigma: prior standard deviation of each error that a robot's
+    submaps share. common_bias_sigma: the same for errors that all robots share, in addition;
+    "marker": the share of the range by which all robots measure one landmark too far.
+    joined_ranges: whether errors of ranges are proportional to the range in the joined map
+    (`joining_kernel.with_joined_ranges`). landmark_sigma: standard deviation [m], per direction, of
+    the measured point, the same for all robots, about the landmark's place: part of a map's
+    covariance, not of the measurements' weights.
     """
 
     iterations_per_tick: int = 2
@@ -101,7 +100,7 @@ class NotDeterminedError(ValueError):
 
 
 UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
-"""Exceptions of a solve where the numbers allow no solution: a case to decide on, not a defect."""
+"""Exceptions of a solve without a solution: a case to decide on, not a defect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +151,7 @@ class Island:
 
     @cached_property
     def landmark_weight(self) -> Float[np.ndarray, " B"]:
-        """Weight of each landmark of each submap: 1 up to its gate, 1 without a robust loss."""
+        """Weight of each landmark of each submap: 1 up to its gate or without a robust loss."""
         chi2, gate = self._landmark_chi2_and_gate
         weight, beyond = np.ones(len(chi2)), chi2 > gate
         weight[beyond] = np.maximum(gate[beyond] / chi2[beyond], LEAST_WEIGHT)
@@ -379,7 +378,7 @@ class Island:
 
     @cached_property
     def resting_points(self) -> Float[np.ndarray, "L 2"]:
-        """The positions [m] of the landmarks at rest; for islands that have some."""
+        """Positions [m] of the landmarks at rest, if there are some."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -389,7 +388,7 @@ class Island:
 
     @cached_property
     def boundary_covariance(self) -> Float[np.ndarray, "n n"]:
-        """The joint covariance of the condensed factor's nodes, if there is such a factor."""
+        """Joint covariance of the condensed factor's nodes, if there is one."""
         graph, old = self.graph, self.graph.condensed
         assert old is not None
         return symmetric_of(
@@ -415,7 +414,7 @@ class Island:
 
     @cached_property
     def resting_blocks(self) -> Float[np.ndarray, "L 2 2"]:
-        """The covariance [m²] of each landmark at rest; for islands that have some."""
+        """Covariance [m²] of each landmark at rest, if there are some."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -432,7 +431,7 @@ def aged(island: Island, iterations: int | None) -> Island:
 
 
 def final_cost(island: Island) -> float:
-    """Evaluate the cost with every robust scale at its final value, for comparison of islands."""
+    """Evaluate the cost with final robust scales, for comparison of islands."""
     return aged(island, FULL_AGE).cost
 
 

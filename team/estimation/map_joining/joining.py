@@ -90,7 +90,7 @@ class NotCanonicalError(ValueError):
 
 
 class GapError(ValueError):
-    """Submaps of a stream are missing before this one, so the graph lacks its start pose."""
+    """Submaps of a stream are missing before this one."""
 
     def __init__(self, contribution: Contribution, expected: int) -> None:
         super().__init__(
@@ -131,9 +131,7 @@ class Tick:
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """A closure that may still be undone: the fold before it, and the ticks since, its own
-    included.
-    """
+    """A closure that may still be undone: the fold before it, and the ticks from it on."""
 
     opened: Opened
     before: "Fold"
@@ -142,21 +140,19 @@ class Audit:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """The state of the fold: the islands solved so far, and the bookkeeping of their submaps.
+    """The islands solved so far, and the bookkeeping of their submaps.
 
     home: island (a key of `islands`) of each stream. reasons: why an island other than the main one
-    is not merged, by its frame. joined: record of each merge and its certainty, by the former
-    frame. warnings: signs of another minimum that the full solution found. waiting: inter-robot
-    measurements whose pose nodes are not both in one island, in canonical order. judged: number of
-    submaps of two islands at their last failed merge attempt, and its reason. searched_at: number
-    of submaps of an island at its last failed search for a lower minimum. iterations, change: the
-    number of iterations and the last step [m, rad] of the main island's last full solution.
-    refused: submaps that are not in the map, in canonical order, with the reason (`refusal`).
-    motion_only: submaps of which only the motion is in the map. left_out: inter-robot measurements
-    with which the map has no solution. set_aside: other refusals in words: initial poses,
-    inter-robot measurements, landmarks of submaps. landmarks: which unnamed landmarks of which
-    submaps are one, with the evidence (`associating`). audits: closures that may still be undone
-    (`auditing`).
+    is not merged, by its frame. joined: each merge and its certainty, by the former frame.
+    warnings: signs of another minimum of the full solution. waiting: inter-robot measurements
+    between two islands, in canonical order. judged: number of submaps of two islands at their last
+    failed merge attempt, and its reason. searched_at: number of submaps of an island at its last
+    failed search for a lower minimum. iterations, change: iterations and last step [m, rad] of the
+    main island's last full solution. refused: submaps that are not in the map, in canonical order,
+    with the reason (`refusal`). motion_only: submaps of which only the motion is in the map.
+    left_out: inter-robot measurements with which the map has no solution. set_aside: other refusals
+    in words. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
+    still be undone (`auditing`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -368,8 +364,7 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
 
 
 def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
-    """Merge islands while any two can be merged, into the one with known initial poses or the
-    smallest frame.
+    """Merge islands while any two can be merged, into the main one or the smallest frame.
 
     A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
     """

@@ -141,7 +141,7 @@ def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.n
 def _sorted_out(
     island: Island, ids: Sequence[int]
 ) -> tuple[Bool[np.ndarray, " L"], Indices, Indices]:
-    """Split landmarks: marks of those that are nodes, their nodes, and the others' places at rest.
+    """Split landmarks: marks of nodes, their nodes, and the places of the others at rest.
 
     Raises KeyError for an unknown id.
     """

@@ -1,8 +1,8 @@
 """Nonlinear least squares: shortening and damping of steps, and narrowing of robust scales.
 
 Robust losses enter by iterated re-weighting: a point's cost is quadratic in the residuals, with the
-weights of that same point. A robust scale begins wide and narrows with the iterations since its
-factor was added, so that a residual that is large at first is not taken for an outlier.
+weights of that point. A robust scale narrows with the iterations since its factor was added, so
+that a residual that is large at first is not taken for an outlier.
 """
 
 import math

@@ -64,7 +64,7 @@ class EndPoses(NamedTuple):
 
 
 class BiasEstimate(NamedTuple):
-    """The estimate of an error that the submaps of a stream share, and its standard deviation."""
+    """Estimate and standard deviation of an error that the submaps of a stream share."""
 
     stream: Stream
     bias: Bias
@@ -96,7 +96,7 @@ def bias_estimates(fold: Fold) -> list[BiasEstimate]:
 
 
 _BIASES: WeakKeyDictionary[Island, list[BiasEstimate]] = WeakKeyDictionary()
-"""Cache of the biases of present islands: a map's message and its priors use the same."""
+"""Cache of the biases of present islands."""
 
 
 def _biases_in(island: Island) -> list[BiasEstimate]:
@@ -182,7 +182,7 @@ def prior_for(
 
 
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
-    """Return the end pose of the stream's last submap, in the frame of its island."""
+    """Return the end pose of the stream's last submap, in its island's frame."""
     island = fold.islands[fold.home[stream]]
     return _mean(island, island.graph.streams[stream][-1])
 
@@ -232,7 +232,7 @@ def _priors_in(
 
 
 def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
-    """Return the end poses of a stream's submaps, in the frame of its island."""
+    """Return the end poses of a stream's submaps, in their island's frame."""
     island = fold.island(robot, incarnation)
     nodes = island.graph.streams[(robot, incarnation)]
     (start, start_covariance), *ends = (_own_marginal(island, node) for node in nodes)
@@ -265,7 +265,7 @@ class Terms(NamedTuple):
 
 
 _TERMS: WeakKeyDictionary[Island, Terms] = WeakKeyDictionary()
-"""Cache of the terms of present islands, for a broadcast and the next tick."""
+"""Cache of the terms of present islands."""
 
 
 def terms(island: Island) -> Terms:

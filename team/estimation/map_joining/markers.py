@@ -1,10 +1,9 @@
 """Marker errors of unnamed landmarks, as states of the full solution.
 
 A sensor that derives the distance from an object's size or height measures each landmark too far by
-a constant share of the range, the same for all robots (`CommonBiasSigmas.marker`). The share
-belongs to the landmark, named or not. The states are added after association: before, each part of
-one landmark would have an error of its own, which would weaken the evidence that the parts are one
-landmark or two.
+a constant share of the range, the same for all robots (`CommonBiasSigmas.marker`). The states are
+added after association: before, each part of one landmark would have an error of its own, which
+would weaken the evidence that the parts are one landmark or two.
 """
 
 from collections.abc import Mapping

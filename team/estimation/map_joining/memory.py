@@ -1,15 +1,14 @@
 """The observations of condensed submaps for association: landmarks seen together, viewed places.
 
-A condensed submap's measurements are in the quadratic. Association also needs its landmarks, which
-of them a keyframe saw together, and thereby the viewed area. Only the newest MOST submaps of each
-landmark are stored, whole: their number depends on the landmarks, not on the duration of the run,
-and counts of submaps end there. Of older ones the pairs of landmarks that they kept apart remain.
+Association needs the landmarks of a submap, which of them a keyframe saw together, and thereby the
+viewed area; the quadratic has none of it. Only the newest MOST submaps of each landmark are stored,
+whole: their number depends on the landmarks, not on the duration of the run, and counts of submaps
+end there. Of older ones the pairs of landmarks that they kept apart remain.
 
-False detections create landmarks that hardly any submap observes again and that would slow a team
-down for good. A landmark of n < MOST submaps is dropped when every landmark of MOST or more, that
-was observed with it when it was last observed, has been observed by MOST n submaps since: fewer
-than one in MOST of the submaps that look there found it. A real landmark there is created anew when
-it is observed.
+False detections create landmarks that would slow a team down for good. A landmark of n < MOST
+submaps is dropped when every landmark of MOST or more, that was observed with it when it was last
+observed, has been observed by MOST n submaps since: fewer than one in MOST of the submaps that look
+there found it. A real landmark there is created anew when it is observed.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
 """Merge two islands when their common points leave a single likely place of one in the other.
 
-A merge is tried from every place that the shared points propose: from all of them, from the
-landmarks alone, from the inter-robot measurements alone, and at every heading at which the points
-fit well. Each attempt is solved in full, and so is a start independent of them (`minima`). The
-solution of lowest cost is accepted if the two maps agree there and no other place is about as
-likely; else the merge is deferred, with the reason.
+A merge is tried from every place that the shared points propose: all of them, the landmarks alone,
+the inter-robot measurements alone, and every heading at which they fit well. Each is solved in
+full, and so is a start independent of them (`minima`). The solution of lowest cost is accepted if
+the two maps agree there and no other place is about as likely; else the merge is deferred.
 """
 
 from collections.abc import Sequence
@@ -38,9 +37,7 @@ class Merge(NamedTuple):
 
 
 class Waits(NamedTuple):
-    """The reason for two separate islands; after_search: whether it took a (slow) search over
-    places.
-    """
+    """Why two islands stay separate; after_search: whether it took a (slow) search over places."""
 
     why: str
     after_search: bool
@@ -54,9 +51,7 @@ def ages(count: int) -> Int64[np.ndarray, " count"]:
 def sighted(
     island: Island, waiting: Sequence[InterRobotFactor]
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """Add the inter-robot measurements between an island's own pose nodes; return the remaining
-    ones.
-    """
+    """Add the inter-robot measurements within an island; return the remaining ones."""
     candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
     found = [between for _, between in candidates if between is not None]
     if not found:
@@ -79,7 +74,7 @@ def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> M
         with np.errstate(all="ignore"):
             return _merge(main, other, waiting)
     except UNSOLVABLE as error:
-        return Waits(f"can not be solved for: {error}", after_search=True)
+        return Waits(f"cannot be solved for: {error}", after_search=True)
 
 
 def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
@@ -138,7 +133,7 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
-    """Word the reason to defer a merge: another place is about as likely."""
+    """Word the reason to defer a merge with two likely places."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
         f"{shared} leave two places {elementwise.hypot(away[0], away[1]):.1f} m apart: "
@@ -147,7 +142,7 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
 
 
 def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
-    """Describe the ties by which an island was merged, and the certainty of its place."""
+    """Describe the ties of a merged island, and the certainty of its place."""
     node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
     sigma_m = deviation(covariance[0, 0] + covariance[1, 1])

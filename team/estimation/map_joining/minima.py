@@ -1,9 +1,8 @@
 """The search for the lowest minimum: one island solved from several starts.
 
 Headings give map joining many minima: after a long way without a landmark Gauss-Newton may fold a
-chain wrongly and stay there. A cost far above its degrees of freedom reveals that; so does another
-start that ends lower. A second minimum of about the same cost is a second map that the same submaps
-allow.
+chain wrongly. A cost far above its degrees of freedom, or another start that ends lower, reveals
+that. A second minimum of about the same cost is a second map that the same submaps allow.
 """
 
 import math
@@ -66,8 +65,8 @@ class Minimum(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The lowest minimum; its distance in cost below that of the first start, and below a second
-    minimum (None where none was found).
+    """The lowest minimum; its cost below the first start's, and below a second minimum (None
+    without).
     """
 
     best: Minimum
@@ -184,9 +183,7 @@ def _mirrored(island: Island) -> Iterator[Island]:
 
 
 def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
-    """List pairs of landmarks, by their indices in the state, that a stream observes in
-    succession.
-    """
+    """List pairs of landmarks, by index in the state, that a stream observes in succession."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
     for submap in graph.submaps:
@@ -286,11 +283,11 @@ def warnings(search: Search) -> list[str]:
     found += [
         f"{named(stream)} is placed weakly: its heading is known to {np.degrees(sigma):.0f}° at "
         f"best, {np.degrees(limit):.0f}° needed; the map may be bent by more than its covariance "
-        "says"
+        "allows"
         for stream, sigma in sorted(_heading_sigmas(island).items())
         if sigma > limit
     ]
-    with suppress(*UNSOLVABLE):  # a heading that can not be moved bends nothing
+    with suppress(*UNSOLVABLE):  # a heading that cannot be moved bends nothing
         found += nonlinearity_warnings(island)
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)

@@ -1,10 +1,9 @@
 """Detect a pose covariance that understates the uncertainty: a curved valley of the cost.
 
-One heading is displaced from its best value and everything else is solved for given that: the
-profile of the cost (Bates & Watts 1988, chapter 6). For a quadratic cost its rise equals the χ² of
-the displacement by the pose's own covariance. After a long way without a landmark that χ² may be
-ten times the rise: the robot may be at a place that its covariance excludes, though the minimum is
-right.
+One heading is displaced and everything else is solved for given that: the profile of the cost
+(Bates & Watts 1988, chapter 6). For a quadratic cost its rise equals the χ² of the displacement by
+the pose's own covariance. After a long way without a landmark that χ² may be ten times the rise:
+the robot may be at a place that its covariance excludes, though the minimum is right.
 """
 
 from collections.abc import Iterator
@@ -133,7 +132,7 @@ def nonlinearity_warnings(island: Island) -> list[str]:
         found = understated_uncertainty(island, node)
         if found is not None:
             texts.append(
-                f"{named(stream)} may have {where} farther off than its covariance says: "
+                f"{named(stream)} may have {where} farther off than its covariance allows: "
                 f"{found.distance:.1f} m away for {found.rise:.1f} more in chi², by the "
                 f"covariance {found.chi2:.0f}"
             )

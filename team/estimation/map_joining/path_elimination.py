@@ -1,9 +1,8 @@
 """The quadratic of factors at the present state, with the old poses eliminated run by run.
 
-A stream's old poses are a chain: a run of them is connected with the landmarks seen along it and
-the poses at its ends. Runs are therefore eliminated one after the other, each from a dense
-quadratic over its neighbours, and the rest of one run is a factor of the next (George 1973, SIAM J.
-Numer. Anal. 10(2), by blocks). At once it would take a dense matrix of all poses and landmarks.
+A run of a stream's old poses is connected with the landmarks seen along it and the poses at its
+ends only. Each run is eliminated from a dense quadratic over its neighbours, and the rest is a
+factor of the next run (George 1973, SIAM J. Numer. Anal. 10(2), by blocks).
 """
 
 from collections import defaultdict

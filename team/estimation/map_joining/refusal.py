@@ -1,14 +1,13 @@
 """Add the members of a tick to a fold; refuse those that allow no solution, with a reason.
 
-Only a trial shows whether the normal equations of a set can be solved. A tick is therefore added as
-a whole; if that has no solution its members are added one by one in canonical order, and those that
-make it unsolvable are left out. The outcome depends on the fold before and on the tick's members
-alone, hence on the set (law 2).
+A tick is added as a whole; if that has no solution its members are added one by one in canonical
+order, and those that make the normal equations unsolvable are left out. The outcome depends on the
+fold before and on the tick's members alone, hence on the set (law 2).
 
 If a whole submap allows no solution, its motion alone is tried, the marginal of its end pose, so
 that the robot's later submaps keep their place. Where that fails too, the robot's chain ends: later
-submaps have no place in any frame and are not in the map. An initial pose that allows no solution
-is treated as unknown; an inter-robot measurement is left out.
+submaps are not in the map. An initial pose that allows no solution is treated as unknown; an
+inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,9 +1,8 @@
 """Restore condensed submaps: at a few sizes of the fold, and where a tick contradicts them.
 
-While poses are uncertain, headings still change, and submaps that were linearised at different
-headings contradict each other: the map becomes overconfident. At begin · GROWTH^k submaps, up to
-SETTLED of them, all condensed submaps are therefore restored, solved, and condensed at the new
-state. A tick that moves them further is folded with all of them restored.
+Submaps linearised at different headings contradict each other: the map becomes overconfident. At
+begin · GROWTH^k submaps, up to SETTLED, all condensed submaps are therefore restored, solved, and
+condensed at the new state. A tick that moves them further is folded with all of them restored.
 """
 
 from collections.abc import Mapping, Sequence

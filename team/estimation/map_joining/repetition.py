@@ -1,17 +1,16 @@
 """Repetitions: parts of a map that repeat another part, as a copy or in a building that repeats.
 
-A robot that is carried off, or whose odometry slips by metres, maps mapped landmarks a second time,
-elsewhere. The set contains no contradiction: from there on its submaps share landmarks with each
-other alone, and only odometry connects them with the rest. The shape of the copy remains. For each
-boundary between two submaps of a stream beyond which it observes hardly any landmark of the rest,
-the landmarks first observed beyond it are aligned with all others by a rigid motion (`voting`).
-With n of them, N others in an area A, and points that match within r, the expected number of
-motions that match m or more by chance is
+A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time,
+elsewhere. The set contains no contradiction: from there on only odometry connects its submaps with
+the rest. The shape of the copy remains. For each boundary between two submaps of a stream beyond
+which it observes hardly any landmark of the rest, the landmarks first observed beyond it are
+aligned with all others by a rigid motion (`voting`). With n of them, N others in an area A, and
+points that match within r, the expected number of motions that match m or more by chance is
 
     E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
-since each pair on a pair defines one motion. Two places that look alike are no proof of an error:
-the set does not determine whether a robot was carried off or the building repeats itself.
+since each pair on a pair defines one motion. The set does not determine whether a robot was carried
+off or the building repeats itself.
 """
 
 import math

@@ -1,10 +1,10 @@
 """Landmarks come to rest, and become nodes again where a submap observes them.
 
-A landmark that no raw submap contains occurs in the condensed factor only. Given the factor's other
-nodes it has a Gaussian that later submaps of other places cannot change (`Resting`), so it is
-eliminated from the quadratic like an old pose; the cost of a tick then depends on the landmarks
-near the robots, not on all of them. The inverse is exact: with e = x − means − gain d ~ N(0, C),
-the quadratic gains eᵀ C⁻¹ e, and the other resting landmarks are conditioned on it.
+A landmark that no raw submap contains has, given the condensed factor's other nodes, a Gaussian
+that later submaps of other places cannot change (`Resting`). It is eliminated from the quadratic
+like an old pose, so the cost of a tick depends on the landmarks near the robots only. The inverse
+is exact: with e = x − means − gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹ e, and the other resting
+landmarks are conditioned on it.
 """
 
 from collections.abc import Collection

@@ -33,7 +33,7 @@ Values = Float[np.ndarray, " _"]
 
 
 CommonBias = Bias | Literal["marker"]
-"""Errors that the team has in common: those of all sensors, and those of each landmark's marker."""
+"""Errors that the team has in common: of all sensors, or of each landmark's marker."""
 CommonError = Bias | int
 """A common error: a bias of all sensors, or, by a landmark's number, the share of the range by
 which all robots measure that landmark too far.
@@ -232,7 +232,7 @@ class Graph:
 
     @property
     def condensed_entry(self) -> Indices:
-        """The part of `entry` for the pairs of the condensed factor's nodes."""
+        """The part of `entry` for the condensed factor's nodes."""
         return self.entry[self.sighting_factors.first_pair + 4 * len(self.sightings) :]
 
     @cached_property

@@ -116,7 +116,7 @@ def factorise(structure: Structure, target: Indices, values: Values) -> tuple[Va
 def _solve_column(
     structure: Structure, panels: Values, right: Float[np.ndarray, "n k"], first: int, c: int
 ) -> None:
-    """Solve one column in place, with a panel's numbers gathered so that a loop follows its row."""
+    """Solve one column in place, gathering a panel's numbers so that a loop follows its row."""
     count = len(structure[0]) - 1
     x = np.empty(len(right))
     for s in range(first, count):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # not needed without keys
 
 REFUSALS = "error,zenoh_link_tls=warn"
 """Zenoh's log filter with keys: refused connections, with reasons."""
-DROP_US = 100_000
+DROP_US = 300_000
 """Time [us] that a publication waits for a subscriber's full queue before it is dropped.
 
 Zenoh marks that queue as congested and drops further publications to it at once until the
