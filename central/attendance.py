@@ -162,11 +162,7 @@ class TeamAttendance:
         ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
-<<<<<<< HEAD
             return f"an end that omits {', '.join(silent)}"
-=======
-            return f"an end without {', '.join(silent)}"
->>>>>>> refs/heads/lang-est
         for name, robot in self.robots.items():
             progress = robot.progress
             last = None if progress is None else ends.get((name, progress.incarnation))

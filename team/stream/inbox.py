@@ -76,11 +76,7 @@ class Inbox:
             if stream.robot == robot
         }
         if not ends and self.next_measurement:
-<<<<<<< HEAD
             return f"an end that omits {robot}"
-=======
-            return f"an end without {robot}"
->>>>>>> refs/heads/lang-est
         last = ends.get(self.incarnation)
         if last is not None and last < self.next_measurement:
             return (

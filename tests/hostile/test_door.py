@@ -79,11 +79,7 @@ ATTACKS = [
         build.progress(node="central", measurements=5, submaps=1),
         "a message of 'central'",
     ),
-<<<<<<< HEAD
     (ch.END, "", build.end(), "an end that omits r1, r2"),
-=======
-    (ch.END, "", build.end(), "an end without r1, r2"),
->>>>>>> refs/heads/lang-est
     (
         ch.END,
         "",
@@ -154,11 +150,7 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
         (ch.ODOMETRY, msgspec.structs.replace(odometry, number=HUGE), f"counts to {HUGE}"),
         (ch.ODOMETRY, far, "days after its stream began"),
         (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),
-<<<<<<< HEAD
         (ch.END, build.end(), "an end that omits r1"),
-=======
-        (ch.END, build.end(), "an end without r1"),
->>>>>>> refs/heads/lang-est
         (
             ch.END,
             build.end(r1=2),
