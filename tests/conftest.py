@@ -15,7 +15,6 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
-import tests.kernels
 import tests.shapes
 
 # The same examples in every run: what fails once fails again. HYPOTHESIS_SEARCH=1 finds new ones.
@@ -37,14 +36,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 SYSTEM = "tests/system/"
-
-
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Notes which kernels the import of the tests has called: test_compiled.py looks at it.
-
-    In a fresh clone one worker would compile them, and the others wait for it.
-    """
-    session.config.stash[tests.kernels.AT_IMPORT] = tests.kernels.called()
 
 
 LAUNCHED = tuple(f"{SYSTEM}test_{name}.py" for name in ("launch", "replay"))
