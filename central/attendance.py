@@ -145,7 +145,6 @@ class TeamAttendance:
         return m.End(stamp_ns=self.now_ns, streams=tuple(streams))
 
     def _never_measured(self, name: str) -> bool:
-        """Whether a live team was ordered to end before this robot had begun."""
         return self.ordered and not self.robots[name].began
 
     def is_complete(self, name: str) -> bool:
@@ -253,9 +252,6 @@ class TeamAttendance:
         return robot.given_up or (name in self.withdrawn and not robot.alive)
 
     def _confirmed(self, end: m.StreamEnd) -> m.Done | None:
-        """Return the robot's `Done` that confirms this end of its stream, if all of it was
-        processed.
-        """
         robot = self.robots[end.robot]
         counts = end.incarnation, end.measurements
         same = (d for d in robot.dones if (d.incarnation, d.measurements) == counts)

@@ -215,7 +215,6 @@ def _numbers(local: LocalMap, own: Int64[np.ndarray, " n"]) -> Int64[np.ndarray,
 
 
 def _seam(chain: Sequence[Contribution], one: _Placed, two: _Placed) -> _Seam:
-    """Evaluate the seam between two submaps, with the motion of those between them."""
     pose, covariance = one.end.a_from_b, one.end.covariance
     for each in chain[one.at + 1 : two.at]:
         step = each.local.end_pose

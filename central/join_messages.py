@@ -238,7 +238,6 @@ def _left_out(fold: Fold, shown: Shown, landmark_submaps: int) -> tuple[str, ...
 
 
 def _listed(names: Sequence[str], most: int) -> str:
-    """List the first names in brackets; landmarks without a name have none."""
     return f" ({', '.join(names[:most])}{', …' * (len(names) > most)})" if names else ""
 
 
@@ -344,9 +343,6 @@ def _apart(fold: Fold) -> Iterator[str]:
 
 
 def _best_attempt(fold: Fold, key: Stream) -> str | None:
-    """Return the island with the most pairs and the test that failed; None if no attempt was
-    made.
-    """
     attempts = []
     for (stream, other), decision in sorted(fold.landmarks.waits.items()):
         mine = fold.home[stream]

@@ -103,7 +103,6 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        """Restore the set of an earlier process."""
         if self._stored is None or not self._shell.going:
             return
         stored = self._stored.samples()

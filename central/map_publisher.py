@@ -100,7 +100,6 @@ class MapPublisher:
         return self._publish("closed", closed_ns, now_ns, ahead=False)
 
     def _publish_whole(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish the map of the whole set, closed if no submap is ahead of the watermark."""
         is_ahead = _lacks(self._members(closed_ns), self._members(math.inf))
         return self._publish("provisional" if is_ahead else "closed", closed_ns, now_ns)
 

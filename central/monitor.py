@@ -119,9 +119,6 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
-    """Compute the covariance scale of the team (the empty name) and of each robot, where
-    defined.
-    """
     streams = [each[0] for each in submaps]
     chi2, dof = (np.array([each[k] for each in submaps], np.float64) for k in (2, 3))
     places: dict[str, list[int]] = {"": list(range(len(submaps)))}
@@ -140,9 +137,6 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
 
 
 def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> list[str]:
-    """Warn of a team or robots with covariances far too small; with `small`, also of too large
-    ones.
-    """
     judged = {who: each for who, each in scales.items() if small or each.value > 1.0}
     words_of = {
         who: words for who, each in judged.items() if who and (words := _misscale(each, ROBOT_WARN))

@@ -110,7 +110,6 @@ class CentralNode:
         return refused
 
     def _admit(self, message: m.Message) -> None:
-        """Admit a robot that announces itself, or whose driver begins its stream."""
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)
@@ -172,7 +171,6 @@ class CentralNode:
                 return []
 
     def _file_submap(self, submap: m.Submap) -> list[Outgoing]:
-        """File a submap and acknowledge it, refused or not."""
         self._warn_of_refusal(self.store.add_submap(submap))
         return self._credit_of(submap, self.store.acknowledged(_stream_of(submap)))
 

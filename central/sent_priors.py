@@ -87,7 +87,6 @@ class SentPriors:
         return self._withdrawn(outside)
 
     def _withdrawn(self, streams: Iterable[Stream]) -> list[Stream]:
-        """Select the streams not withdrawn before, and note them as withdrawn."""
         new = [s for s in sorted(streams) if s not in self._sent or self._sent[s] is not None]
         self._sent |= dict.fromkeys(new)
         return new

@@ -151,7 +151,6 @@ class TickFold:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
 
     def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
-        """Fold the ticks from this one on again, without withdrawn robots."""
         until_ns = self._until_ns
         if math.isfinite(tick):
             self._roll_back(tick)
@@ -216,7 +215,6 @@ class TickFold:
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
     def _push_tick(self, tick: int) -> bool:
-        """Fold a tick and test it where due; return whether the conviction changed."""
         before = self.checkpoints.tick
         fold = self._fold_tick(self.fold, tick)
         self.checkpoints.push(tick, fold)
@@ -291,7 +289,6 @@ class TickFold:
         return True
 
     def _try_robots(self, fold: Fold, until_ns: float) -> Trial | None:
-        """Hold a trial of a fold up to this time; return None where no robot is suspect."""
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
             return None

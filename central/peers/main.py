@@ -140,7 +140,6 @@ class PeerShell(RobotShell):
         self._log(members)
 
     def _log(self, members: Sequence[Member]) -> None:
-        """Log members that the robot's own log may have lost when the process died."""
         tap: Tap | None = getattr(self.bus, "tap", None)
         if tap is not None and members:
             now_ns = time.time_ns()

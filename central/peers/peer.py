@@ -188,7 +188,6 @@ class Peer:
         return self._from_fold(self.fold.grow())
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """Convert the fold's messages to those that this node publishes."""
         return list(messages)
 
     def refresh(self) -> list[Outgoing]:

@@ -114,9 +114,6 @@ class PeerRobot(Peer):
         return True
 
     def _own_stored(self) -> list[m.Message]:
-        """Return the estimator's stored messages of each incarnation of its own stream, the latest
-        first.
-        """
         found: list[m.Message] = []
         own = (s for s in self.peer.replica.streams if s[0] == self.robot)
         for stream in sorted(own, reverse=True):
@@ -148,7 +145,6 @@ class PeerRobot(Peer):
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str
     ) -> list[Outgoing]:
-        """Route a member, a measurement, or another message for the estimator."""
         out: list[Outgoing] = []
         if channel is not None and channel in CHANNELS:
             self.peer.take_sample(sample, channel.publisher(name))

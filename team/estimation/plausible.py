@@ -109,7 +109,6 @@ def _far(coordinates: Values, limit_m: float, of: str) -> str | None:
 
 
 def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | None:
-    """Give the reason why a covariance with these headings is refused."""
     variances = np.diag(covariance)
     if not (variances > 0.0).all():
         return "a variance that is not positive"

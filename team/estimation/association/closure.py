@@ -441,7 +441,6 @@ def _find_reachable(view: IslandView, patch: Indices) -> Indices:
 
 
 def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
-    """Make a side of an island's landmarks, with the views of some submaps."""
     n = len(view.ids)
     own = view.joint.covariance.reshape(n, 2, n, 2)[at, :, at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))

@@ -125,7 +125,6 @@ def _wrap(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def _apply_step(
     poses: Float[np.ndarray, "K 3"], steps: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "K 3"]:
-    """Move each pose by a step (forward, left, turn); Exp to first order."""
     xi = steps.reshape(-1, 3)
     went = np.einsum("kij,kj->ki", rotations(poses[:, 2]), xi[:, :2])
     return np.column_stack((poses[:, :2] + went, _wrap(poses[:, 2] + xi[:, 2])))

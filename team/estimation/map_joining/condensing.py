@@ -131,7 +131,6 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
 
 
 def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
-    """Attach the memory, numbered as in the graph before."""
     graph = smaller.graph
     node_of = np.full(len(before.fixed), -1, np.int64)
     for id_, node in before.landmarks.items():

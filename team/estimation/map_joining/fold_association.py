@@ -227,7 +227,6 @@ def _record(
 
 
 def _merge_near(fold: Fold, key: Stream) -> Fold:
-    """Merge the landmarks that a closure has brought close to each other: all against all."""
     view = view_island(fold.islands[key], fold.landmarks)
     everything = np.arange(len(view.ids))
     view.grow("near", everything, everything, view.profile.near)

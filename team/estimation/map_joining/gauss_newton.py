@@ -518,7 +518,6 @@ def _largest(step: Values) -> float:
 
 
 def _eased(damping: float) -> float:
-    """Reduce the damping for the next iteration, whose robust scale changes the cost."""
     return 0.0 if damping == STUCK else damping
 
 

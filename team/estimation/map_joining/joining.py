@@ -342,7 +342,6 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
 
 
 def _search(island: Island) -> Search:
-    """Search the island's full solution; where there is none, the island is unchanged."""
     with suppress(*UNSOLVABLE):
         found = searched([island])
         if is_solvable(found.best.island):

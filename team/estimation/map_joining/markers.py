@@ -57,9 +57,6 @@ def warn_of_unmarked(island: Island) -> list[str]:
 
 
 def _find_unmarked(island: Island) -> dict[int, int]:
-    """Find the nodes and numbers of unnamed landmarks without a marker state; none where the
-    settings have no marker errors.
-    """
     graph = island.graph
     if "marker" not in island.settings.common_bias_sigma:
         return {}

@@ -115,7 +115,6 @@ def placed(
 def _places(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> list[Float[np.ndarray, "3"]]:
-    """Propose further places of the other island from its shared points."""
     by_landmarks = [tie for tie in tied if tie.seen is None]
     by_sightings = [tie for tie in tied if tie.seen is not None]
     proposed: list[Alignment | None] = []
@@ -142,7 +141,6 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
 
 
 def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
-    """Describe the ties of a merged island, and the certainty of its place."""
     node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
     sigma_m = deviation(covariance[0, 0] + covariance[1, 1])

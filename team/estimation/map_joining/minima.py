@@ -229,7 +229,6 @@ def _further(island: Island) -> Iterator[Island]:
 
 
 def _at_rest(best: Minimum) -> Minimum:
-    """Solve a minimum further from its own state, until it has settled."""
     for _ in range(MORE_SOLUTIONS):
         if best.change <= SETTLED_M:
             break

@@ -169,7 +169,6 @@ def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) 
 
 
 def _add(H: Matrix, g: Values, sizes: Indices, nodes: Indices, left: list[Left]) -> None:
-    """Add quadratics over parts of these nodes."""
     first = np.concatenate([[0], np.cumsum(sizes[nodes])])
     for each in left:
         within = places(first, np.searchsorted(nodes, each.nodes))

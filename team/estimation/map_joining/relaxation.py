@@ -72,9 +72,6 @@ def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
 def _least_squares(
     rows: Sequence[_Rows], numbers: Values, free: Bool[np.ndarray, " _"]
 ) -> Values | None:
-    """Minimise the weighted residuals over the free numbers, given the others; None if
-    undetermined.
-    """
     from scipy.sparse import csc_array, tril  # slow to import, and no robot uses it
 
     weighted = [each.weights[:, None] * each.coefficients for each in rows]

@@ -594,7 +594,6 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
 
 
 def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
-    """Transform a node's value into the main frame; a bias has no frame."""
     if len(value) == 3:
         return compose(main_from_other, value)
     return transformed(main_from_other, value) if len(value) == 2 else value
