@@ -119,6 +119,7 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
+    """Compute the covariance scale of the team (the empty name) and of each robot."""
     streams = [each[0] for each in submaps]
     chi2, dof = (np.array([each[k] for each in submaps], np.float64) for k in (2, 3))
     places: dict[str, list[int]] = {"": list(range(len(submaps)))}

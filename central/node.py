@@ -110,6 +110,7 @@ class CentralNode:
         return refused
 
     def _admit(self, message: m.Message) -> None:
+        """Admit a robot that announces itself, or whose driver begins its stream."""
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)

@@ -215,6 +215,7 @@ class TickFold:
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
     def _push_tick(self, tick: int) -> bool:
+        """Fold a tick and test it where due; return whether the conviction changed."""
         before = self.checkpoints.tick
         fold = self._fold_tick(self.fold, tick)
         self.checkpoints.push(tick, fold)
