@@ -218,7 +218,7 @@ class Window:
         Compute the weighted mean (K, 3) of the poses at each keyframe, headings on the circle.
         """
 
-    def sights(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64]]:
+    def measurements(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64]]:
         """
         Copy the measurements: keyframes (N,), ids (N,), (range, bearing) (N, 2), and the covariances that they
         bring (N, 4), or (N, 0) where they bring none.

@@ -32,7 +32,7 @@ def bytes_of(window: core.Window) -> list[bytes]:
     arrays = (
         *window.particles(),
         window.paths(),
-        *window.sights(),
+        *window.measurements(),
         window.nodes(),
         *window.close()[:3],
     )
@@ -99,6 +99,22 @@ def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one
         with pytest.raises(core.MotionError, match="not positive semi-definite"):
             refused()
     assert bytes_of(window) == kept
+
+
+@pytest.mark.parametrize("place", [0, 2, 3, 4])
+def test_a_sensor_without_noise_or_white_noise_is_refused(place: int) -> None:
+    noise = (*NOISE[:place], 0.0, *NOISE[place + 1 :])
+    with pytest.raises(ValueError, match="of the sensor must be"):
+        core.Window(M, noise)
+
+
+def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes() -> None:
+    window = core.Window(M, NOISE, mount=(0.3, 0.1, 0.7))
+    window.advance(*KEYFRAME)
+    based = window.of_base()
+    for use in (based.close, based.run, lambda: based.advance(*KEYFRAME)):
+        with pytest.raises(ValueError, match="no measurements of its own"):
+            use()
 
 
 def test_a_copy_is_a_window_of_its_own() -> None:
@@ -173,7 +189,7 @@ def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path() -
     with pytest.raises(IndexError):
         core.Window(M, NOISE).mark()
     window = opened()
-    keyframes, seen, measurements, own = window.sights()
+    keyframes, seen, measurements, own = window.measurements()
     _, _, ids, means, covariances = window.particles()
     solved = (ids, means, covariances, window.paths())
     core.landmarks_along_paths(*solved, keyframes, seen, measurements, own, NOISE)

@@ -59,7 +59,7 @@ void add(Sums<T>& s, const Line<T>& at, T of_range, T of_bearing, T wr, T wb) {
 
 // Adds a measurement's terms by the covariance that it brings, with those between range and bearing.
 template <class T>
-void add_claim(Sums<T>& s, const Line<T>& at, const Sight& z, const Noise& noise) {
+void add_claim(Sums<T>& s, const Line<T>& at, const WindowMeasurement& z, const Noise& noise) {
   const T distance = at.distance, ex = at.ex, ey = at.ey;
   T of_range = z.range - distance, of_bearing = at.off;
   T rr = pack::all<T>(z.claim.rr), rb = pack::all<T>(z.claim.rb), bb = pack::all<T>(z.claim.bb);
@@ -127,7 +127,7 @@ void eliminate_errors(Sums<T>& s, const Noise& noise) {
 // Solves one landmark of some particles. pose_at: their poses at a keyframe; range_weights: as many
 // as there are measurements, of the range as the first evaluation predicts it.
 template <class T, class Path>
-Landmark<T> solve(const Landmark<T>& start, std::span<const Sight> sights, const Noise& noise, Path&& pose_at,
+Landmark<T> solve(const Landmark<T>& start, std::span<const WindowMeasurement> measurements, const Noise& noise, Path&& pose_at,
                   std::span<T> range_weights) {
   Landmark<T> best = start;
   T at_x = start.x, at_y = start.y, least = pack::all<T>(INF);
@@ -136,8 +136,8 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const Sight> sights, const
   for (int step = 0; step <= STEPS; step++) {
     Sums<T> s;
     s.bearing_variance = pack::all<T>(noise.bearing_variance);
-    for (std::size_t k = 0; k < sights.size(); k++) {
-      const Sight& z = sights[k];
+    for (std::size_t k = 0; k < measurements.size(); k++) {
+      const WindowMeasurement& z = measurements[k];
       const Line<T> line = line_to<T>(at_x, at_y, pose_at(z.keyframe), z.bearing);
       if (z.claim.is_made()) {
         add_claim(s, line, z, noise);
@@ -169,13 +169,13 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const Sight> sights, const
 }  // namespace
 
 Rows landmarks_along_paths(std::span<const std::uint32_t> ids, const Rows& starts, const Rows& path,
-                           std::span<const Sight> sights, const Noise& noise) {
+                           std::span<const WindowMeasurement> measurements, const Noise& noise) {
   Rows solved(starts.count(), starts.rows());
-  std::vector<Sight> of_one;
-  std::vector<Pack> range_weights(sights.size());
+  std::vector<WindowMeasurement> of_one;
+  std::vector<Pack> range_weights(measurements.size());
   for (std::size_t slot = 0; slot < ids.size(); slot++) {
     of_one.clear();
-    for (const Sight& each : sights)
+    for (const WindowMeasurement& each : measurements)
       if (each.id == ids[slot]) of_one.push_back(each);
     for (std::size_t at = 0; at < starts.stride(); at += WIDTH) {
       const auto row = [&](std::size_t k) { return load(starts[5 * slot + k] + at); };

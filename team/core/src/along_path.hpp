@@ -6,7 +6,7 @@
 namespace teamslam::window {
 
 // One measurement of a window, as it was read at one of its keyframes.
-struct Sight {
+struct WindowMeasurement {
   std::uint32_t id;
   std::size_t keyframe;
   double range, bearing;
@@ -25,6 +25,6 @@ struct Sight {
 // ids, starts: the landmarks, five rows each as of `Particles::map`; path: x, y, heading of each
 // keyframe. Returns rows as `starts` has them.
 Rows landmarks_along_paths(std::span<const std::uint32_t> ids, const Rows& starts, const Rows& path,
-                           std::span<const Sight> sights, const Noise& noise);
+                           std::span<const WindowMeasurement> measurements, const Noise& noise);
 
 }  // namespace teamslam::window

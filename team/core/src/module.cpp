@@ -131,6 +131,9 @@ MadeParticles made_particles(const Particles& p) {
 
 models::Noise noise_of(const std::array<double, 5>& noise) {
   check_finite(noise.data(), 5, "the noise of the sensor");
+  check(noise[0] > 0.0 && noise[1] >= 0.0 && noise[3] > 0.0, "the variances of the sensor must be positive");
+  check(noise[2] > 0.0 && noise[2] <= 1.0 && noise[4] > 0.0 && noise[4] <= 1.0,
+        "the white shares of the sensor must be in (0, 1]");
   return {noise[0], noise[1], noise[2], noise[3], noise[4]};
 }
 
@@ -338,15 +341,15 @@ void bind_particles(nb::module_& m) {
         check(means.shape(0) > 0 && means.shape(1) == ids.size(), "means must be (M, L, 2), M > 0");
         finite(measurements, "measurements");
         const std::span<const models::Claim> claims = claims_of(own, n);
-        std::vector<window::Sight> sights;
+        std::vector<window::WindowMeasurement> taken;
         for (std::size_t k = 0; k < n; k++) {
           check(keyframes(k) >= 0 && std::size_t(keyframes(k)) < paths.shape(0), "a keyframe is not in the paths");
-          sights.push_back({seen(k), std::size_t(keyframes(k)), measurements(k, 0), measurements(k, 1),
+          taken.push_back({seen(k), std::size_t(keyframes(k)), measurements(k, 0), measurements(k, 1),
                             claims.empty() ? models::OF_SENSOR : claims[k]});
         }
         const Rows solved =
             window::landmarks_along_paths({ids.data(), ids.size()}, map_of(means.shape(0), means, covariances),
-                                          path_of(paths, means.shape(0)), sights, noise_of(noise));
+                                          path_of(paths, means.shape(0)), taken, noise_of(noise));
         return std::tuple(made_landmarks(solved, 0, 2), made_landmarks(solved, 2, 3));
       },
       "ids"_a.noconvert(), "means"_a, "covariances"_a, "paths"_a, "keyframes"_a.noconvert(), "seen"_a.noconvert(), "measurements"_a, "own"_a, "noise"_a,
@@ -502,16 +505,16 @@ void bind_window(nb::module_& m) {
           },
           "Compute the weighted mean (K, 3) of the poses at each keyframe, headings on the circle.")
       .def(
-          "sights",
+          "measurements",
           [](const Window& self) {
-            const std::span<const window::Sight> sights = self.sights();
-            const std::size_t n = sights.size();
+            const std::span<const window::WindowMeasurement> taken = self.measurements();
+            const std::size_t n = taken.size();
             const bool has_claims =
-                std::any_of(sights.begin(), sights.end(), [](const window::Sight& each) { return each.claim.is_made(); });
+                std::any_of(taken.begin(), taken.end(), [](const window::WindowMeasurement& each) { return each.claim.is_made(); });
             std::vector<std::int64_t> keyframes;
             std::vector<std::uint32_t> ids;
             std::vector<double> measurements, own;
-            for (const window::Sight& each : sights) {
+            for (const window::WindowMeasurement& each : taken) {
               keyframes.push_back(std::int64_t(each.keyframe));
               ids.push_back(each.id);
               measurements.insert(measurements.end(), {each.range, each.bearing});

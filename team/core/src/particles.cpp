@@ -88,9 +88,9 @@ void Particles::resample(double uniform, Rows& path) {
   forget_weights();
 }
 
-std::vector<Sighting> Particles::find(std::span<const std::uint32_t> observed, std::span<const Reading> readings) {
+std::vector<ScanMeasurement> Particles::find(std::span<const std::uint32_t> observed, std::span<const Reading> readings) {
   const std::size_t before = landmarks();
-  std::vector<Sighting> scan;
+  std::vector<ScanMeasurement> scan;
   scan.reserve(observed.size());
   for (std::size_t k = 0; k < observed.size(); k++) {
     const std::size_t slot = slot_of(observed[k]);
@@ -102,7 +102,7 @@ std::vector<Sighting> Particles::find(std::span<const std::uint32_t> observed, s
   return scan;
 }
 
-void Particles::step(const Motion& motion, const Lower3& L, bool improved, std::span<const Sighting> scan,
+void Particles::step(const Motion& motion, const Lower3& L, bool improved, std::span<const ScanMeasurement> scan,
                      std::span<const double> normals) {
   Rows drawn(count(), 3);
   for (std::size_t j = 0; j < 3; j++) drawn.set(j, &normals[j], 3);
@@ -112,7 +112,7 @@ void Particles::step(const Motion& motion, const Lower3& L, bool improved, std::
     MotionNoise<Pack> noise;
     Pack log_weight{};
     if (improved)
-      for (const Sighting& each : scan)
+      for (const ScanMeasurement& each : scan)
         if (each.is_known) {
           const Landmark<Pack> mark = landmark(each.slot, at);
           log_weight += condition(noise, L, mark, predict(se2::moved_by_noise(start, L, noise.m), mark, each.reading));
@@ -120,7 +120,7 @@ void Particles::step(const Motion& motion, const Lower3& L, bool improved, std::
     const Pack normal[3] = {load(drawn[0] + at), load(drawn[1] + at), load(drawn[2] + at)};
     log_weight += draw(noise, normal);
     const Directed<Pack> end = se2::moved_by_noise(start, L, noise.m);
-    for (const Sighting& each : scan) {
+    for (const ScanMeasurement& each : scan) {
       Landmark<Pack> mark;
       if (each.is_first) {
         mark = models::place(end, each.reading);

@@ -15,7 +15,7 @@ using models::Claim, models::Noise, models::Reading;
 using se2::Directed, se2::Motion;
 
 // One measurement of a scan: the slot of its landmark, and whether it is its first sight.
-struct Sighting {
+struct ScanMeasurement {
   std::size_t slot;
   bool is_known, is_first;  // is_known: from before the scan
   Reading reading;
@@ -52,7 +52,7 @@ struct Particles {
   void resample(double uniform, Rows& path);
 
   // Finds the scan's landmarks, and makes room for those that are new.
-  std::vector<Sighting> find(std::span<const std::uint32_t> ids, std::span<const Reading> readings);
+  std::vector<ScanMeasurement> find(std::span<const std::uint32_t> ids, std::span<const Reading> readings);
 
   // Poses pose ∘ motion ∘ Exp(L ε), then every landmark of the scan given them.
   //
@@ -64,7 +64,7 @@ struct Particles {
   //
   // A first sight has a flat prior and adds nothing; a second measurement of it in the same scan
   // updates it, but has no part in the proposal. normals: (M, 3).
-  void step(const Motion& motion, const Lower3& L, bool improved, std::span<const Sighting> scan,
+  void step(const Motion& motion, const Lower3& L, bool improved, std::span<const ScanMeasurement> scan,
             std::span<const double> normals);
 
   Rows pose;                        // x [m], y [m], heading [rad]

@@ -47,6 +47,7 @@ Window::Window(const Settings& settings)
       effective_(effective_sample_size({particles_.log_weights.data(), settings.particles})) {}
 
 std::vector<Reading> Window::readings_of(const Scan& scan) const {
+  check_of_sensor();
   std::vector<Reading> readings;
   readings.reserve(scan.ids.size());
   for (std::size_t k = 0; k < scan.ids.size(); k++)
@@ -86,7 +87,7 @@ double Window::take(const Motion& motion, const Lower3& L, const Scan& scan, std
   const double log_evidence = normalise(log_weights);
   effective_ = effective_sample_size(log_weights);
   for (std::size_t k = 0; k < scan.ids.size(); k++)
-    sights_.push_back({scan.ids[k], keyframes(), scan.ranges[k], scan.bearings[k], scan.claim(k)});
+    measurements_.push_back({scan.ids[k], keyframes(), scan.ranges[k], scan.bearings[k], scan.claim(k)});
   path_.append(particles_.pose);
   return log_evidence;
 }
@@ -109,6 +110,10 @@ void Window::replace(Particles particles, Rows path) {
   effective_ = effective_sample_size({particles_.log_weights.data(), particles_.count()});
 }
 
+void Window::check_of_sensor() const {
+  if (is_of_base_) throw std::invalid_argument("the window of a base has no measurements of its own");
+}
+
 Window Window::of_base() const {
   Window based = *this;
   if (settings_.mount.is_mounted()) {
@@ -116,17 +121,20 @@ Window Window::of_base() const {
     move_poses(settings_.mount, based.path_);
     move_landmarks(settings_.mount, based.particles_.map);
     based.settings_.mount = {};
+    based.is_of_base_ = true;
   }
   return based;
 }
 
 Rows Window::solved_landmarks() const {
-  return landmarks_along_paths(particles_.ids, particles_.map, path_, sights_, settings_.noise);
+  check_of_sensor();
+  return landmarks_along_paths(particles_.ids, particles_.map, path_, measurements_, settings_.noise);
 }
 
 Gaussian Window::run() const { return gaussian(false, settings_.noise.is_white() ? particles_.map : solved_landmarks()); }
 
 Gaussian Window::gaussian(bool with_nodes, Rows landmarks) const {
+  check_of_sensor();
   Rows poses = particles_.pose;
   if (with_nodes)
     for (const std::size_t keyframe : nodes_) {

@@ -1,7 +1,7 @@
 // One window of Hybrid-SLAM: particles that start at zero, and the one Gaussian they become.
 //
-// Poses are the sensor's, in the frame of the window's start of the sensor; a Gaussian is that of
-// the base, in the frame of its start. Brooks and Bailey 2009, HybridSLAM.
+// Poses are of the sensor, relative to the sensor's pose at the window's start; a Gaussian is of the
+// base, relative to the base's pose there. Brooks and Bailey 2009, HybridSLAM.
 #pragma once
 
 #include <stdexcept>
@@ -80,7 +80,8 @@ class Window {
   // The landmarks of each particle solved over all measurements, rows in order of first sight.
   Rows solved_landmarks() const;
 
-  // The window as one of the base: poses and landmarks in the frame of the base's start.
+  // Poses and landmarks in the frame of the base's start. The measurements stay the sensor's, so this
+  // window neither advances nor closes: it throws std::invalid_argument.
   Window of_base() const;
 
   // Replaces the paths of the particles, and what follows from them.
@@ -90,11 +91,12 @@ class Window {
   const Particles& particles() const { return particles_; }
   const Rows& path() const { return path_; }
   std::size_t keyframes() const { return path_.rows() / 3; }
-  std::span<const Sight> sights() const { return sights_; }
+  std::span<const WindowMeasurement> measurements() const { return measurements_; }
   std::span<const std::size_t> nodes() const { return nodes_; }
   double effective() const { return effective_; }
 
  private:
+  void check_of_sensor() const;
   Gaussian gaussian(bool with_nodes, Rows landmarks) const;
   double take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
               std::span<const double> normals);
@@ -104,9 +106,10 @@ class Window {
   Settings settings_;
   Particles particles_;
   Rows path_;  // x, y, heading of each keyframe, along each particle's line of descent
-  std::vector<Sight> sights_;
+  std::vector<WindowMeasurement> measurements_;
   std::vector<std::size_t> nodes_;  // the keyframe of each pose node
   double effective_;
+  bool is_of_base_ = false;
 };
 
 }  // namespace teamslam::window

@@ -65,22 +65,22 @@ class Window(msgspec.Struct, frozen=True, gc=False):
     @property
     def keyframes(self) -> Int64[np.ndarray, " N"]:
         """The keyframe of each measurement, in [0, K)."""
-        return self.core.sights()[0]
+        return self.core.measurements()[0]
 
     @property
     def ids(self) -> UInt32[np.ndarray, " N"]:
         """The landmark of each measurement."""
-        return self.core.sights()[1]
+        return self.core.measurements()[1]
 
     @property
     def measurements(self) -> Float[np.ndarray, "N 2"]:
         """(range [m], bearing [rad]) with the sensor's calibration applied."""
-        return self.core.sights()[2]
+        return self.core.measurements()[2]
 
     @property
     def own(self) -> Own:
         """The noises that the measurements claim (`team.estimation.scans`)."""
-        return self.core.sights()[3]
+        return self.core.measurements()[3]
 
     @property
     def node_keyframes(self) -> Int64[np.ndarray, " nodes"]:
@@ -230,7 +230,7 @@ def _sensitivity(
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
     mount, is_mounted = np.array(window.sensor.mount), window.sensor.is_mounted
     ids, mean = submap
-    keyframes, seen, _, own = window.core.sights()
+    keyframes, seen, _, own = window.core.measurements()
     end, points = mean[:3], mean[3 + 3 * len(nodes) :].reshape(-1, 2)
     if is_mounted:
         away = inverse(mount)
