@@ -6,8 +6,6 @@ import shutil
 import subprocess
 import sys
 import tomllib
-import zipfile
-from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -54,47 +52,6 @@ def tracked() -> list[Path]:
     listed = subprocess.run([git, "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
     files = [ROOT / name for name in listed.stdout.decode().split("\0") if name]
     return [file for file in files if file.is_file()]
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
-    """The wheel, built from a copy with the build tools at hand, so that nothing is fetched."""
-    source = tmp_path_factory.mktemp("source")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    for package in PACKAGES:
-        shutil.copytree(
-            ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__", "*.so")
-        )
-    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet"]
-    command += ["--no-index", "--wheel-dir", str(source / "dist"), str(source)]
-    subprocess.run(command, check=True, capture_output=True, timeout=600)
-    (built,) = (source / "dist").glob("*.whl")
-    with zipfile.ZipFile(built) as archive:
-        yield archive
-
-
-def test_the_wheel_holds_the_three_packages_their_scenarios_and_nothing_else(
-    wheel: zipfile.ZipFile,
-) -> None:
-    about = f"teamslam-{PROJECT['version']}.dist-info/"
-    shipped = {name for name in wheel.namelist() if not name.startswith(about)}
-    expected = {
-        path.relative_to(ROOT).as_posix()
-        for package in PACKAGES
-        for path in (ROOT / package).rglob("*")
-        if path.suffix in {".py", ".pyi", ".toml", ".html", ".js", ".css", ".svg"}
-        or path.name == "py.typed"
-    }
-    modules = {
-        name for name in shipped if name.startswith("team/core/_core_") and name.endswith(".so")
-    }
-    assert modules
-    assert shipped - modules == {name for name in expected if "team/core/building/" not in name}
-    assert {f"{package}/py.typed" for package in PACKAGES} <= shipped
-    assert {
-        f"sim/scenarios/builtin/{n}.toml" for n in ("thesis", "thesis-b", "waypoints")
-    } <= shipped
 
 
 def test_the_changelog_tells_of_this_version() -> None:

@@ -1,10 +1,15 @@
 """The program as it is installed: from its wheel, and beside folders that are named as its own."""
 
 import shutil
+import subprocess
 import sys
 import sysconfig
+import tomllib
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+
+import pytest
 
 from sim.scenarios.scenario import builtin_names
 from team.recording.reader import open_log
@@ -14,6 +19,8 @@ from tests.system.scenarios import short
 
 PACKAGES = ("team", "central", "sim")
 COMMAND = Path(sys.executable).with_name("teamslam")
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+OFFLINE = ("--no-deps", "--no-index")
 
 
 async def test_a_user_s_own_folders_do_not_shadow_ours(team: Processes) -> None:
@@ -38,24 +45,55 @@ async def done(team: Processes, name: str, command: Sequence[object]) -> str:
     return process.said()
 
 
-async def test_the_wheel_runs_in_an_environment_of_its_own(team: Processes) -> None:
-    """Our dependencies are lent by the environment of the tests; nothing is fetched."""
-    source, fresh = team.folder / "source", team.folder / "fresh"
-    source.mkdir()
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from a copy with the build tools at hand, so that nothing is fetched."""
+    source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     for package in PACKAGES:
         leave = shutil.ignore_patterns("__pycache__", "*.so")
         shutil.copytree(ROOT / package, source / package, ignore=leave)
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-    offline = ["--no-deps", "--no-index"]
-    build = [*pip, "wheel", *offline, "--no-build-isolation", "--wheel-dir", "dist", source]
-    await done(team, "build", build)
-    (wheel,) = (team.folder / "dist").glob("*.whl")
+    build = [
+        *PIP,
+        "wheel",
+        *OFFLINE,
+        "--no-build-isolation",
+        "--wheel-dir",
+        source / "dist",
+        source,
+    ]
+    subprocess.run(build, check=True, capture_output=True, timeout=600)
+    (built,) = (source / "dist").glob("*.whl")
+    return built
 
+
+def test_the_wheel_holds_the_three_packages_and_nothing_else(wheel: Path) -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    about = f"teamslam-{version}.dist-info/"
+    with zipfile.ZipFile(wheel) as archive:
+        shipped = {name for name in archive.namelist() if not name.startswith(about)}
+        assert f"{about}licenses/LICENSE" in archive.namelist()
+    expected = {
+        path.relative_to(ROOT).as_posix()
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*")
+        if path.suffix in {".py", ".pyi", ".toml", ".html", ".js", ".css", ".svg"}
+        or path.name == "py.typed"
+    }
+    modules = {
+        name for name in shipped if name.startswith("team/core/_core_") and name.endswith(".so")
+    }
+    assert modules
+    assert shipped - modules == {name for name in expected if "team/core/building/" not in name}
+
+
+async def test_the_wheel_runs_in_an_environment_of_its_own(team: Processes, wheel: Path) -> None:
+    """Our dependencies are lent by the environment of the tests; nothing is fetched."""
+    fresh = team.folder / "fresh"
     await done(team, "venv", [sys.executable, "-m", "venv", "--without-pip", fresh])
     python = fresh / "bin" / "python"
-    install = [pip[0], "-m", "pip", "--python", python, *pip[3:], "install", *offline, wheel]
+    install = [PIP[0], "-m", "pip", "--python", python, *PIP[3:], "install", *OFFLINE, wheel]
     await done(team, "install", install)
     (packages,) = fresh.glob("lib/python*/site-packages")
     (packages / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
