@@ -43,7 +43,7 @@ MOST_WARNINGS = 64
 """Number of the newest warnings that are kept."""
 
 Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWindow]
-"""What is sent instead of a closed window, given the team's map and the submaps before it."""
+"""Replacement of a closed window, given the team's map and the submaps before it."""
 
 
 class Mapper:
@@ -150,7 +150,7 @@ class Mapper:
         self._taking = measurement
         # A scan comes before the odometry that ends at its stamp, and that may end a window.
         is_odometry = isinstance(measurement, m.AnyOdometry)
-        stamp_ns = measurement.stamp_ns + (self._offset_ns if is_odometry else 0)
+        stamp_ns = self._team_ns(measurement)
         # Where its clock has leapt too far, no receiver takes a submap with such a stamp.
         is_near = another_time(stamp_ns, self._began_ns) is None
         if is_near:
@@ -161,6 +161,11 @@ class Mapper:
             return self.drive(measurement, is_near)
         self.account(measurement, self._observe(measurement, is_near))
         return False
+
+    def _team_ns(self, measurement: m.Measurement) -> int:
+        """Team time of a measurement [ns]: odometry is stamped by its own clock."""
+        offset_ns = self._offset_ns if isinstance(measurement, m.AnyOdometry) else 0
+        return measurement.stamp_ns + offset_ns
 
     def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
         """Account for the measurement in progress and add it to the open window."""
@@ -318,7 +323,7 @@ class Mapper:
         """Compute the open window again from its measurements."""
         self._reopen_window()
         for measurement in self._window:
-            is_near = another_time(measurement.stamp_ns, self._began_ns) is None
+            is_near = another_time(self._team_ns(measurement), self._began_ns) is None
             self.note_input(measurement.number)
             if isinstance(measurement, m.AnyOdometry):
                 interval, rejected = self.judge_interval(measurement, is_near)

@@ -95,18 +95,24 @@ void add_claim(Sums<T>& s, const Line<T>& at, const WindowMeasurement& z, const 
   add(s, at, of_range, of_bearing, wr, wb);
 }
 
+// Subtracts the share of an eliminated error, whose sums are total and (x, y), from the landmark's.
+template <class T>
+void deduct(Sums<T>& s, const T& share, const T& total, const T& x, const T& y) {
+  s.cost -= share * total * total;
+  s.gx -= share * total * x;
+  s.gy -= share * total * y;
+  s.xx -= share * x * x;
+  s.xy -= share * x * y;
+  s.yy -= share * y * y;
+}
+
 // Eliminates the constant errors of range and bearing, one after the other, by Schur's complement.
 template <class T>
 void eliminate_errors(Sums<T>& s, const Noise& noise) {
   if (noise.range_white < 1.0) {
     const T constant = (1.0 - noise.range_white) * s.range_variance, share = 1.0 / (s.range_weight + 1.0 / constant);
     const T total = s.range_sum, rx = s.rx, ry = s.ry, cross = s.cross;
-    s.cost -= share * total * total;
-    s.gx -= share * total * rx;
-    s.gy -= share * total * ry;
-    s.xx -= share * rx * rx;
-    s.xy -= share * rx * ry;
-    s.yy -= share * ry * ry;
+    deduct(s, share, total, rx, ry);
     s.bearing_sum -= share * cross * total;
     s.bx -= share * cross * rx;
     s.by -= share * cross * ry;
@@ -114,13 +120,7 @@ void eliminate_errors(Sums<T>& s, const Noise& noise) {
   }
   if (noise.bearing_white < 1.0) {
     const T constant = (1.0 - noise.bearing_white) * s.bearing_variance, share = 1.0 / (s.bearing_weight + 1.0 / constant);
-    const T total = s.bearing_sum, bx = s.bx, by = s.by;
-    s.cost -= share * total * total;
-    s.gx -= share * total * bx;
-    s.gy -= share * total * by;
-    s.xx -= share * bx * bx;
-    s.xy -= share * bx * by;
-    s.yy -= share * by * by;
+    deduct(s, share, T(s.bearing_sum), T(s.bx), T(s.by));
   }
 }
 
