@@ -15,9 +15,6 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-from jaxtyping import Float
-
 from team.config import UNNAMED
 from team.ros2 import encoding as ros
 from team.ros2.arrivals import attachment
@@ -26,7 +23,7 @@ from team.ros2.encoding import Names, Pose, compose, inverse, names_of
 from team.ros2.keys import publication
 from team.ros2.topics import RobotTopics
 from team.wire import messages as m
-from team.wire.arrays import floats, ids, stamps
+from team.wire.arrays import floats, ids, landmark_blocks, stamps
 from team.wire.zenoh.foreign import ForeignKeys
 
 MOST_PATH = 2000
@@ -159,7 +156,7 @@ class Answers:
     def _map(self, message: m.FusedMap) -> list[Answer]:
         numbers = ids(message.ids, "ids").tolist()
         means = floats(message.means, "means").reshape(-1, 2)
-        blocks = landmark_blocks(message)
+        blocks = landmark_blocks(message.covariance, len(numbers), joint=message.joint)
         stamp_ns, frame = message.stamp_ns, self.names.map_frame
         named = [number < UNNAMED for number in numbers]
         labels = [str(n if n < UNNAMED else n - UNNAMED) for n in numbers]
@@ -184,21 +181,6 @@ class Answers:
         topic: str, kind: str, stamp_ns: int, message: Any, *, latched: bool = False
     ) -> Answer:
         return Answer(topic, kind, stamp_ns, ros.encode(message), latched)
-
-
-def landmark_blocks(message: m.FusedMap) -> Float[np.ndarray, "L 2 2"]:
-    """Each landmark's own covariance [m²]."""
-    values, count = floats(message.covariance, "covariance"), len(ids(message.ids, "ids"))
-    blocks = np.empty((count, 2, 2))
-    n = 2 * count if message.joint else 2
-    first = np.arange(0, n, 2)
-    at = first * n - first * (first - 1) // 2
-    if not message.joint:
-        xx, xy, yy = values.reshape(-1, 3).T
-    else:  # the packed upper triangle: row i begins at i n − i (i − 1)/2
-        xx, xy, yy = values[at], values[at + 1], values[at + n - first]
-    blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 0], blocks[:, 1, 1] = xx, xy, xy, yy
-    return blocks
 
 
 class RosPublisher:

@@ -23,6 +23,7 @@ from team.wire.arrays import (
     from_numbers,
     from_stamps,
     ids,
+    landmark_blocks,
     octets,
     stamps,
 )
@@ -307,15 +308,7 @@ def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
 
 def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray, "L 2 2"]:
     """The 2 × 2 covariance of each landmark."""
-    values = floats(message.covariance, "covariance").astype(np.float64)
-    if message.joint:  # row i of a packed upper triangle of n rows begins at i·n − i(i − 1)/2
-        n = 2 * (len(message.ids) // 4)
-        rows = np.arange(0, n, 2)
-        first, second = (i * n - i * (i - 1) // 2 for i in (rows, rows + 1))
-        xx, xy, yy = values[first], values[first + 1], values[second]
-    else:
-        xx, xy, yy = values.reshape(-1, 3).T
-    return np.stack((xx, xy, xy, yy), axis=1).reshape(-1, 2, 2)
+    return landmark_blocks(message.covariance, len(message.ids) // 4, joint=message.joint)
 
 
 LandmarkMap = TypeVar("LandmarkMap", m.MapEstimate, m.FusedMap)

@@ -245,3 +245,19 @@ def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
         raise ValueError(f"not positive definite: {what}") from None
     if factor.diagonal().min() ** 2 <= len(scaled) * EPSILON:
         raise ValueError(f"not positive definite: {what}")
+
+
+def landmark_blocks(covariance: bytes, count: int, *, joint: bool) -> np.ndarray:
+    """The 2 × 2 covariance of each landmark [m²], (count, 2, 2).
+
+    joint: the bytes are the packed upper triangle of all landmarks, else the packed blocks.
+    """
+    values = floats(covariance, "covariance").astype(np.float64)
+    if joint:  # row i of a packed upper triangle of n rows begins at i·n − i(i − 1)/2
+        n = 2 * count
+        rows = np.arange(0, n, 2)
+        first, second = (i * n - i * (i - 1) // 2 for i in (rows, rows + 1))
+        xx, xy, yy = values[first], values[first + 1], values[second]
+    else:
+        xx, xy, yy = values.reshape(-1, 3).T
+    return np.stack((xx, xy, xy, yy), axis=1).reshape(-1, 2, 2)

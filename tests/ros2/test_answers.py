@@ -13,7 +13,8 @@ from team.ros2.definitions import types
 from team.ros2.encoding import compose, ellipse, inverse, names_of
 from team.ros2.keys import of_rmw, of_token
 from team.ros2.topics import RobotTopics
-from team.ros2_answers import Answers, LiveAnswers, RosPublisher, landmark_blocks
+from team.ros2_answers import Answers, LiveAnswers, RosPublisher
+from team.translate import landmark_blocks_of
 from team.wire import messages as m
 from team.wire.arrays import from_floats, from_ids
 from team.wire.zenoh.foreign import ForeignKeys
@@ -87,12 +88,12 @@ def test_landmarks_have_ellipses_of_two_sigma_and_their_ids() -> None:
     markers = decoded(out["/r1/team_landmarks"]).markers
     assert markers[0].action == 3, "the landmarks of the map before are deleted first"
     drawn = [each for each in markers if each.ns == "landmarks" and each.action == 0]
-    major, minor, _ = ellipse(landmark_blocks(fused)[0])
+    major, minor, _ = ellipse(landmark_blocks_of(fused)[0])
     assert (drawn[0].scale.x, drawn[0].scale.y) == (major, minor)
     named = decoded(out["/r1/team_map"]).detections
     assert [each.id for each in named] == ["4", "7"]
     block = named[1].results[0].pose.covariance.reshape(6, 6)[:2, :2]
-    np.testing.assert_array_equal(block, landmark_blocks(fused)[1])
+    np.testing.assert_array_equal(block, landmark_blocks_of(fused)[1])
     assert all(out[topic].latched for topic in ("/r1/team_landmarks", "/r1/team_map"))
 
 
@@ -102,7 +103,7 @@ def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint: bool) -> Non
     blocks = np.array([P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)])
     data = packed(P) if joint else from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
     changed = {"ids": ids, "means": from_floats(range(6)), "covariance": data, "joint": joint}
-    np.testing.assert_array_equal(landmark_blocks(example(m.FusedMap, **changed)), blocks)
+    np.testing.assert_array_equal(landmark_blocks_of(example(m.FusedMap, **changed)), blocks)
 
 
 def test_an_ellipse_has_the_directions_of_its_covariance() -> None:
