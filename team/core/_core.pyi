@@ -48,6 +48,21 @@ def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy
 def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """The length of each (x, y)."""
 
+class Random:
+    """
+    Random numbers with defined bits: Philox 4x64-10 (Salmon et al. 2011), a function of its key and
+    of the count of numbers drawn before.
+    """
+
+    def __init__(self, key: bytes) -> None:
+        """Begin at the first number of a key of 16 bytes."""
+
+    def uniform(self) -> float:
+        """Draw a number in [0, 1)."""
+
+    def normals(self, rows: int, columns: int) -> NDArray[numpy.float64]:
+        """Draw standard normal numbers (rows, columns) (Box and Muller 1958)."""
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 
