@@ -21,9 +21,9 @@ std::string text_of(const Axes& axes) {
 
 std::span<const std::size_t> without(const Axes& axes, std::size_t last) { return {axes.data(), axes.size() - last}; }
 
-dense::Const square(const Table& table) {
-  check(table.shape(0) == table.shape(1), "the matrix must be square");
-  return matrix_of(table);
+dense::Const square(const Array& matrix) {
+  check(matrix.ndim() == 2 && matrix.shape(0) == matrix.shape(1), "the matrix must be square");
+  return {matrix.data(), matrix.shape(0), matrix.shape(0), matrix.shape(0)};
 }
 
 // A vector or a matrix, as a matrix of one or more columns of n rows.
@@ -115,7 +115,7 @@ void bind_dense(nb::module_& m) {
       "A"_a, "Invert a matrix or each of a stack. Raises LinAlgError where one is singular.");
   m.def(
       "cholesky",
-      [](const Table& A) {
+      [](const Array& A) {
         std::optional<dense::Matrix> L = dense::cholesky(square(A));
         if (!L) fail("Matrix is not positive definite");
         return made_matrix(std::move(*L));
@@ -124,28 +124,30 @@ void bind_dense(nb::module_& m) {
       "Compute the lower L with L L^T = A from the lower triangle of A.\n\n"
       "Raises LinAlgError where A is not positive definite.");
   m.def(
-      "inverse_of_factored", [](const Table& L) { return made_matrix(dense::inverse_from_factor(square(L))); }, "L"_a,
+      "inverse_of_factored", [](const Array& L) { return made_matrix(dense::inverse_from_factor(square(L))); }, "L"_a,
       "Compute (L L^T)^-1 of a lower triangular L, exactly symmetric.");
   m.def(
       "forward",
-      [](const Table& L, const Array& B) {
-        dense::Matrix right = columns_of(B, L.shape(0));
-        dense::solve_lower(square(L), right.view());
+      [](const Array& L, const Array& B) {
+        const dense::Const lower = square(L);
+        dense::Matrix right = columns_of(B, lower.rows);
+        dense::solve_lower(lower, right.view());
         return made_array(std::move(right).numbers(), axes_of(B));
       },
       "L"_a, "B"_a, "Compute L^-1 B of a lower triangular L; B is a vector or a matrix.");
   m.def(
       "solve_factored",
-      [](const Table& L, const Array& B) {
-        dense::Matrix right = columns_of(B, L.shape(0));
-        dense::solve_lower(square(L), right.view());
-        dense::solve_upper(matrix_of(L), right.view());
+      [](const Array& L, const Array& B) {
+        const dense::Const lower = square(L);
+        dense::Matrix right = columns_of(B, lower.rows);
+        dense::solve_lower(lower, right.view());
+        dense::solve_upper(lower, right.view());
         return made_array(std::move(right).numbers(), axes_of(B));
       },
       "L"_a, "B"_a, "Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.");
   m.def(
       "factor_or_fault",
-      [](const Table& P) {
+      [](const Array& P) {
         gaussian::Factor found = gaussian::factor_or_fault(square(P));
         return std::tuple(made_matrix(std::move(found.L)), int(found.fault));
       },

@@ -62,10 +62,54 @@ struct nanobind::detail::type_caster<Number> {
   }
 };
 
+// An array of any shape, read row by row: one of another layout is copied, faster than by nanobind.
+class Array {
+ public:
+  using Any = nb::ndarray<const double, nb::device::cpu>;
+
+  Array() = default;
+  explicit Array(Any&& from) : held_(std::move(from)), data_(held_.data()) {
+    std::int64_t step = 1;
+    bool is_in_order = true;
+    for (std::size_t i = ndim(); i-- > 0; step *= std::int64_t(shape(i)))
+      is_in_order = is_in_order && (shape(i) == 1 || held_.stride(i) == step);
+    if (is_in_order || size() == 0) return;
+    copied_.reserve(size());
+    copy(0, held_.data());
+    data_ = copied_.data();
+  }
+
+  const double* data() const { return data_; }
+  std::size_t size() const { return held_.size(); }
+  std::size_t ndim() const { return held_.ndim(); }
+  std::size_t shape(std::size_t i) const { return held_.shape(i); }
+
+ private:
+  void copy(std::size_t axis, const double* from) {
+    if (axis == ndim()) return copied_.push_back(*from);
+    for (std::size_t i = 0; i < shape(axis); i++) copy(axis + 1, from + std::int64_t(i) * held_.stride(axis));
+  }
+
+  Any held_;
+  std::vector<double> copied_;
+  const double* data_ = nullptr;
+};
+
+template <>
+struct nanobind::detail::type_caster<Array> {
+  NB_TYPE_CASTER(Array, make_caster<Array::Any>::Name)
+
+  bool from_python(handle from, std::uint8_t flags, cleanup_list* cleanup) noexcept {
+    make_caster<Array::Any> caster;
+    if (!caster.from_python(from, flags, cleanup)) return false;
+    value = Array(std::move(caster.value));
+    return true;
+  }
+};
+
 namespace teamslam::binding {
 
 // Arrays from Python, and arrays to Python.
-using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Numbers = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Table = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
