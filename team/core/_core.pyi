@@ -90,7 +90,7 @@ def squared(x: float) -> float:
     """
 
 @overload
-def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+def squared(x: NDArray[numpy.float64]) -> object: ...
 
 @overload
 def normal_below(x: float) -> float:
@@ -116,11 +116,23 @@ def atan2(y: float, x: float) -> float:
 def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
+def atan2(y: NDArray[numpy.float64], x: float) -> NDArray[numpy.float64]: ...
+
+@overload
+def atan2(y: float, x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
 def hypot(x: float, y: float) -> float:
     """The length of (x, y); both may be arrays."""
 
 @overload
 def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def hypot(x: NDArray[numpy.float64], y: float) -> NDArray[numpy.float64]: ...
+
+@overload
+def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """

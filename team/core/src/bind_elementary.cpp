@@ -109,8 +109,9 @@ void bind_elementary(nb::module_& m) {
   def_of_one(m, "log", elementary::log, "x", "The natural logarithm of x, or of each of an array.");
   def_of_one(m, "log1p", elementary::log1p, "x", "The logarithm of 1 + x, or of that of each of an array.");
   def_of_one(m, "expm1", elementary::expm1, "x", "E to the power of x, less 1; x may be an array.");
-  def_of_one(m, "squared", [](double x) { return x * x; }, "x",
-             "The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.");
+  m.def("squared", [](const Number& x) { return x.value * x.value; }, "x"_a,
+        "The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.");
+  m.def("squared", [](const Array::Any& x) { return nb::cast(x) * nb::cast(x); }, "x"_a);
   def_of_one(m, "normal_below", elementary::normal_below, "x",
              "The probability that a standard normal variable stays below x, to 1e-15; x may be an array.");
   def_of_one(m, "wrapped", se2::wrapped<double>, "angle", "The same direction in (-pi, pi]; angle may be an array.");
