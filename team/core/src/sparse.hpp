@@ -41,8 +41,8 @@ struct Supernodes {
 
 // The stored blocks of the lower triangle of a symmetric matrix, and their places in the factor.
 //
-// Entry e with column_start[j] ≤ e < column_start[j + 1] is block (rows[e], j), rows[e] ≥ j ascending,
-// the diagonal block first. The numbers of a matrix are one flat array: block e row by row from
+// Entry e with column_start[j] ≤ e < column_start[j + 1] is block (rows[e], j), rows[e] ≥ j, the
+// diagonal block first. The numbers of a matrix are one flat array: block e row by row from
 // value_start[e] on, diagonal blocks as full squares.
 class Pattern {
  public:
