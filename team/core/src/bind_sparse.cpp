@@ -110,7 +110,7 @@ void bind_sparse(nb::module_& m) {
              return made_numbers(f.solve(sparse::Values{right.data(), right.size()}));
            },
            "right"_a, "Solve A x = right.")
-      .def("solve",
+      .def("solve_columns",
            [](const Cholesky& f, const Table& right) {
              check(std::int64_t(right.shape(0)) == f.pattern().unknowns(), "right must have a row for each unknown");
              return made_matrix(f.solve(matrix_of(right)));
