@@ -119,17 +119,15 @@ class Pattern:
         """Compute xᵀ A x of a matrix on this pattern."""
 
 class Cholesky:
-    """The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted."""
+    """
+    The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.
+    """
 
     def __init__(self, pattern: Pattern, values: NDArray[numpy.float64]) -> None:
         """
         Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is
         rounding noise of its diagonal entry counts as zero.
         """
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether all numbers of the factor are finite."""
 
     def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
         """Solve A x = right."""

@@ -94,7 +94,7 @@ void bind_sparse(nb::module_& m) {
            },
            "values"_a, "x"_a, "Compute xᵀ A x of a matrix on this pattern.");
 
-  nb::class_<Cholesky>(m, "Cholesky", "The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted.")
+  nb::class_<Cholesky>(m, "Cholesky", "The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.")
       .def("__init__",
            [](Cholesky* self, std::shared_ptr<Pattern> pattern, const Numbers& values) {
              const sparse::Values numbers = values_on(*pattern, values);
@@ -103,7 +103,6 @@ void bind_sparse(nb::module_& m) {
            "pattern"_a, "values"_a,
            "Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is\n"
            "rounding noise of its diagonal entry counts as zero.")
-      .def_prop_ro("is_finite", &Cholesky::is_finite, "Whether all numbers of the factor are finite.")
       .def("solve",
            [](const Cholesky& f, const Numbers& right) {
              check(std::int64_t(right.size()) == f.pattern().unknowns(), "right must have a number for each unknown");

@@ -365,16 +365,6 @@ Cholesky::Cholesky(std::shared_ptr<const Pattern> pattern, Values values)
   }
 }
 
-bool Cholesky::is_finite() const {
-  for (Index s = 0; s < pattern_->supernodes().count(); s++) {
-    const Const each = panel(s);
-    for (std::size_t k = 0; k < each.rows; k++)
-      for (std::size_t i = k; i < each.columns; i++)
-        if (!std::isfinite(each[k][i])) return false;
-  }
-  return true;
-}
-
 // x := L⁻¹ x.
 void Cholesky::forward(Columns& x) const {
   const Supernodes& nodes = pattern_->supernodes();

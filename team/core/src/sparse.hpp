@@ -76,7 +76,8 @@ class Pattern {
   Supernodes supernodes_;
 };
 
-// The Cholesky factor L of a matrix on a pattern, L Lᵀ = A (permuted).
+// The Cholesky factor L of a matrix on a pattern, L Lᵀ = A (permuted). Its numbers are finite: one that
+// is not leaves no positive pivot in its row.
 class Cholesky {
  public:
   // Throws NotPositiveDefinite, which names the pivot's variable. A pivot that is rounding noise of its
@@ -84,7 +85,6 @@ class Cholesky {
   Cholesky(std::shared_ptr<const Pattern> pattern, Values values);
 
   const Pattern& pattern() const { return *pattern_; }
-  bool is_finite() const;
 
   // A⁻¹ right.
   dense::Matrix solve(dense::Const right) const;

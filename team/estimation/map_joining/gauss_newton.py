@@ -443,10 +443,10 @@ def is_solvable(island: Island) -> bool:
     """
     try:
         with np.errstate(all="ignore"):
-            factor, cost = island.posterior, island.cost
+            _, cost = island.posterior, island.cost
     except UNSOLVABLE:
         return False
-    return bool(np.isfinite(island.state).all()) and factor.is_finite and math.isfinite(cost)
+    return bool(np.isfinite(island.state).all()) and math.isfinite(cost)
 
 
 def iterated(island: Island) -> Island:
