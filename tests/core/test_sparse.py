@@ -47,7 +47,7 @@ def dense_on(pattern, rng):
         mask[offset[i] : offset[i + 1], offset[j] : offset[j + 1]] = True
     dense = np.tril(np.where(mask, rng.normal(size=(n, n)), 0.0))
     dense += np.tril(dense, -1).T
-    dense += (1.0 + np.abs(dense).sum(axis=1).max()) * np.eye(n)
+    dense += (1.0 + np.abs(dense).sum(axis=1).max(initial=0.0)) * np.eye(n)
     scale = 10.0 ** rng.uniform(-3.0, 3.0, n)
     return scale[:, None] * dense * scale
 
