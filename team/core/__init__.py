@@ -41,9 +41,12 @@ _import_library()
 
 from team.core._core import (  # noqa: E402 - the level is chosen before
     POSE_JITTER,
+    Cholesky,
     MotionError,
     NotFiniteError,
     Random,
+    NotPositiveDefiniteError,
+    Pattern,
     Step,
     Window,
     adjoint,
@@ -71,6 +74,7 @@ from team.core._core import (  # noqa: E402 - the level is chosen before
     log1p,
     logarithm,
     mean_direction,
+    minimum_degree,
     moments,
     normal_below,
     normalise,
@@ -94,9 +98,12 @@ from team.core._core import (  # noqa: E402 - the level is chosen before
 
 __all__ = [
     "POSE_JITTER",
+    "Cholesky",
     "MotionError",
     "NotFiniteError",
     "Random",
+    "NotPositiveDefiniteError",
+    "Pattern",
     "Step",
     "Window",
     "adjoint",
@@ -124,6 +131,7 @@ __all__ = [
     "log1p",
     "logarithm",
     "mean_direction",
+    "minimum_degree",
     "moments",
     "normal_below",
     "normalise",

@@ -229,6 +229,7 @@ void bind_dense(nb::module_& m);
 void bind_elementary(nb::module_& m);
 void bind_random(nb::module_& m);
 void bind_se2(nb::module_& m);
+void bind_sparse(nb::module_& m);
 void bind_window(nb::module_& m);
 
 }  // namespace teamslam::binding
