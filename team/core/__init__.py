@@ -41,6 +41,7 @@ _import_library()
 
 from team.core._core import (  # noqa: E402 - the level is chosen before
     POSE_JITTER,
+    Consensus,
     MotionError,
     NotFiniteError,
     Step,
@@ -70,6 +71,7 @@ from team.core._core import (  # noqa: E402 - the level is chosen before
 
 __all__ = [
     "POSE_JITTER",
+    "Consensus",
     "MotionError",
     "NotFiniteError",
     "Step",

@@ -30,13 +30,16 @@ using Shifts = std::array<double, BIASES>;  // a number's answer to each bias
 
 Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& pose, const Point<double>& at,
                const Noise& noise) {
-  const double dx = at.x - pose.x, dy = at.y - pose.y;
-  const double d = pack::max(pack::sqrt(dx * dx + dy * dy), models::NEAREST_M), direction = elementary::atan2(dy, dx);
-  const auto [v, u] = elementary::sin_cos(direction - pose.heading);
-  const auto [ey, ex] = elementary::sin_cos(direction);
-  Sight sight{z.keyframe, landmark, d, 0.0,
-              {{-u, -v, 0.0, ex, ey}, noise.range_variance + noise.range_per_m2 * d * d},
-              {{v / d, -u / d, -1.0, -ey / d, ex / d}, noise.bearing_variance}};
+  const auto [dx, dy, d, direction] = models::line_to(pose, at.x, at.y);
+  const auto of_pose = models::pose_jacobian(d, direction - pose.heading);
+  const auto of_landmark = models::landmark_jacobian(d, direction);
+  Sight sight{z.keyframe, landmark, d, 0.0, {{}, noise.range_variance + noise.range_per_m2 * d * d}, {{}, noise.bearing_variance}};
+  const auto set = [](Line& line, const std::array<double, 3>& by_pose, const std::array<double, 2>& by_landmark) {
+    std::copy(by_pose.begin(), by_pose.end(), line.H);
+    std::copy(by_landmark.begin(), by_landmark.end(), line.H + 3);
+  };
+  set(sight.range, of_pose[0], of_landmark[0]);
+  set(sight.bearing, of_pose[1], of_landmark[1]);
   if (z.claim.is_made()) {
     sight.slope = z.claim.rb / z.claim.rr;
     sight.range.variance = z.claim.rr;
@@ -142,7 +145,8 @@ std::vector<Pose<double>> path_to(const Pose<double>& end, const Window& window)
 }  // namespace
 
 Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, bool with_nodes) {
-  const auto& [_, __, noise, mount] = window.settings();
+  const Noise& noise = window.settings().noise;
+  const se2::Mount& mount = window.settings().mount;
   const se2::Mount away = mount.inverse();
   const std::span<const std::size_t> nodes = with_nodes ? window.nodes() : std::span<const std::size_t>();
   std::vector<std::uint32_t> ids = window.particles().ids;
@@ -186,8 +190,8 @@ Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, b
   for (std::size_t landmark = 0; landmark < L; landmark++) {
     const GivenPath sums = landmark_given(B, sights, landmark, noise);
     for (std::size_t b = 0; b < BIASES; b++) {
-      const auto [x, y] = mount.is_mounted() ? mount.turned(sums.solved(b)) : sums.solved(b);
-      found.rows[b][first + 2 * landmark] = x + 0.0;
+      const auto [x, y] = mount.is_mounted() ? mount.base_vector(sums.solved(b)) : sums.solved(b);
+      found.rows[b][first + 2 * landmark] = x + 0.0;  // a zero is positive
       found.rows[b][first + 2 * landmark + 1] = y + 0.0;
     }
   }

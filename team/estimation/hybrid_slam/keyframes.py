@@ -8,12 +8,11 @@ from jaxtyping import Bool, Float, UInt32
 from msgspec.structs import force_setattr, replace
 
 from team.config import MotionModel, Sensor
-from team.estimation import dense, geometry
+from team.estimation import dense, elementary, geometry
 from team.estimation.geometry import Pose, adjoint, inverse
 from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.hybrid_slam.reduction import KeyframeScan, all_between, reduced
-from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, scanned
 from team.estimation.mount import of_sensor
 from team.estimation.odometry import STANDING, OdometryInterval
@@ -332,6 +331,16 @@ def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most:
     nearest = new[np.argsort(ranges[unknown][first], kind="stable")[: max(most - len(known), 0)]]
     taken = ~unknown | np.isin(ids, nearest)
     return keyframe.only(taken)
+
+
+def carried_on(
+    column: Float[np.ndarray, "3"], motion: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """A shift of the earlier motion, seen at the end of a further motion: Ad(motion⁻¹) column."""
+    s, c = elementary.sin_and_cos(motion[2])
+    x = column[0] - motion[1] * column[2]
+    y = column[1] + motion[0] * column[2]
+    return np.array([c * x + s * y, -s * x + c * y, column[2]])
 
 
 def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:
