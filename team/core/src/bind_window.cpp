@@ -1,8 +1,7 @@
 // Bindings of the window and of the functions on its particles.
 #include <algorithm>
 
-#include "binding.hpp"
-#include "window.hpp"
+#include "binding_scan.hpp"
 
 namespace teamslam::binding {
 
@@ -54,14 +53,6 @@ MadeParticles made_particles(const Particles& p) {
           made_landmarks(p.map, 0, 2), made_landmarks(p.map, 2, 3)};
 }
 
-models::Noise noise_of(const std::array<double, 5>& noise) {
-  check_finite(noise.data(), 5, "the noise of the sensor");
-  check(noise[0] > 0.0 && noise[1] >= 0.0 && noise[3] > 0.0, "the variances of the sensor must be positive");
-  check(noise[2] > 0.0 && noise[2] <= 1.0 && noise[4] > 0.0 && noise[4] <= 1.0,
-        "the white shares of the sensor must be in (0, 1]");
-  return {noise[0], noise[1], noise[2], noise[3], noise[4]};
-}
-
 // Rows of landmarks from (M, L, 2) means and (M, L, 3) covariances.
 Rows map_of(std::size_t count, const Stack& means, const Stack& covariances) {
   const std::size_t L = means.shape(1);
@@ -109,20 +100,6 @@ Rows path_of(const Stack& paths, std::size_t count) {
 
 window::Increment increment_of(const Triple& mean, const Matrix3& covariance) {
   return {{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
-}
-
-std::span<const models::Claim> claims_of(const Table& own, std::size_t n) {
-  check(own.shape(0) == n && (own.shape(1) == 0 || own.shape(1) == 4), "own must be (n, 0) or (n, 4)");
-  finite(own, "own");
-  static_assert(sizeof(models::Claim) == 4 * sizeof(double));
-  if (own.shape(1) == 0) return {};
-  return {reinterpret_cast<const models::Claim*>(own.data()), n};
-}
-
-Scan scan_of(const Ids& ids, const Numbers& ranges, const Numbers& bearings, const Table& own) {
-  const std::size_t n = ids.size();
-  check(ranges.size() == n && bearings.size() == n, "ids, ranges and bearings must have one length");
-  return {{ids.data(), n}, finite(ranges, "ranges"), finite(bearings, "bearings"), claims_of(own, n)};
 }
 
 std::span<const double> normals_of(const Table& normals, std::size_t count) {
