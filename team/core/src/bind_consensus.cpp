@@ -1,5 +1,5 @@
 // Bindings of the consensus over a window's scans.
-#include "bind_scan.hpp"
+#include "binding_scan.hpp"
 #include "consensus.hpp"
 
 namespace teamslam::binding {

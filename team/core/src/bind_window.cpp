@@ -1,7 +1,7 @@
 // Bindings of the window and of the functions on its particles.
 #include <algorithm>
 
-#include "bind_scan.hpp"
+#include "binding_scan.hpp"
 #include "sensitivity.hpp"
 
 namespace teamslam::binding {
@@ -97,6 +97,12 @@ Rows path_of(const Stack& paths, std::size_t count) {
   for (std::size_t k = 0; k < paths.shape(0); k++)
     for (std::size_t j = 0; j < 3; j++) path.set(3 * k + j, paths.data() + 3 * count * k + j, 3);
   return path;
+}
+
+window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Triple>& shift = std::nullopt) {
+  window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
+  if (shift) increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
+  return increment;
 }
 
 std::span<const double> normals_of(const Table& normals, std::size_t count) {

@@ -100,6 +100,8 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 // One function for each file of bindings.
 void bind_consensus(nb::module_& m);
 void bind_elementary(nb::module_& m);
+void bind_models(nb::module_& m);
+void bind_motion(nb::module_& m);
 void bind_window(nb::module_& m);
 
 }  // namespace teamslam::binding

@@ -14,5 +14,7 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   nb::exception<window::MotionError>(m, "MotionError", PyExc_ValueError);
   binding::bind_consensus(m);
   binding::bind_elementary(m);
+  binding::bind_models(m);
+  binding::bind_motion(m);
   binding::bind_window(m);
 }

@@ -1,4 +1,4 @@
-// A sensor, motions and scans from Python, checked.
+// Poses, scans and the noise of a sensor from Python, for the bindings.
 #pragma once
 
 #include "binding.hpp"
@@ -6,19 +6,17 @@
 
 namespace teamslam::binding {
 
+template <class Array>
+se2::Pose<double> pose_of(const Array& pose) {
+  return {pose.data()[0], pose.data()[1], pose.data()[2]};
+}
+
 inline models::Noise noise_of(const std::array<double, 5>& noise) {
   check_finite(noise.data(), 5, "the noise of the sensor");
   check(noise[0] > 0.0 && noise[1] >= 0.0 && noise[3] > 0.0, "the variances of the sensor must be positive");
   check(noise[2] > 0.0 && noise[2] <= 1.0 && noise[4] > 0.0 && noise[4] <= 1.0,
         "the white shares of the sensor must be in (0, 1]");
   return {noise[0], noise[1], noise[2], noise[3], noise[4]};
-}
-
-inline window::Increment increment_of(const Triple& mean, const Matrix3& covariance,
-                                      const std::optional<Triple>& shift = std::nullopt) {
-  window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
-  if (shift) increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
-  return increment;
 }
 
 inline std::span<const models::Claim> claims_of(const Table& own, std::size_t n) {
