@@ -21,8 +21,13 @@ from team.estimation.geometry import (
     logarithm,
     wrapped,
 )
-from team.estimation.hybrid_slam.landmark_kernel import innovation_of
-from team.estimation.models import NEAREST_M, landmark_jacobian, pose_jacobian, predicted
+from team.estimation.hybrid_slam.landmark_kernel import (
+    innovation_of,
+    landmark_jacobian,
+    pose_jacobian,
+    predicted,
+)
+from team.estimation.models import NEAREST_M
 from team.estimation.placing import put_block
 
 Sensor3 = tuple[float, float, float]
