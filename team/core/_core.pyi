@@ -48,6 +48,171 @@ def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy
 def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """The length of each (x, y)."""
 
+class Calibration:
+    """What corrects a raw measurement of range and bearing, or refuses it."""
+
+    def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
+        """
+        lens: coefficients of the bearing's error b (l0 + l1 b + l2 b^2); optical_axis [rad]: of a camera whose
+        range is a depth along it; ranges: (least, most) of raw ranges [m]; half_field: half of the field of view [rad].
+        """
+
+    def correct(self, ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64]) -> tuple[NDArray[numpy.bool_], NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Return which raw measurements are accepted, and all of them corrected: ((r - range_offset)/range_scale,
+        b - bearing_offset - lens(b)).
+
+        A depth is divided by cos(b - optical_axis), too, and NaN where that is below 0.17. Accepted are those
+        in the ranges and the field of view whose corrected range is positive.
+        """
+
+NEAREST_M: float
+
+def predicted(pose: NDArray[numpy.float64], landmark: NDArray[numpy.float64]) -> tuple[float, float]:
+    """
+    Predict range [m] and bearing [rad] of a point landmark from a pose, both in the map frame.
+
+    range = max(|landmark - (x, y)|, NEAREST_M), bearing = atan2(dy, dx) - heading in (-pi, pi].
+    """
+
+def predict(pose: NDArray[numpy.float64], landmarks: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Predict the measurements h (L, 2) of landmarks (L, 2), with dh/dxi (L, 2, 3) of h(pose o Exp(xi), landmark) at
+    xi = 0 and dh/dlandmark (L, 2, 2).
+    """
+
+def located(pose: NDArray[numpy.float64], range: float, bearing: float) -> NDArray[numpy.float64]:
+    """
+    Invert the model: the point at (range, bearing) from a pose, in the pose's map frame.
+    """
+
+def place(pose: NDArray[numpy.float64], measurements: NDArray[numpy.float64], noise: Sequence[float], own: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).
+
+    noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.
+    """
+
+def reduce_scans(scans: Sequence[tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], poses: NDArray[numpy.float64]) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.
+
+    poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
+    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
+    """
+
+class MotionModel:
+    """The parameters of a motion model, as of `team.config.MotionModel`."""
+
+    def __init__(self, *, turns_first: bool, forward: Sequence[float], turn: Sequence[float], final_turn: Sequence[float], lateral: Sequence[float], forward_scale: float, yaw_scale: float, yaw_rate_limit: float, turn_drag: float, veer: float, slow_below: float, slow_scale: float, covariance_factor: float, calibrated_speed: Sequence[float] | None, alphas: Sequence[float] | None, alpha_interval_s: float, wheels: Sequence[float] | None, shares: Sequence[float] | None, shares_interval_s: float) -> None:
+        """
+        Noises are (per_s, per_m, per_rad); wheels: their distance, and the noise of the left and of the right one.
+        """
+
+    def increment(self, duration_s: float, forward: float, yaw_rate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute the motion of one odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
+
+        With v = forward_scale forward (slow_scale forward where |forward| < slow_below),
+        w = clip(yaw_scale yaw_rate, +-yaw_rate_limit), the path length d = sign(v) max(|v| - turn_drag |w|, 0) t,
+        the turn p = w t + veer d and the noises a (forward, on d), b (turn, on p), c (final turn), l (lateral), the
+        motion is
+
+        - "turn-then-drive": turn p + b, drive d + a, then (0, l, c): the thesis, section 4.3.1;
+        - all others: Exp(d + a, 0, p + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma & Ma eq. 1-4.
+
+        Returns mean and covariance.
+        """
+
+    def part(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, duration_s: float, share: float, rest: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute a share of a measured motion Exp(twist) at constant twist, followed by the share `rest`.
+
+        covariance: the source's own of the whole interval, in the tangent space of its end; without it the noise is
+        the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.
+        """
+
+    def forward_column(self, duration_s: float, forward: float, yaw_rate: float) -> NDArray[numpy.float64]:
+        """
+        Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)
+        times the measured one; zero where |forward| lies in `calibrated_speed`, and without such a range.
+        """
+
+def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], then: NDArray[numpy.float64], added: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compose two motions: mean o then, with Ad C Ad' + added, Ad = Ad(then^-1), to first order in the noise.
+    """
+
+def motion_of_sensor(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], mount: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).
+    """
+
+def shift_after(shift: NDArray[numpy.float64], motion: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.
+    """
+
+class Odometry:
+    """
+    Odometry integrated since the places that matter to a window.
+
+    With a mount the motions since a keyframe and a scan are the sensor's; those since a pose node and an
+    inter-robot measurement are the base's. A motion is (mean, covariance).
+    """
+
+    def __init__(self, model: MotionModel, mount: Sequence[float] | None) -> None:
+        """
+        mount: the sensor's pose on the base; None where it is at the base's origin.
+        """
+
+    def drive(self, duration_s: float, forward: float, yaw_rate: float, added: Sequence[float] | None) -> None:
+        """
+        Go on by a part of an interval whose speeds were measured.
+
+        added: variances per second, in addition to the noise.
+        """
+
+    def move(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, interval_s: float, duration_s: float, share: float, rest: float, added: Sequence[float] | None) -> None:
+        """
+        Go on by a part of an interval whose motion was measured, as `MotionModel.part`.
+        """
+
+    def end_keyframe(self) -> tuple[tuple[NDArray[numpy.float64], NDArray[numpy.float64]], NDArray[numpy.float64], tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None]:
+        """
+        End the motion since the last keyframe here.
+
+        Returns it, its shift by an error of the scale of speed, and the motion since the last scan without
+        identities, if there was one.
+        """
+
+    def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Return the motion since the last scan without identities or keyframe; this is such a scan.
+        """
+
+    def mark_scan(self) -> None:
+        """A scan of a keyframe of several scans is here."""
+
+    def end_scans(self) -> NDArray[numpy.float64]:
+        """
+        Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.
+        """
+
+    def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """The motion since the last pose node."""
+
+    def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
+        """
+        This is a pose node: returns the motions since the marked sightings, in their order, and forgets these.
+        """
+
+    def mark_sighting(self) -> None:
+        """An inter-robot measurement that waits for the next pose node is here."""
+
+    def forget_sightings(self) -> None:
+        """Forget the marked sightings."""
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 

@@ -9,18 +9,16 @@ the base's is m ∘ S ∘ m⁻¹, and a point p in the frame of the sensor's sta
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.estimation import dense, elementary, elementwise
 from team.estimation.gaussian import PoseGaussian
-from team.estimation.geometry import Pose, adjoint, compose, inverse
+from team.estimation.geometry import Pose, compose, inverse
 from team.estimation.models import Increment
 
 
 def of_sensor(step: Increment, mount: Pose) -> Increment:
     """Convert a motion of the base to the sensor's: T Exp(ξ) m = m (m⁻¹ T m) Exp(Ad(m⁻¹) ξ)."""
-    away = inverse(mount)
-    Ad = adjoint(away)
-    C = dense.product(dense.product(Ad, step.covariance), Ad.T)
-    return Increment(compose(compose(away, step.mean), mount), 0.5 * (C + C.T))
+    return Increment(*core.motion_of_sensor(step.mean, step.covariance, mount))
 
 
 def of_base(step: Increment, mount: Pose) -> Increment:

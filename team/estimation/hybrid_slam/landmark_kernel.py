@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from team.estimation import elementary
 from team.estimation.compiled import compiled, inlined
+from team.estimation.geometry import Point, Pose, wrapped
 from team.estimation.models import NEAREST_M
 
 Triple = tuple[float, float, float]
@@ -84,3 +85,32 @@ def place(
     covariance[0] = along * ex * ex + across * ey * ey - 2.0 * both * ex * ey
     covariance[1] = (along - across) * ex * ey + both * (ex * ex - ey * ey)
     covariance[2] = along * ey * ey + across * ex * ex + 2.0 * both * ex * ey
+
+
+@compiled
+def predicted(pose: Pose, landmark: Point) -> tuple[float, float]:
+    """Predict range [m] and bearing [rad] of a point landmark from a pose, both in the map frame.
+
+    range = max(‖landmark − (x, y)‖, NEAREST_M), bearing = atan2(Δy, Δx) − theta in (−π, π].
+    """
+    dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
+    distance = max(math.sqrt(dx * dx + dy * dy), NEAREST_M)
+    return distance, wrapped(elementary.atan2(dy, dx) - pose[2])
+
+
+@compiled
+def pose_jacobian(distance: float, bearing: float) -> Float[np.ndarray, "2 3"]:
+    """Compute ∂z/∂xi of h(pose ∘ Exp(xi), landmark) at xi = 0, from the predicted (range,
+    bearing).
+    """
+    s, c = elementary.sin_and_cos(bearing)
+    return np.array([[-c, -s, 0.0], [s / distance, -c / distance, -1.0]])
+
+
+@compiled
+def landmark_jacobian(distance: float, direction: float) -> Float[np.ndarray, "2 2"]:
+    """Compute ∂z/∂landmark, from the predicted range and the direction = theta + bearing in the
+    map.
+    """
+    s, c = elementary.sin_and_cos(direction)
+    return np.array([[c, s], [-s / distance, c / distance]])

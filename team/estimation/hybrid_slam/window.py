@@ -110,7 +110,7 @@ def advanced(
     none).
 
     The measurements are accepted and corrected already (`models.scanned`).
-    forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
+    forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
     own: the noises that the measurements claim (`team.estimation.scans`).
     """
     noises = unclaimed(len(ids)) if own is None else own

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from team import core
 from team.estimation.geometry import compose, exponential, tangent, wrapped
 from team.estimation.hybrid_slam.consensus_kernel import _prediction
-from team.estimation.models import landmark_jacobian, predicted
+from team.estimation.models import predicted
 from tests.estimation.hybrid_slam import one_landmark
 
 SENSOR = (0.04, 0.001, 0.003)
@@ -52,7 +53,7 @@ def test_the_range_and_then_the_bearing_are_the_joint_update(kind: str) -> None:
     """Range first, then the bearing less its regression on the range: the same Gaussian."""
     h = np.array(predicted(np.array(POSE), MEAN))
     z = h + np.array([0.2, -0.05])
-    H = landmark_jacobian(h[0], POSE[2] + h[1])
+    H = core.predict(np.array(POSE), MEAN[None])[2][0]
     expected = kalman(z - h, H, noise(OWN[kind], h[0]))
     for got, textbook in zip(updated(z, OWN[kind]), expected, strict=True):
         np.testing.assert_allclose(got, textbook, rtol=1e-10)

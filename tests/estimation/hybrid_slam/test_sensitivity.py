@@ -22,8 +22,7 @@ from team.estimation.hybrid_slam.sensitivity_kernel import BIASES, carried_on
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
 from team.estimation.map_joining.submap_factor import biased_normal
-from team.estimation.models import increment_of
-from team.estimation.odometry import forward_column
+from team.estimation.models import increment_of, model_of
 from team.estimation.randomness import generator
 from team.robot.node import RobotNode
 from team.wire import channels as ch
@@ -62,7 +61,7 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
             ranges[seen] * (1.0 + range_scale) + range_offset,
             bearings + bearing,
             random,
-            forward_column(MOTION, 1.0, 1.0, 0.1),
+            model_of(MOTION).forward_column(1.0, 1.0, 0.1),
         )
     return windows.gaussian(window)
 
@@ -85,7 +84,10 @@ def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
     window, random = windows.opened(front, Sensor()), generator(1, "r1", 0, 0)
     motion = msgspec.structs.replace(MOTION, calibrated_speed=(0.5, 2.0))
     seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
-    step, column = increment_of(motion, 1.0, 1.0, 0.1), forward_column(motion, 1.0, 1.0, 0.1)
+    step, column = (
+        increment_of(motion, 1.0, 1.0, 0.1),
+        model_of(motion).forward_column(1.0, 1.0, 0.1),
+    )
     local = windows.gaussian(windows.advanced(window, step, *seen, random, column))
     assert local.biases == ("bearing", "range_offset", "range_scale")
     assert local.sensitivity.shape == (3, 5)
@@ -141,9 +143,9 @@ def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, 
 
     h = 1e-6
     step = geometry.between(driven_with(1.0 - h), driven_with(1.0 + h))
-    first = forward_column(motion, 0.5, speed, rate)
+    first = model_of(motion).forward_column(0.5, speed, rate)
     second = increment_of(motion, 0.5, speed, more).mean
-    column = carried_on(first, second) + forward_column(motion, 0.5, speed, more)
+    column = carried_on(first, second) + model_of(motion).forward_column(0.5, speed, more)
     np.testing.assert_allclose(column, geometry.logarithm(step) / (2 * h), atol=2e-2 * speed)
 
 
