@@ -119,17 +119,13 @@ def advanced(
     uniform = generator.random() if is_thin else None
     normals, after = generator.standard_normal((count, 3)), window.core.copy()
     with refused_by_name():
-        step = after.advance(
-            increment.mean, increment.covariance, *seen, uniform, normals, forward
-        )
+        step = after.advance(increment.mean, increment.covariance, *seen, uniform, normals, forward)
     expected = Innovation(step.squared, step.dof)
     if not math.isfinite(step.squared):
         expected = NOTHING
         with suppress(NotACovarianceError):  # then it is not known how well they were predicted
             expected = innovation_of(window.core, increment, seen)
-    return msgspec.structs.replace(
-        window, core=after, innovation=window.innovation.plus(expected)
-    )
+    return msgspec.structs.replace(window, core=after, innovation=window.innovation.plus(expected))
 
 
 def marked(window: Window, stamp_ns: int) -> Window:
