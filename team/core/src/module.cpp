@@ -15,5 +15,7 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   binding::bind_elementary(m);
   binding::bind_models(m);
   binding::bind_motion(m);
+  binding::bind_dense(m);
+  binding::bind_se2(m);
   binding::bind_window(m);
 }
