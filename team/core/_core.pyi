@@ -23,6 +23,91 @@ class NotFiniteError(ValueError):
 class MotionError(ValueError):
     pass
 
+class Consensus:
+    """
+    The measurements of a window, and which of them agree: those that no others confirm are outliers.
+
+    A measurement is accepted where it is likelier given the other accepted ones and the odometry than
+    as an outlier, uniform over the sensor's range and field of view.
+    """
+
+    def __init__(self, noise: Sequence[float], max_range: float, field_of_view: float, outlier_share: float) -> None:
+        """
+        Begin a window. noise: as of `Window`; outlier_share: the share of measurements that are outliers.
+        """
+
+    def add(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> None:
+        """
+        Take a keyframe: the motion since the last one, then its measurements (there may be none).
+        """
+
+    def agreeing(self) -> NDArray[numpy.bool_]:
+        """
+        Mark the measurements that agree with others of their landmark under the odometry alone.
+
+        The measurement of a landmark that the others support best places it; it is accepted together with
+        those that support it.
+        """
+
+    def confirmed(self) -> NDArray[numpy.bool_]:
+        """
+        Mark those of `agreeing`, then by a smoother over the whole window until the classification is stable.
+
+        Where the normal equations have no solution in floating point, nothing more is rejected.
+        """
+
+def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
+
+    Raises ValueError where A has not as many columns as B has rows.
+    """
+
+def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
+
+    Raises LinAlgError where A is singular.
+    """
+
+def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
+    """
+
+def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the lower L with L L^T = A from the lower triangle of A.
+
+    Raises LinAlgError where A is not positive definite.
+    """
+
+def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute (L L^T)^-1 of a lower triangular L, exactly symmetric."""
+
+def forward(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute L^-1 B of a lower triangular L; B is a vector or a matrix."""
+
+def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.
+    """
+
+def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
+    """
+    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
+    """
+
+def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
+    """
+
+def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
+    """
+
 @overload
 def sin_and_cos(angle: float) -> tuple[float, float]:
     """
@@ -299,58 +384,6 @@ class Odometry:
     def forget_sightings(self) -> None:
         """Forget the marked sightings."""
 
-def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
-
-    Raises ValueError where A has not as many columns as B has rows.
-    """
-
-def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
-
-    Raises LinAlgError where A is singular.
-    """
-
-def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
-    """
-
-def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute the lower L with L L^T = A from the lower triangle of A.
-
-    Raises LinAlgError where A is not positive definite.
-    """
-
-def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """Compute (L L^T)^-1 of a lower triangular L, exactly symmetric."""
-
-def forward(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """Compute L^-1 B of a lower triangular L; B is a vector or a matrix."""
-
-def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.
-    """
-
-def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
-    """
-    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
-    """
-
-def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
-    """
-
-def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
-    """
-
 def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
 
@@ -480,12 +513,13 @@ class Window:
     def copy(self) -> Window:
         """Copy the window."""
 
-    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64]) -> Step:
+    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> Step:
         """
         Take a keyframe: the motion since the last one, then its measurements (there may be none).
 
         own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are
-        resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3).
+        resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,
+        in (forward, left, turn), by an error of the scale of speed.
         Raises MotionError, and leaves the window as it was.
         """
 
@@ -496,9 +530,9 @@ class Window:
         Raises MotionError, and leaves the window as it was.
         """
 
-    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> None:
+    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> None:
         """
-        Move the particles without a keyframe; the weights stay. Raises MotionError.
+        Move the particles without a keyframe; the weights stay. shift: as of `advance`. Raises MotionError.
         """
 
     def mark(self) -> None:
@@ -528,6 +562,18 @@ class Window:
         """
         Replace the paths (K, M, 3), with the particles at their ends, the weights and the landmarks.
         """
+
+    def sensitivity(self, mean: NDArray[numpy.float64], with_nodes: bool) -> tuple[NDArray[numpy.float64], int]:
+        """
+        Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.
+
+        Returns a row for each of bearing, forward_scale, range_offset and range_scale, by the window's smoother
+        about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.
+        """
+
+    @property
+    def has_shifts(self) -> bool:
+        """Whether an error of the scale of speed shifts one of the motions."""
 
     def of_base(self) -> Window:
         """

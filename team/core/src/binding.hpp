@@ -225,6 +225,7 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 }
 
 // One function for each file of bindings.
+void bind_consensus(nb::module_& m);
 void bind_dense(nb::module_& m);
 void bind_elementary(nb::module_& m);
 void bind_models(nb::module_& m);
