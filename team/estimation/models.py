@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from team import core
 from team.config import MotionModel, MotionNoise, Sensor
 from team.core import NEAREST_M, located, predicted
-from team.estimation import elementary
-from team.estimation.geometry import Pose
+from team.estimation.se2 import Pose
 
 __all__ = [
     "NEAREST_M",
@@ -99,17 +98,15 @@ def increment_of(
 def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
     """Compute (σ_range² [m²], σ_bearing² [rad²]) at a range: σ_r² = range_sigma² + (per_m r)²."""
     slope = sensor.range_sigma_per_m * predicted_range
-    return elementary.squared(sensor.range_sigma) + slope * slope, elementary.squared(
-        sensor.bearing_sigma
-    )
+    return core.squared(sensor.range_sigma) + slope * slope, core.squared(sensor.bearing_sigma)
 
 
 def variances(sensor: Sensor) -> tuple[float, float, float]:
     """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]), the kernels' form of a sensor."""
     return (
-        elementary.squared(sensor.range_sigma),
-        elementary.squared(sensor.range_sigma_per_m),
-        elementary.squared(sensor.bearing_sigma),
+        core.squared(sensor.range_sigma),
+        core.squared(sensor.range_sigma_per_m),
+        core.squared(sensor.bearing_sigma),
     )
 
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.config import MotionModel
-from team.estimation import elementary
-from team.estimation.geometry import Pose, logarithm
 from team.estimation.models import Increment, increment_of, model_of
+from team.estimation.se2 import Pose, logarithm
 
 
 class Moved(NamedTuple):
@@ -58,7 +58,7 @@ class OdometryInterval(NamedTuple):
         """Magnitude of the velocity [m/s]; without a reported motion, the signed forward speed."""
         if self.moved is None:
             return self.forward
-        return elementary.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
+        return core.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
 
 
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)
@@ -74,7 +74,7 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
     """
     if motion.kind != "ackermann" or motion.wheel_base is None:
         return math.nan, math.nan
-    slope = elementary.tan(steering + motion.steering_offset)
+    slope = core.tan(steering + motion.steering_offset)
     share = 1.0 - slope * motion.wheel_offset / motion.wheel_base
     if not share > 0.0:
         return math.nan, math.nan

@@ -13,8 +13,10 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   nb::exception<binding::NotFiniteError>(m, "NotFiniteError", PyExc_ValueError);
   nb::exception<window::MotionError>(m, "MotionError", PyExc_ValueError);
   binding::bind_consensus(m);
+  binding::bind_dense(m);
   binding::bind_elementary(m);
   binding::bind_models(m);
   binding::bind_motion(m);
+  binding::bind_se2(m);
   binding::bind_window(m);
 }

@@ -8,10 +8,9 @@ from jaxtyping import Float, UInt32
 
 from team import core
 from team.config import UNNAMED, Sensor
-from team.estimation import elementary
-from team.estimation.geometry import Pose
 from team.estimation.models import Increment
 from team.estimation.scans import SENSOR, Own
+from team.estimation.se2 import Pose
 
 
 class KeyframeScan(msgspec.Struct, frozen=True, gc=False):
@@ -57,10 +56,9 @@ def variances(
     """(rr, rb, bb) of each measurement: as it claims, or the sensor's at its range."""
     of_sensor = np.column_stack(
         (
-            elementary.squared(sensor.range_sigma)
-            + elementary.squared(sensor.range_sigma_per_m * ranges),
+            core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * ranges),
             np.zeros(len(ranges)),
-            np.full(len(ranges), elementary.squared(sensor.bearing_sigma)),
+            np.full(len(ranges), core.squared(sensor.bearing_sigma)),
         )
     )
     if not own.size:

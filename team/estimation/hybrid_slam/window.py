@@ -17,11 +17,11 @@ from team import core
 from team.config import BIASES, Bias, FrontEnd, Sensor
 from team.estimation import dense
 from team.estimation.gaussian import FAULTS, NotACovarianceError
-from team.estimation.geometry import tangent
 from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation_of
 from team.estimation.models import Increment
 from team.estimation.scans import Own, unclaimed
+from team.estimation.se2 import tangent
 from team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)

@@ -15,10 +15,10 @@ from sim.scenarios.source import streams_of
 from sim.world.streams import WorldStreams
 from team import core
 from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.geometry import compose
 from team.estimation.hybrid_slam.fastslam import noise_of
 from team.estimation.models import Increment, increment_of, predicted
 from team.estimation.scans import point_scan, polar_scan, unclaimed
+from team.estimation.se2 import compose
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(0.03), turn=MotionNoise(0.02), lateral=MotionNoise(0.01))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from team import core
-from team.estimation.geometry import compose, exponential, inverse, tangent, wrapped
 from team.estimation.models import predicted
+from team.estimation.se2 import compose, exponential, inverse, tangent, wrapped
 from tests.estimation.hybrid_slam import one_landmark
 
 SENSOR = (0.04, 0.001, 0.003)

@@ -12,7 +12,7 @@ from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
 from team import core, translate
 from team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation import geometry
+from team.estimation import se2
 from team.estimation.consistency import nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.hybrid_slam import window as windows
@@ -47,7 +47,7 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
     landmarks = np.array([[4, 3], [6, -3], [9, 2], [3, -4], [11, -2], [8, 6]], dtype=float)
     pose = np.zeros(3)
     for _ in range(8):
-        pose = geometry.compose(pose, increment_of(MOTION, 1.0, 1.0, 0.1).mean)
+        pose = se2.compose(pose, increment_of(MOTION, 1.0, 1.0, 0.1).mean)
         offset = landmarks - pose[:2]
         ranges = np.hypot(*offset.T)
         seen = np.flatnonzero(ranges < 8.0)
@@ -133,7 +133,7 @@ def stated(window, motions, mean, nodes):
     path, (keyframes, seen, _, own) = window.mean_path(), window.measurements()
     ids = np.sort(window.ids())
     points = mean[3 + 3 * nodes :].reshape(-1, 2)
-    steps = [geometry.between(a, b) for a, b in zip([np.zeros(3), *path], path, strict=False)]
+    steps = [se2.between(a, b) for a, b in zip([np.zeros(3), *path], path, strict=False)]
     white = noise_of(SMOOTHED)
     K, W, biased = len(path), [], []
     for covariance, shift in motions:
@@ -149,12 +149,9 @@ def stated(window, motions, mean, nodes):
         biased.append([[0.0, 0.0, 1.0, distance], [1.0, 0.0, 0.0, 0.0]])
 
     def residuals(x):
-        poses = [
-            geometry.compose(p, geometry.exponential(x[3 * k : 3 * k + 3]))
-            for k, p in enumerate(path)
-        ]
+        poses = [se2.compose(p, se2.exponential(x[3 * k : 3 * k + 3])) for k, p in enumerate(path)]
         found = [
-            geometry.logarithm(geometry.between(step, geometry.between(a, b)))
+            se2.logarithm(se2.between(step, se2.between(a, b)))
             for step, a, b in zip(steps, [np.zeros(3), *poses], poses, strict=False)
         ]
         for k, landmark in zip(keyframes, seen, strict=True):
@@ -188,7 +185,7 @@ def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(
     answer = stated(window, motions, mean, len(nodes)).T
     path = window.mean_path()
     for at, k in enumerate((len(path) - 1, *nodes)):
-        turn = geometry.tangent(path[k][2])
+        turn = se2.tangent(path[k][2])
         expected = answer[:, 3 * k : 3 * k + 3] @ turn.T
         np.testing.assert_allclose(rows[:, 3 * at : 3 * at + 3], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(rows[:, 9:], answer[:, 18:], rtol=1e-5, atol=1e-5)
@@ -197,7 +194,9 @@ def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(
 def test_a_window_without_keyframes_has_no_answer_and_a_mean_of_another_one_is_refused():
     window = core.Window(5, noise_of(SMOOTHED))
     rows, fault = window.sensitivity(np.zeros(3), True)
-    assert (rows.tolist(), fault) == ([[0.0] * 3] * 4, 0)
+    assert rows.shape == (4, 3)
+    assert not rows.any()
+    assert fault == 0
     assert not window.has_shifts
     full, _ = some_window(0, SMOOTHED)
     assert full.has_shifts
@@ -219,14 +218,14 @@ def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, 
 
     def driven_with(scale):
         first = increment_of(motion, 0.5, scale * speed, rate).mean
-        return geometry.compose(first, increment_of(motion, 0.5, scale * speed, more).mean)
+        return se2.compose(first, increment_of(motion, 0.5, scale * speed, more).mean)
 
     h = 1e-6
-    step = geometry.between(driven_with(1.0 - h), driven_with(1.0 + h))
+    step = se2.between(driven_with(1.0 - h), driven_with(1.0 + h))
     first = model_of(motion).forward_column(0.5, speed, rate)
     second = increment_of(motion, 0.5, speed, more).mean
     column = core.shift_after(first, second) + model_of(motion).forward_column(0.5, speed, more)
-    np.testing.assert_allclose(column, geometry.logarithm(step) / (2 * h), atol=2e-2 * speed)
+    np.testing.assert_allclose(column, se2.logarithm(step) / (2 * h), atol=2e-2 * speed)
 
 
 # --- the factor ---
