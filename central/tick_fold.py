@@ -40,9 +40,9 @@ from central.withdrawal import (
     find_suspects,
     hold_trial,
 )
+from team.config import BIASES
 from team.estimation.association.landmark_sets import Verdict
 from team.estimation.contribution import Stream
-from team.estimation.hybrid_slam.sensitivity_kernel import BIASES
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.auditing import fold_tick
 from team.estimation.map_joining.condensing import LIMITS, Limits

@@ -6,7 +6,7 @@ so it does not depend on the odometry's rate.
 """
 
 import math
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -24,6 +24,7 @@ UNNAMED = 2**31
 """Landmark ids below this are identities. Those from here on come from data association: 2³¹ + a
 local index in a submap, 2³¹ | a number of the first member in the team's map."""
 Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
+BIASES: tuple[Bias, ...] = get_args(Bias)
 Exchange = Literal["continuous", "rendezvous"]
 """A robot sends each submap when it is closed, or all buffered submaps at an encounter."""
 if TYPE_CHECKING:
@@ -252,7 +253,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Speed of a teammate in between [m/s]."""
     outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     """Share of measurements that are not of their landmark. Above 0 a window uses only measurements
-    that others confirm (`team.estimation.hybrid_slam.consensus`)."""
+    that others confirm (`team.estimation.hybrid_slam.outliers`)."""
     biases: tuple[Bias, ...] = ()
     """Errors shared by all of the robot's windows, estimated by the centre; each submap carries its
     derivative by each of them."""

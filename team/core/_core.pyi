@@ -23,6 +23,91 @@ class NotFiniteError(ValueError):
 class MotionError(ValueError):
     pass
 
+class Consensus:
+    """
+    The measurements of a window, and which of them agree: those that no others confirm are outliers.
+
+    A measurement is accepted where it is likelier given the other accepted ones and the odometry than
+    as an outlier, uniform over the sensor's range and field of view.
+    """
+
+    def __init__(self, noise: Sequence[float], max_range: float, field_of_view: float, outlier_share: float) -> None:
+        """
+        Begin a window. noise: as of `Window`; outlier_share: the share of measurements that are outliers.
+        """
+
+    def add(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> None:
+        """
+        Take a keyframe: the motion since the last one, then its measurements (there may be none).
+        """
+
+    def agreeing(self) -> NDArray[numpy.bool_]:
+        """
+        Mark the measurements that agree with others of their landmark under the odometry alone.
+
+        The measurement of a landmark that the others support best places it; it is accepted together with
+        those that support it.
+        """
+
+    def confirmed(self) -> NDArray[numpy.bool_]:
+        """
+        Mark those of `agreeing`, then by a smoother over the whole window until the classification is stable.
+
+        Where the normal equations have no solution in floating point, nothing more is rejected.
+        """
+
+def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
+
+    Raises ValueError where A has not as many columns as B has rows.
+    """
+
+def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
+
+    Raises LinAlgError where A is singular.
+    """
+
+def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
+    """
+
+def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the lower L with L L^T = A from the lower triangle of A.
+
+    Raises LinAlgError where A is not positive definite.
+    """
+
+def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute (L L^T)^-1 of a lower triangular L, exactly symmetric."""
+
+def forward(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute L^-1 B of a lower triangular L; B is a vector or a matrix."""
+
+def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.
+    """
+
+def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
+    """
+    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
+    """
+
+def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
+    """
+
+def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
+    """
+
 @overload
 def sin_and_cos(angle: float) -> tuple[float, float]:
     """
@@ -134,57 +219,170 @@ def hypot(x: NDArray[numpy.float64], y: float) -> NDArray[numpy.float64]: ...
 @overload
 def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
-def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
+class Calibration:
+    """What corrects a raw measurement of range and bearing, or refuses it."""
 
-    Raises ValueError where A has not as many columns as B has rows.
-    """
+    def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
+        """
+        lens: coefficients of the bearing's error b (l0 + l1 b + l2 b^2); optical_axis [rad]: of a camera whose
+        range is a depth along it; ranges: (least, most) of raw ranges [m]; half_field: half of the field of view [rad].
+        """
 
-def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
+    def correct(self, ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64]) -> tuple[NDArray[numpy.bool_], NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Return which raw measurements are accepted, and all of them corrected: ((r - range_offset)/range_scale,
+        b - bearing_offset - lens(b)).
 
-    Raises LinAlgError where A is singular.
-    """
+        A depth is divided by cos(b - optical_axis), too, and NaN where that is below 0.17. Accepted are those
+        in the ranges and the field of view whose corrected range is positive.
+        """
 
-def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
-    """
+NEAREST_M: float
 
-def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+def predicted(pose: NDArray[numpy.float64], landmark: NDArray[numpy.float64]) -> tuple[float, float]:
     """
-    Compute the lower L with L L^T = A from the lower triangle of A.
+    Predict range [m] and bearing [rad] of a point landmark from a pose, both in the map frame.
 
-    Raises LinAlgError where A is not positive definite.
-    """
-
-def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """Compute (L L^T)^-1 of a lower triangular L, exactly symmetric."""
-
-def forward(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """Compute L^-1 B of a lower triangular L; B is a vector or a matrix."""
-
-def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.
+    range = max(|landmark - (x, y)|, NEAREST_M), bearing = atan2(dy, dx) - heading in (-pi, pi].
     """
 
-def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
+def predict(pose: NDArray[numpy.float64], landmarks: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
     """
-    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
-    """
-
-def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
+    Predict the measurements h (L, 2) of landmarks (L, 2), with dh/dxi (L, 2, 3) of h(pose o Exp(xi), landmark) at
+    xi = 0 and dh/dlandmark (L, 2, 2).
     """
 
-def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+def located(pose: NDArray[numpy.float64], range: float, bearing: float) -> NDArray[numpy.float64]:
     """
-    Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
+    Invert the model: the point at (range, bearing) from a pose, in the pose's map frame.
     """
+
+def place(pose: NDArray[numpy.float64], measurements: NDArray[numpy.float64], noise: Sequence[float], own: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).
+
+    noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.
+    """
+
+def reduce_scans(scans: Sequence[tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], poses: NDArray[numpy.float64]) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.
+
+    poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
+    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
+    """
+
+class MotionModel:
+    """The parameters of a motion model, as of `team.config.MotionModel`."""
+
+    def __init__(self, *, turns_first: bool, forward: Sequence[float], turn: Sequence[float], final_turn: Sequence[float], lateral: Sequence[float], forward_scale: float, yaw_scale: float, yaw_rate_limit: float, turn_drag: float, veer: float, slow_below: float, slow_scale: float, covariance_factor: float, calibrated_speed: Sequence[float] | None, alphas: Sequence[float] | None, alpha_interval_s: float, wheels: Sequence[float] | None, shares: Sequence[float] | None, shares_interval_s: float) -> None:
+        """
+        Noises are (per_s, per_m, per_rad); wheels: their distance, and the noise of the left and of the right one.
+        """
+
+    def increment(self, duration_s: float, forward: float, yaw_rate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute the motion of one odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
+
+        With v = forward_scale forward (slow_scale forward where |forward| < slow_below),
+        w = clip(yaw_scale yaw_rate, +-yaw_rate_limit), the path length d = sign(v) max(|v| - turn_drag |w|, 0) t,
+        the turn p = w t + veer d and the noises a (forward, on d), b (turn, on p), c (final turn), l (lateral), the
+        motion is
+
+        - "turn-then-drive": turn p + b, drive d + a, then (0, l, c): the thesis, section 4.3.1;
+        - all others: Exp(d + a, 0, p + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma & Ma eq. 1-4.
+
+        Returns mean and covariance.
+        """
+
+    def part(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, duration_s: float, share: float, rest: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute a share of a measured motion Exp(twist) at constant twist, followed by the share `rest`.
+
+        covariance: the source's own of the whole interval, in the tangent space of its end; without it the noise is
+        the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.
+        """
+
+    def forward_column(self, duration_s: float, forward: float, yaw_rate: float) -> NDArray[numpy.float64]:
+        """
+        Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)
+        times the measured one; zero where |forward| lies in `calibrated_speed`, and without such a range.
+        """
+
+def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], then: NDArray[numpy.float64], added: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compose two motions: mean o then, with Ad C Ad' + added, Ad = Ad(then^-1), to first order in the noise.
+    """
+
+def motion_of_sensor(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], mount: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).
+    """
+
+def shift_after(shift: NDArray[numpy.float64], motion: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.
+    """
+
+class Odometry:
+    """
+    Odometry integrated since the places that matter to a window.
+
+    With a mount the motions since a keyframe and a scan are the sensor's; those since a pose node and an
+    inter-robot measurement are the base's. A motion is (mean, covariance).
+    """
+
+    def __init__(self, model: MotionModel, mount: Sequence[float] | None) -> None:
+        """
+        mount: the sensor's pose on the base; None where it is at the base's origin.
+        """
+
+    def drive(self, duration_s: float, forward: float, yaw_rate: float, added: Sequence[float] | None) -> None:
+        """
+        Go on by a part of an interval whose speeds were measured.
+
+        added: variances per second, in addition to the noise.
+        """
+
+    def move(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, interval_s: float, duration_s: float, share: float, rest: float, added: Sequence[float] | None) -> None:
+        """
+        Go on by a part of an interval whose motion was measured, as `MotionModel.part`.
+        """
+
+    def end_keyframe(self) -> tuple[tuple[NDArray[numpy.float64], NDArray[numpy.float64]], NDArray[numpy.float64], tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None]:
+        """
+        End the motion since the last keyframe here.
+
+        Returns it, its shift by an error of the scale of speed, and the motion since the last scan without
+        identities, if there was one.
+        """
+
+    def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Return the motion since the last scan without identities or keyframe; this is such a scan.
+        """
+
+    def mark_scan(self) -> None:
+        """A scan of a keyframe of several scans is here."""
+
+    def end_scans(self) -> NDArray[numpy.float64]:
+        """
+        Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.
+        """
+
+    def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """The motion since the last pose node."""
+
+    def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
+        """
+        This is a pose node: returns the motions since the marked sightings, in their order, and forgets these.
+        """
+
+    def mark_sighting(self) -> None:
+        """An inter-robot measurement that waits for the next pose node is here."""
+
+    def forget_sightings(self) -> None:
+        """Forget the marked sightings."""
 
 def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
@@ -436,12 +634,13 @@ class Window:
     def copy(self) -> Window:
         """Copy the window."""
 
-    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64]) -> Step:
+    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> Step:
         """
         Take a keyframe: the motion since the last one, then its measurements (there may be none).
 
         own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are
-        resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3).
+        resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,
+        in (forward, left, turn), by an error of the scale of speed.
         Raises MotionError, and leaves the window as it was.
         """
 
@@ -452,9 +651,9 @@ class Window:
         Raises MotionError, and leaves the window as it was.
         """
 
-    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> None:
+    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> None:
         """
-        Move the particles without a keyframe; the weights stay. Raises MotionError.
+        Move the particles without a keyframe; the weights stay. shift: as of `advance`. Raises MotionError.
         """
 
     def mark(self) -> None:
@@ -484,6 +683,18 @@ class Window:
         """
         Replace the paths (K, M, 3), with the particles at their ends, the weights and the landmarks.
         """
+
+    def sensitivity(self, mean: NDArray[numpy.float64], with_nodes: bool) -> tuple[NDArray[numpy.float64], int]:
+        """
+        Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.
+
+        Returns a row for each of bearing, forward_scale, range_offset and range_scale, by the window's smoother
+        about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.
+        """
+
+    @property
+    def has_shifts(self) -> bool:
+        """Whether an error of the scale of speed shifts one of the motions."""
 
     def of_base(self) -> Window:
         """

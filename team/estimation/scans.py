@@ -118,34 +118,3 @@ def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[
         (r >= least_m) & (r <= most_m) & (across >= low) & (across <= high)
     )
     return within
-
-
-def carried(
-    own: Float[np.ndarray, " own"], distance: float, direction: float, to: Float[np.ndarray, "2"]
-) -> Own:
-    """Transform the row of a measurement to another pose, where its point lies at `to`.
-
-    direction: of the measurement's ray, in that pose's frame. Its covariance in the plane, along
-    and across the ray, is converted to the point's range and bearing there.
-    """
-    if own[3] == SENSOR:
-        return own[None]
-    reach, far = max(distance, NEAREST_M), max(core.hypot(*to), NEAREST_M)
-    turn = direction - core.atan2(to[1], to[0])
-    s, c = core.sin_and_cos(turn)
-    rr, rb, bb = own[0], own[1] * reach, own[2] * reach * reach
-    along = c * c * rr - 2.0 * c * s * rb + s * s * bb
-    both = c * s * (rr - bb) + (c * c - s * s) * rb
-    across = s * s * rr + 2.0 * c * s * rb + c * c * bb
-    return np.array([[along, both / far, across / (far * far), own[3]]])
-
-
-def mean_claim(claims: list[Own]) -> Own:
-    """Average the covariances of several measurements to the row of their median.
-
-    It is not divided by their number: an error on a landmark is repeated a moment later.
-    """
-    if not claims:
-        return unclaimed(1)
-    mean: Own = np.mean([each for each in claims if each[0, 3] == claims[0][0, 3]], axis=0)
-    return mean

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from team import core
 from team.config import Lens, MotionModel, MotionNoise, Sensor
 from team.estimation import models
 from team.estimation.models import Increment, increment_of
@@ -243,22 +244,20 @@ def test_the_sensors_jacobians_are_those_of_central_differences(x, y, theta, dis
     pose = np.array([x, y, theta])
     landmark = models.located(pose, distance, bearing)
     np.testing.assert_allclose(models.predicted(pose, landmark), (distance, bearing), atol=1e-9)
+    expected, by_pose, by_landmark = core.predict(pose, landmark[None])
+    np.testing.assert_array_equal(expected[0], models.predicted(pose, landmark))
     for column in range(3):
         xi = 1e-6 * (np.arange(3) == column)
         ahead = models.predicted(compose(pose, exponential(xi)), landmark)
         behind = models.predicted(compose(pose, exponential(-xi)), landmark)
         numeric = np.subtract(ahead, behind) / 2e-6
-        np.testing.assert_allclose(
-            models.pose_jacobian(distance, bearing)[:, column], numeric, atol=1e-6
-        )
+        np.testing.assert_allclose(by_pose[0, :, column], numeric, atol=1e-6)
     for column in range(2):
         shift = 1e-6 * (np.arange(2) == column)
         ahead = models.predicted(pose, landmark + shift)
         behind = models.predicted(pose, landmark - shift)
         numeric = np.subtract(ahead, behind) / 2e-6
-        np.testing.assert_allclose(
-            models.landmark_jacobian(distance, theta + bearing)[:, column], numeric, atol=1e-6
-        )
+        np.testing.assert_allclose(by_landmark[0, :, column], numeric, atol=1e-6)
 
 
 def test_calibration_takes_back_what_the_sensor_does():

@@ -7,7 +7,7 @@ import pytest
 
 from team.config import MotionModel, MotionNoise
 from team.estimation.models import Increment, increment_of
-from team.estimation.odometry import OdometryInterval, moved, part_of, steered
+from team.estimation.odometry import OdometryInterval, moved, steered
 from team.estimation.se2 import between, compose, exponential, logarithm
 
 SECOND = 1_000_000_000
@@ -71,7 +71,7 @@ def test_the_noise_of_an_increment_is_what_central_differences_of_its_arc_say() 
     ]  # fmt: skip
     J = np.column_stack([*columns, [-along[1], along[0], 0.0]])
     expected = J @ np.diag([0.09, 0.04, 0.01]) @ J.T
-    told = part_of(motion, moved(end, None), 1.0, 1.0, 0.0)
+    told = interval(end.tolist()).part(motion, SECOND, 0)
     np.testing.assert_allclose(told.covariance, expected, atol=1e-9)
 
 

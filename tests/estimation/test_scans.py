@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 
+from team import core
 from team.config import Bounds, Sensor
 from team.core import landmarks_along_paths
 from team.estimation.hybrid_slam.fastslam import noise_of
-from team.estimation.hybrid_slam.landmark_kernel import place
-from team.estimation.models import landmark_jacobian, predicted
+from team.estimation.models import predicted
 from team.estimation.scans import (
     POINT,
     POLAR,
-    carried,
-    mean_claim,
     point_scan,
     polar_scan,
     sensible,
@@ -61,7 +59,7 @@ def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does
     seen, R = np.array([4.0, 0.3]), np.array([[0.04, 0.006], [0.006, 0.002]])
     mean, P = updated(polar_scan(IDS, seen[:1], seen[1:], packed(R)[None]))
     r, b = predicted(POSE, MEAN)
-    H = landmark_jacobian(r, POSE[2] + b)
+    H = core.predict(POSE, MEAN[None])[2][0]
     K = SPREAD @ H.T @ np.linalg.inv(H @ SPREAD @ H.T + R)
     np.testing.assert_allclose(mean, MEAN + K @ (seen - [r, b]), atol=1e-12)
     np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
@@ -69,9 +67,8 @@ def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does
 
 def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
     scan = point_scan(IDS, np.array([[2.5, 1.5]]), CLAIM[None])
-    mean, P = np.empty(2), np.empty(3)
-    seen = np.array([scan.ranges[0], scan.bearings[0]])
-    place(mean, P, tuple(POSE), seen, SENSOR, scan.own[0])
+    seen = np.column_stack((scan.ranges, scan.bearings))
+    (mean,), (P,) = core.place(POSE, seen, (*SENSOR[:2], 1.0, SENSOR[2], 1.0), scan.own)
     R = turn(POSE[2])
     np.testing.assert_allclose(mean, POSE[:2] + R @ [2.5, 1.5], atol=1e-12)
     np.testing.assert_allclose(full(P), R @ full(CLAIM) @ R.T, atol=1e-12)
@@ -134,9 +131,7 @@ def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None
     point = truth.copy()
     for _ in range(20):
         h = np.array([predicted(pose, point) for pose in path])
-        H = np.vstack([
-            landmark_jacobian(r, pose[2] + b) for (r, b), pose in zip(h, path, strict=True)
-        ])  # fmt: skip
+        H = np.vstack([core.predict(pose, point[None])[2][0] for pose in path])
         information = H.T @ W @ H
         point = point + np.linalg.solve(information, H.T @ W @ (z - h).ravel())
     np.testing.assert_allclose(means[0, 0], point, atol=2e-4)
@@ -145,15 +140,20 @@ def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None
 
 def test_a_claim_is_carried_to_another_pose_as_the_plane_turns() -> None:
     scan = point_scan(IDS, np.array([[2.0, 1.0]]), CLAIM[None])
+    larger = scan._replace(own=scan.own * [3.0, 3.0, 3.0, 1.0])
     back = np.array([0.3, -0.4, 0.5])
     to = back[:2] + turn(back[2]) @ [2.0, 1.0]
-    direction = float(back[2] + scan.bearings[0])
-    found = carried(scan.own[0], float(scan.ranges[0]), direction, to)
+    ids, ranges, bearings, own = core.reduce_scans([scan], back[None])
     turned = turn(back[2]) @ full(CLAIM) @ turn(back[2]).T
-    np.testing.assert_allclose(found, point_scan(IDS, to[None], packed(turned)[None]).own)
-    np.testing.assert_allclose(
-        mean_claim([found, found * [3.0, 3.0, 3.0, 1.0]])[0, :3], 2.0 * found[0, :3]
-    )
+    expected = point_scan(IDS, to[None], packed(turned)[None])
+    assert ids.tolist() == IDS.tolist()
+    for found, of_plane in zip((ranges, bearings, own), expected[1:], strict=True):
+        np.testing.assert_allclose(found, of_plane)
+    mean = core.reduce_scans([scan, larger], np.array([back, back]))[3]
+    np.testing.assert_allclose(mean[0, :3], 2.0 * own[0, :3])
+    bare = scan._replace(own=unclaimed(1))
+    mixed = core.reduce_scans([bare, scan], np.array([back, back]))[3]
+    np.testing.assert_array_equal(mixed, own, "a scan without covariances says nothing of them")
 
 
 def test_scans_of_which_only_some_claim_say_so_row_by_row() -> None:

@@ -138,7 +138,7 @@ def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> N
 def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
     sources = sources_of("sim.studies.experiments.team_runs", ROOTS)
     wanted = {
-        "team.estimation.hybrid_slam.consensus_kernel",
+        "team.estimation.hybrid_slam.outliers",
         "central.submap_fold",
         "sim.studies.rules.svd_rule",  # found by the name that a table gives
         "sim.studies.batch_reference.graph",

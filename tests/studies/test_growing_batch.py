@@ -5,9 +5,10 @@ import pytest
 
 from sim.studies.batch_reference import growing as batch
 from sim.studies.batch_reference.graph import FLOOR_SIGMAS
+from team import core
 from team.config import Sensor
 from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.models import landmark_jacobian, noise, pose_jacobian, predicted
+from team.estimation.models import noise
 from team.estimation.se2 import (
     adjoint,
     between,
@@ -87,11 +88,11 @@ def dense_solution(starts, turns):
                 J[:, column[b] : column[b] + 3] = of_b
             else:
                 node, id_, distance, bearing, sensor = rest
-                d, beta = predicted(x[node], x[id_])
+                (z,), (of_pose,), (of_landmark,) = core.predict(x[node], x[id_][None])
+                d, beta = z
                 P = np.diag(noise(sensor, d))
                 r = np.array([d - distance, wrap(beta - bearing)])
-                J[:, column[node] : column[node] + 3] = pose_jacobian(d, beta)
-                of_landmark = landmark_jacobian(d, x[node][2] + beta)
+                J[:, column[node] : column[node] + 3] = of_pose
                 J[:, column[id_] : column[id_] + 2] = of_landmark
             W = np.linalg.inv(P)
             A, g = A + J.T @ W @ J, g + J.T @ W @ r

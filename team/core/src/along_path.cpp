@@ -19,27 +19,30 @@ struct Sums {
   T range_variance{}, bearing_variance{};
 };
 
-// A landmark seen from a path: its distance and direction, and the bearing's innovation.
+// A measurement of one landmark.
+struct Seen {
+  std::size_t keyframe;
+  Reading reading;
+  bool is_claimed;
+};
+
+// A landmark seen from a path: its distance and direction, and the innovations.
 template <class T>
-struct Line {
-  T distance, ex, ey, off;
+struct Sight : models::Innovation<T> {
+  T distance, ex, ey;
 };
 
 template <class T>
-Line<T> line_to(T at_x, T at_y, const se2::Pose<T>& pose, double bearing) {
-  const T dx = at_x - pose.x, dy = at_y - pose.y;
-  const T apart = pack::sqrt(T(dx * dx + dy * dy));
-  const T distance = select(apart > models::NEAREST_M, apart, pack::all<T>(models::NEAREST_M));
-  const auto is_apart = pack::max(pack::abs(dx), pack::abs(dy)) >= 1e-240;
-  const T direction = elementary::direction_near(pack::abs(dy), select(is_apart, dx, pack::copysign(pack::all<T>(1.0), dx)));
-  const T off = se2::wrapped(T(bearing + pose.heading - pack::copysign(direction, dy)));
-  return {distance, dx / distance, dy / distance, off};
+Sight<T> sight(const se2::Pose<T>& pose, T x, T y, const Reading& z) {
+  const models::Line<T> line = models::line_to(pose, x, y);
+  const T off = se2::wrapped(T(z.bearing + pose.heading - line.direction));
+  return {models::innovation_of(z, line.distance, off), line.distance, line.dx / line.distance, line.dy / line.distance};
 }
 
 // Adds a measurement's terms by its innovations and weights.
 template <class T>
-void add(Sums<T>& s, const Line<T>& at, T of_range, T of_bearing, T wr, T wb) {
-  const T distance = at.distance, ex = at.ex, ey = at.ey;
+void add(Sums<T>& s, const Sight<T>& at, T wr, T wb) {
+  const T distance = at.distance, ex = at.ex, ey = at.ey, of_range = at.of_range, of_bearing = at.of_bearing;
   s.cost += wr * of_range * of_range + wb * of_bearing * of_bearing;
   const T wr_r = wr * of_range, wb_b = wb * of_bearing / distance, wt = wb / (distance * distance);
   s.gx += wr_r * ex - wb_b * ey;
@@ -59,20 +62,9 @@ void add(Sums<T>& s, const Line<T>& at, T of_range, T of_bearing, T wr, T wb) {
 
 // Adds a measurement's terms by the covariance that it brings, with those between range and bearing.
 template <class T>
-void add_claim(Sums<T>& s, const Line<T>& at, const WindowMeasurement& z, const Noise& noise) {
+void add_claim(Sums<T>& s, const Sight<T>& at, const Noise& noise) {
+  const auto& [of_range, of_bearing, rr, rb, bb] = static_cast<const models::Innovation<T>&>(at);
   const T distance = at.distance, ex = at.ex, ey = at.ey;
-  T of_range = z.range - distance, of_bearing = at.off;
-  T rr = pack::all<T>(z.claim.rr), rb = pack::all<T>(z.claim.rb), bb = pack::all<T>(z.claim.bb);
-  if (z.claim.is_of_point()) {
-    const double reach = pack::max(z.range, models::NEAREST_M);
-    const auto [si, co] = elementary::sin_cos_near(at.off);
-    const models::Turned<T> S = models::turned(z.claim.rr, z.claim.rb * reach, z.claim.bb * reach * reach, si, co);
-    rr = S.along;
-    rb = S.both / distance;
-    bb = S.across / (distance * distance);
-    of_range = reach * co - distance;
-    of_bearing = reach * si / distance;
-  }
   const T between = rb * pack::sqrt(noise.range_white * noise.bearing_white);
   const T r = noise.range_white * rr, b = noise.bearing_white * bb;
   const T determinant = r * b - between * between, wr = b / determinant, w = -between / determinant, wb = r / determinant;
@@ -90,9 +82,7 @@ void add_claim(Sums<T>& s, const Line<T>& at, const WindowMeasurement& z, const 
   s.range_sum += along;
   s.bearing_sum += across;
   s.cross += w;
-  s.range_variance = rr;
-  s.bearing_variance = bb;
-  add(s, at, of_range, of_bearing, wr, wb);
+  add(s, at, wr, wb);
 }
 
 // Subtracts the share of an eliminated error, whose sums are total and (x, y), from the landmark's.
@@ -127,7 +117,7 @@ void eliminate_errors(Sums<T>& s, const Noise& noise) {
 // Solves one landmark of some particles. pose_at: their poses at a keyframe; range_weights: as many
 // as there are measurements, of the range as the first evaluation predicts it.
 template <class T, class Path>
-Landmark<T> solve(const Landmark<T>& start, std::span<const WindowMeasurement> measurements, const Noise& noise, Path&& pose_at,
+Landmark<T> solve(const Landmark<T>& start, std::span<const Seen> measurements, const Noise& noise, Path&& pose_at,
                   std::span<T> range_weights) {
   Landmark<T> best = start;
   T at_x = start.x, at_y = start.y, least = pack::all<T>(INF);
@@ -137,16 +127,16 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const WindowMeasurement> m
     Sums<T> s;
     s.bearing_variance = pack::all<T>(noise.bearing_variance);
     for (std::size_t k = 0; k < measurements.size(); k++) {
-      const WindowMeasurement& z = measurements[k];
-      const Line<T> line = line_to<T>(at_x, at_y, pose_at(z.keyframe), z.bearing);
-      if (z.claim.is_made()) {
-        add_claim(s, line, z, noise);
+      const Seen& z = measurements[k];
+      const Sight<T> at = sight<T>(pose_at(z.keyframe), at_x, at_y, z.reading);
+      s.range_variance = at.rr;
+      s.bearing_variance = at.bb;
+      if (z.is_claimed) {
+        add_claim(s, at, noise);
         continue;
       }
-      s.range_variance = noise.range_variance + noise.range_per_m2 * line.distance * line.distance;
-      s.bearing_variance = pack::all<T>(noise.bearing_variance);
-      if (step == 0) range_weights[k] = 1.0 / (noise.range_white * s.range_variance);
-      add(s, line, T(z.range - line.distance), line.off, range_weights[k], bearing_weight);
+      if (step == 0) range_weights[k] = 1.0 / (noise.range_white * at.rr);
+      add(s, at, range_weights[k], bearing_weight);
     }
     eliminate_errors(s, noise);
     const T determinant = s.xx * s.yy - s.xy * s.xy;
@@ -171,12 +161,13 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const WindowMeasurement> m
 Rows landmarks_along_paths(std::span<const std::uint32_t> ids, const Rows& starts, const Rows& path,
                            std::span<const WindowMeasurement> measurements, const Noise& noise) {
   Rows solved(starts.count(), starts.rows());
-  std::vector<WindowMeasurement> of_one;
+  std::vector<Seen> of_one;
   std::vector<Pack> range_weights(measurements.size());
   for (std::size_t slot = 0; slot < ids.size(); slot++) {
     of_one.clear();
     for (const WindowMeasurement& each : measurements)
-      if (each.id == ids[slot]) of_one.push_back(each);
+      if (each.id == ids[slot])
+        of_one.push_back({each.keyframe, models::reading_of(each.range, each.bearing, noise, each.claim), each.claim.is_made()});
     for (std::size_t at = 0; at < starts.stride(); at += WIDTH) {
       const auto row = [&](std::size_t k) { return load(starts[5 * slot + k] + at); };
       const auto pose_at = [&](std::size_t keyframe) {

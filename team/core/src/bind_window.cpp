@@ -1,8 +1,8 @@
 // Bindings of the window and of the functions on its particles.
 #include <algorithm>
 
-#include "binding.hpp"
-#include "window.hpp"
+#include "binding_scan.hpp"
+#include "sensitivity.hpp"
 
 namespace teamslam::binding {
 
@@ -54,14 +54,6 @@ MadeParticles made_particles(const Particles& p) {
           made_landmarks(p.map, 0, 2), made_landmarks(p.map, 2, 3)};
 }
 
-models::Noise noise_of(const std::array<double, 5>& noise) {
-  check_finite(noise.data(), 5, "the noise of the sensor");
-  check(noise[0] > 0.0 && noise[1] >= 0.0 && noise[3] > 0.0, "the variances of the sensor must be positive");
-  check(noise[2] > 0.0 && noise[2] <= 1.0 && noise[4] > 0.0 && noise[4] <= 1.0,
-        "the white shares of the sensor must be in (0, 1]");
-  return {noise[0], noise[1], noise[2], noise[3], noise[4]};
-}
-
 // Rows of landmarks from (M, L, 2) means and (M, L, 3) covariances.
 Rows map_of(std::size_t count, const Stack& means, const Stack& covariances) {
   const std::size_t L = means.shape(1);
@@ -107,22 +99,10 @@ Rows path_of(const Stack& paths, std::size_t count) {
   return path;
 }
 
-window::Increment increment_of(const Triple& mean, const Matrix3& covariance) {
-  return {{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
-}
-
-std::span<const models::Claim> claims_of(const Table& own, std::size_t n) {
-  check(own.shape(0) == n && (own.shape(1) == 0 || own.shape(1) == 4), "own must be (n, 0) or (n, 4)");
-  finite(own, "own");
-  static_assert(sizeof(models::Claim) == 4 * sizeof(double));
-  if (own.shape(1) == 0) return {};
-  return {reinterpret_cast<const models::Claim*>(own.data()), n};
-}
-
-Scan scan_of(const Ids& ids, const Numbers& ranges, const Numbers& bearings, const Table& own) {
-  const std::size_t n = ids.size();
-  check(ranges.size() == n && bearings.size() == n, "ids, ranges and bearings must have one length");
-  return {{ids.data(), n}, finite(ranges, "ranges"), finite(bearings, "bearings"), claims_of(own, n)};
+window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Triple>& shift = std::nullopt) {
+  window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
+  if (shift) increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
+  return increment;
 }
 
 std::span<const double> normals_of(const Table& normals, std::size_t count) {
@@ -280,15 +260,17 @@ void bind_window(nb::module_& m) {
       .def(
           "advance",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
-             const Numbers& bearings, const Table& own, std::optional<double> uniform, const Table& normals) {
+             const Numbers& bearings, const Table& own, std::optional<double> uniform, const Table& normals,
+             const std::optional<Triple>& shift) {
             check(!uniform || (*uniform >= 0.0 && *uniform < 1.0), "uniform must be in [0, 1)");
-            return self.advance(increment_of(motion, covariance), scan_of(ids, ranges, bearings, own),
+            return self.advance(increment_of(motion, covariance, shift), scan_of(ids, ranges, bearings, own),
                                 uniform.value_or(window::NO_RESAMPLING), normals_of(normals, self.settings().particles));
           },
-          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "uniform"_a.none(), "normals"_a,
+          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "uniform"_a.none(), "normals"_a, "shift"_a = nb::none(),
           "Take a keyframe: the motion since the last one, then its measurements (there may be none).\n\n"
           "own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are\n"
-          "resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3).\n"
+          "resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,\n"
+          "in (forward, left, turn), by an error of the scale of speed.\n"
           "Raises MotionError, and leaves the window as it was.")
       .def(
           "step",
@@ -302,11 +284,12 @@ void bind_window(nb::module_& m) {
           "Raises MotionError, and leaves the window as it was.")
       .def(
           "move",
-          [](Window& self, const Triple& motion, const Matrix3& covariance, const Table& normals) {
-            self.move(increment_of(motion, covariance), normals_of(normals, self.settings().particles));
+          [](Window& self, const Triple& motion, const Matrix3& covariance, const Table& normals,
+             const std::optional<Triple>& shift) {
+            self.move(increment_of(motion, covariance, shift), normals_of(normals, self.settings().particles));
           },
-          "motion"_a, "covariance"_a, "normals"_a,
-          "Move the particles without a keyframe; the weights stay. Raises MotionError.")
+          "motion"_a, "covariance"_a, "normals"_a, "shift"_a = nb::none(),
+          "Move the particles without a keyframe; the weights stay. shift: as of `advance`. Raises MotionError.")
       .def("mark", &Window::mark, "Make the particles' poses at the last keyframe a pose node.")
       .def(
           "innovation",
@@ -343,6 +326,25 @@ void bind_window(nb::module_& m) {
           },
           "paths"_a, "log_weights"_a, "means"_a, "covariances"_a,
           "Replace the paths (K, M, 3), with the particles at their ends, the weights and the landmarks.")
+      .def(
+          "sensitivity",
+          [](const Window& self, const Numbers& mean, bool with_nodes) {
+            const std::size_t nodes = with_nodes ? self.nodes().size() : 0;
+            check(mean.size() == 3 + 3 * nodes + 2 * self.particles().landmarks(), "mean must be of this window");
+            window::Sensitivity found = window::sensitivity_of(self, finite(mean, "mean"), with_nodes);
+            return std::tuple(made_matrix(std::move(found.rows)), int(found.fault));
+          },
+          "mean"_a, "with_nodes"_a,
+          "Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.\n\n"
+          "Returns a row for each of bearing, forward_scale, range_offset and range_scale, by the window's smoother\n"
+          "about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.")
+      .def_prop_ro(
+          "has_shifts",
+          [](const Window& self) {
+            const auto is_shifted = [](const window::WindowMotion& each) { return each.shift != std::array<double, 3>{}; };
+            return std::any_of(self.motions().begin(), self.motions().end(), is_shifted);
+          },
+          "Whether an error of the scale of speed shifts one of the motions.")
       .def("of_base", &Window::of_base,
            "Copy the window as one of the base: poses and landmarks in the frame of the base's start.")
       .def("particles", [](const Window& self) { return made_particles(self.particles()); },
@@ -361,15 +363,8 @@ void bind_window(nb::module_& m) {
       .def(
           "mean_path",
           [](const Window& self) {
-            std::vector<double> weights, means;
-            for (std::size_t i = 0; i < self.settings().particles; i++)
-              weights.push_back(elementary::exp(self.particles().log_weights[i]));
-            for (std::size_t j = 0; j < 3 * self.keyframes(); j++) {
-              const std::span<const double> numbers = self.path().numbers(j);
-              double sum = 0.0;
-              for (std::size_t i = 0; i < weights.size(); i++) sum += weights[i] * numbers[i];
-              means.push_back(j % 3 == 2 ? window::mean_direction(numbers, weights) : sum);
-            }
+            std::vector<double> means;
+            for (const auto& [x, y, heading] : self.mean_path()) means.insert(means.end(), {x, y, heading});
             return made<double, nb::ndim<2>>(std::move(means), {self.keyframes(), 3});
           },
           "Compute the weighted mean (K, 3) of the poses at each keyframe, headings on the circle.")

@@ -7,14 +7,20 @@
 // the map, (u, v) in the robot, and d the distance, the Jacobians are
 //
 //     ∂h/∂landmark = [eₓ e_y; −e_y/d eₓ/d],  ∂h/∂ξ = [−u −v 0; v/d −u/d −1].
+//
+// Two evaluations differ in rounding. `predict` and `place` take the heading's sine and cosine and no
+// angle: they are for particles, which are many. `line_to`, `polar`, `located` take angles.
 #pragma once
+
+#include <array>
+#include <type_traits>
 
 #include "se2.hpp"
 
 namespace teamslam::models {
 
 using pack::all, pack::copysign, pack::max, pack::select;
-using se2::Directed;
+using se2::Directed, se2::Point, se2::Pose;
 
 inline constexpr double NEAREST_M = 1e-3;
 inline constexpr double LOG_2_PI = 1.8378770664093453;
@@ -86,19 +92,104 @@ inline Reading reading_of(double range, double bearing, const Noise& sensor, con
   return z;
 }
 
+// z − h and its noise: that of the sensor at the predicted range, or the measurement's own.
+template <class T>
+struct Innovation {
+  T of_range, of_bearing, rr, rb, bb;
+};
+
+// Of a point, whose bearing's innovation δ is given by its sine and cosine.
+//
+// Both innovations are the point's: with its error (r cos δ − d, r sin δ) along and across the
+// predicted direction and S its covariance turned there, (e₀, e₁/d) and diag(1, 1/d) S diag(1, 1/d).
+// That is a linear map of both, so whatever follows is what it were for the point itself.
+template <class T>
+inline Innovation<T> innovation_of_point(const Reading& z, const T& distance, const T& sine_off, const T& cosine_off) {
+  const double reach = max(z.range, NEAREST_M);
+  const T d = distance;
+  const Turned<T> S = turned(z.along, z.both, z.across, sine_off, cosine_off);
+  return {reach * cosine_off - d, reach * sine_off / d, S.along, S.both / d, S.across / (d * d)};
+}
+
+template <class T>
+inline Innovation<T> innovation_of_polar(const Reading& z, const T& distance, const T& off) {
+  return {z.range - distance, off, z.rr + z.rr_per_m2 * distance * distance, all<T>(z.rb), all<T>(z.bb)};
+}
+
+// By the predicted range and the bearing's innovation.
+template <class T>
+inline Innovation<T> innovation_of(const Reading& z, const T& distance, const T& off) {
+  if (!z.is_point) return innovation_of_polar(z, distance, off);
+  const auto [s, c] = elementary::sin_cos_near(off);
+  return innovation_of_point(z, distance, s, c);
+}
+
+// A landmark seen from a pose: its distance [m] and its direction in the map [rad].
+template <class T>
+struct Line {
+  T dx, dy, distance, direction;
+};
+
+template <class T>
+inline Line<T> line_to(const Pose<T>& pose, const T& x, const T& y) {
+  const T dx = x - pose.x, dy = y - pose.y;
+  const T distance = max(T(pack::sqrt(T(dx * dx + dy * dy))), all<T>(NEAREST_M));
+  if constexpr (std::is_same_v<T, double>) {
+    return {dx, dy, distance, elementary::atan2(dy, dx)};
+  } else {
+    const auto is_apart = max(pack::abs(dx), pack::abs(dy)) >= 1e-240;
+    const T along = select(is_apart, dx, copysign(all<T>(1.0), dx));
+    return {dx, dy, distance, copysign(elementary::direction_near(pack::abs(dy), along), dy)};
+  }
+}
+
+// h in angles: range [m] and bearing [rad], or a measurement.
+struct Polar {
+  double range, bearing;
+};
+
+inline Polar polar(const Pose<double>& pose, const Point<double>& landmark) {
+  const Line<double> line = line_to(pose, landmark.x, landmark.y);
+  return {line.distance, se2::wrapped(line.direction - pose.heading)};
+}
+
+// z − h of a landmark that is predicted at a range and a bearing.
+inline Innovation<double> innovation_of(const Reading& z, const Polar& predicted) {
+  return innovation_of(z, predicted.range, se2::wrapped(z.bearing - predicted.bearing));
+}
+
+// The rows of range and bearing: ∂h/∂ξ of h(pose ∘ Exp(ξ), landmark) at ξ = 0, by the predicted
+// bearing, and ∂h/∂landmark, by the landmark's direction in the map.
+using PoseJacobian = std::array<std::array<double, 3>, 2>;
+using LandmarkJacobian = std::array<std::array<double, 2>, 2>;
+
+inline PoseJacobian pose_jacobian(double distance, double bearing) {
+  const auto [s, c] = elementary::sin_cos(bearing);
+  return {{{-c, -s, 0.0}, {s / distance, -c / distance, -1.0}}};
+}
+
+inline LandmarkJacobian landmark_jacobian(double distance, double direction) {
+  const auto [s, c] = elementary::sin_cos(direction);
+  return {{{c, s}, {-s / distance, c / distance}}};
+}
+
+// The inverse of h: the point at a range and a bearing from a pose.
+inline Point<double> located(const Pose<double>& pose, const Polar& z) {
+  const auto [s, c] = elementary::sin_cos(pose.heading + z.bearing);
+  return {pose.x + z.range * c, pose.y + z.range * s};
+}
+
 // A landmark seen from a pose: distance, its direction in the map (ex, ey) and in the robot (u, v),
 // sine and cosine of the bearing's innovation, both innovations and their noise.
 template <class T>
-struct Prediction {
-  T distance, ex, ey, u, v, sine_off, cosine_off, of_range, of_bearing, rr, rb, bb;
+struct Prediction : Innovation<T> {
+  T distance, ex, ey, u, v, sine_off, cosine_off;
 };
 
 // h and z − h.
 //
 // The bearing's innovation δ is the angle between the direction that was read and the one that is
-// predicted, by their vector and scalar products. For a point both innovations are the point's:
-// with its error (r cos δ − d, r sin δ) along and across the predicted direction and S its
-// covariance turned there, (e₀, e₁/d) and diag(1, 1/d) S diag(1, 1/d).
+// predicted, by their vector and scalar products.
 template <class T>
 inline Prediction<T> predict(const Directed<T>& pose, const Landmark<T>& at, const Reading& z) {
   Prediction<T> p;
@@ -113,34 +204,36 @@ inline Prediction<T> predict(const Directed<T>& pose, const Landmark<T>& at, con
   p.v = c * p.ey - s * p.ex;
   p.sine_off = z.sine * p.u - z.cosine * p.v;
   p.cosine_off = z.cosine * p.u + z.sine * p.v;
-  p.of_range = z.range - p.distance;
-  p.of_bearing = copysign(elementary::direction_near(pack::abs(p.sine_off), p.cosine_off), p.sine_off);
-  p.rr = z.rr + z.rr_per_m2 * p.distance * p.distance;
-  p.rb = all<T>(z.rb);
-  p.bb = all<T>(z.bb);
+  Innovation<T>& innovation = p;
   if (z.is_point) {
-    const double reach = max(z.range, NEAREST_M);
-    const T d = p.distance;
-    const Turned<T> S = turned(z.along, z.both, z.across, p.sine_off, p.cosine_off);
-    p.of_range = reach * p.cosine_off - d;
-    p.of_bearing = reach * p.sine_off / d;
-    p.rr = S.along;
-    p.rb = S.both / d;
-    p.bb = S.across / (d * d);
+    innovation = innovation_of_point(z, p.distance, p.sine_off, p.cosine_off);
+  } else {
+    const T off = copysign(elementary::direction_near(pack::abs(p.sine_off), p.cosine_off), p.sine_off);
+    innovation = innovation_of_polar(z, p.distance, off);
   }
   return p;
 }
 
-// A landmark at first sight: the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z.
+// A landmark at first sight in the direction (ex, ey): the inverse model g and Σ = G R Gᵀ, G = ∂g/∂z.
 template <class T>
-inline Landmark<T> place(const Directed<T>& pose, const Reading& z) {
+inline Landmark<T> place_in(const T& ex, const T& ey, const T& x, const T& y, const Reading& z) {
   const double distance = max(z.range, NEAREST_M);
-  const T s = pose.sine, c = pose.cosine;
-  const T ex = c * z.cosine - s * z.sine, ey = s * z.cosine + c * z.sine;
-  return {pose.x + distance * ex, pose.y + distance * ey,
+  return {x + distance * ex, y + distance * ey,
           z.along * ex * ex + z.across * ey * ey - 2.0 * z.both * ex * ey,
           (z.along - z.across) * ex * ey + z.both * (ex * ex - ey * ey),
           z.along * ey * ey + z.across * ex * ex + 2.0 * z.both * ex * ey};
+}
+
+template <class T>
+inline Landmark<T> place(const Directed<T>& pose, const Reading& z) {
+  const T s = pose.sine, c = pose.cosine;
+  const T ex = c * z.cosine - s * z.sine, ey = s * z.cosine + c * z.sine;
+  return place_in(ex, ey, pose.x, pose.y, z);
+}
+
+inline Landmark<double> place(const Pose<double>& pose, const Reading& z) {
+  const auto [ey, ex] = elementary::sin_cos(pose.heading + z.bearing);
+  return place_in<double>(ex, ey, pose.x, pose.y, z);
 }
 
 template <class T>

@@ -14,7 +14,11 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   nb::exception<window::MotionError>(m, "MotionError", PyExc_ValueError);
   binding::bind_elementary(m);
   binding::bind_random(m);
+  binding::bind_consensus(m);
   binding::bind_dense(m);
+  binding::bind_elementary(m);
+  binding::bind_models(m);
+  binding::bind_motion(m);
   binding::bind_se2(m);
   binding::bind_sparse(m);
   binding::bind_window(m);

@@ -153,7 +153,7 @@ inline Directed<T> moved_by_noise(const Directed<T>& at, const Lower3& L, const 
 class Mount {
  public:
   Mount() = default;
-  Mount(double x, double y, double heading) : x_(x), y_(y), is_mounted_(x != 0.0 || y != 0.0 || heading != 0.0) {
+  Mount(double x, double y, double heading) : x_(x), y_(y), heading_(heading), is_mounted_(x != 0.0 || y != 0.0 || heading != 0.0) {
     const auto [s, c] = elementary::sin_cos(heading);
     sine_ = s;
     cosine_ = c;
@@ -163,6 +163,12 @@ class Mount {
 
   bool is_mounted() const { return is_mounted_; }
 
+  // m⁻¹: the mount whose sensor is this one's base.
+  Mount inverse() const {
+    const auto [x, y, heading] = se2::inverse(Pose<double>{x_, y_, heading_});
+    return {x, y, heading};
+  }
+
   Pose<double> base_pose(const Pose<double>& sensor) const {
     const auto [s, c] = elementary::sin_cos(sensor.heading);
     const Point<double> moved =
@@ -170,7 +176,18 @@ class Mount {
     return {moved.x, moved.y, sensor.heading + 0.0};
   }
   Point<double> base_point(const Point<double>& p) const {
-    return {(cosine_ * p.x - sine_ * p.y) + x_, (sine_ * p.x + cosine_ * p.y) + y_};
+    const auto [x, y] = base_vector(p);
+    return {x + x_, y + y_};
+  }
+  Point<double> base_vector(const Point<double>& d) const {
+    return {cosine_ * d.x - sine_ * d.y, sine_ * d.x + cosine_ * d.y};
+  }
+  // The shift of the base's pose, of one of the sensor's in (x, y, heading).
+  Pose<double> base_shift(const Pose<double>& shift, const Pose<double>& sensor) const {
+    const auto [s, c] = elementary::sin_cos(sensor.heading);
+    const auto [x, y] = base_vector({shift.x - (s * away_x_ + c * away_y_) * shift.heading,
+                                     shift.y + (c * away_x_ - s * away_y_) * shift.heading});
+    return {x, y, shift.heading};
   }
   // Along the axes of the base's frame.
   Spread<double> base_spread(const Spread<double>& P) const {
@@ -180,7 +197,7 @@ class Mount {
   }
 
  private:
-  double x_ = 0, y_ = 0, sine_ = 0, cosine_ = 1, away_x_ = 0, away_y_ = 0;
+  double x_ = 0, y_ = 0, heading_ = 0, sine_ = 0, cosine_ = 1, away_x_ = 0, away_y_ = 0;
   bool is_mounted_ = false;
 };
 

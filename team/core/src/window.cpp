@@ -5,7 +5,7 @@ namespace teamslam::window {
 namespace {
 
 Lower3 factor_of(const Increment& increment) {
-  const auto& [mean, covariance] = increment;
+  const auto& [mean, covariance, shift] = increment;
   const Lower3 L = linalg::semidefinite_factor(covariance);
   if (!L.is_finite()) throw MotionError("not positive semi-definite");
   if (!std::isfinite(mean.forward) || !std::isfinite(mean.left) || !std::isfinite(mean.turn))
@@ -72,23 +72,30 @@ Step Window::advance(const Increment& increment, const Scan& scan, double unifor
   const std::vector<Reading> readings = readings_of(scan);
   const Innovation innovation = innovation_of(particles_, increment.mean, L, slots_of(scan), readings);
   if (uniform >= 0.0) particles_.resample(uniform, path_);
-  const double log_evidence = take(increment.mean, L, scan, readings, normals);
+  const double log_evidence = take(increment, L, scan, readings, normals);
   return {effective_, log_evidence, innovation.squared, innovation.error.size()};
 }
 
 double Window::step(const Increment& increment, const Scan& scan, std::span<const double> normals) {
-  return take(increment.mean, factor_of(increment), scan, readings_of(scan), normals);
+  return take(increment, factor_of(increment), scan, readings_of(scan), normals);
 }
 
-double Window::take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
+void Window::keep(const Increment& increment) {
+  WindowMotion& motion = motions_.emplace_back();
+  for (std::size_t i = 0; i < 9; i++) motion.covariance[i / 3][i % 3] = increment.covariance[i];
+  motion.shift = increment.shift;
+}
+
+double Window::take(const Increment& increment, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
                     std::span<const double> normals) {
-  particles_.step(motion, L, settings_.is_improved, particles_.find(scan.ids, readings), normals);
+  particles_.step(increment.mean, L, settings_.is_improved, particles_.find(scan.ids, readings), normals);
   const std::span<double> log_weights(particles_.log_weights.data(), particles_.count());
   const double log_evidence = normalise(log_weights);
   effective_ = effective_sample_size(log_weights);
   for (std::size_t k = 0; k < scan.ids.size(); k++)
     measurements_.push_back({scan.ids[k], keyframes(), scan.ranges[k], scan.bearings[k], scan.claim(k)});
   path_.append(particles_.pose);
+  keep(increment);
   return log_evidence;
 }
 
@@ -97,11 +104,27 @@ void Window::move(const Increment& increment, std::span<const double> normals) {
   const std::vector<double> log_weights = particles_.log_weights;
   particles_.step(increment.mean, L, false, {}, normals);
   particles_.log_weights = log_weights;
+  keep(increment);
 }
 
 void Window::mark() {
   if (!keyframes()) throw std::out_of_range("a pose node needs a keyframe");
   nodes_.push_back(keyframes() - 1);
+}
+
+std::vector<se2::Pose<double>> Window::mean_path() const {
+  std::vector<double> weights;
+  for (std::size_t i = 0; i < particles_.count(); i++) weights.push_back(elementary::exp(particles_.log_weights[i]));
+  const auto mean = [&](std::size_t row) {
+    const std::span<const double> numbers = path_.numbers(row);
+    double sum = 0.0;
+    for (std::size_t i = 0; i < weights.size(); i++) sum += weights[i] * numbers[i];
+    return sum;
+  };
+  std::vector<se2::Pose<double>> found;
+  for (std::size_t k = 0; k < keyframes(); k++)
+    found.push_back({mean(3 * k), mean(3 * k + 1), mean_direction(path_.numbers(3 * k + 2), weights)});
+  return found;
 }
 
 void Window::replace(Particles particles, Rows path) {

@@ -19,10 +19,18 @@ struct Settings {
   se2::Mount mount;
 };
 
-// The motion since the last keyframe, its covariance in the tangent space of its end.
+// The motion since the last keyframe; its covariance, and its shift by an error of the scale of speed, in
+// the tangent space of its end.
 struct Increment {
   Motion mean;
   std::span<const double, 9> covariance;
+  std::array<double, 3> shift{};
+};
+
+// The motion to a keyframe, or after the last one: its noise and its shift.
+struct WindowMotion {
+  linalg::Matrix3 covariance;
+  std::array<double, 3> shift;
 };
 
 // Measurements of landmarks, corrected by the calibration; an id may occur twice. claims: the
@@ -81,8 +89,12 @@ class Window {
   Rows solved_landmarks() const;
 
   // Poses and landmarks in the frame of the base's start. The measurements stay the sensor's, so this
-  // window neither advances nor closes: it throws std::invalid_argument.
+  // window neither advances nor closes: `check_of_sensor` throws std::invalid_argument.
   Window of_base() const;
+  void check_of_sensor() const;
+
+  // The weighted mean of the poses at each keyframe, headings on the circle.
+  std::vector<se2::Pose<double>> mean_path() const;
 
   // Replaces the paths of the particles, and what follows from them.
   void replace(Particles particles, Rows path);
@@ -92,13 +104,14 @@ class Window {
   const Rows& path() const { return path_; }
   std::size_t keyframes() const { return path_.rows() / 3; }
   std::span<const WindowMeasurement> measurements() const { return measurements_; }
+  std::span<const WindowMotion> motions() const { return motions_; }
   std::span<const std::size_t> nodes() const { return nodes_; }
   double effective() const { return effective_; }
 
  private:
-  void check_of_sensor() const;
   Gaussian gaussian(bool with_nodes, Rows landmarks) const;
-  double take(const Motion& motion, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
+  void keep(const Increment& increment);
+  double take(const Increment& increment, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
               std::span<const double> normals);
   std::vector<Reading> readings_of(const Scan& scan) const;
   std::vector<std::size_t> slots_of(const Scan& scan) const;
@@ -107,6 +120,7 @@ class Window {
   Particles particles_;
   Rows path_;  // x, y, heading of each keyframe, along each particle's line of descent
   std::vector<WindowMeasurement> measurements_;
+  std::vector<WindowMotion> motions_;
   std::vector<std::size_t> nodes_;  // the keyframe of each pose node
   double effective_;
   bool is_of_base_ = false;

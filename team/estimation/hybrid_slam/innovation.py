@@ -15,13 +15,7 @@ from team.config import Sensor
 from team.estimation import dense
 from team.estimation.gaussian import cholesky_factor, whitened
 from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
-from team.estimation.models import (
-    Increment,
-    landmark_jacobian,
-    noise,
-    pose_jacobian,
-    predicted,
-)
+from team.estimation.models import Increment, noise
 from team.estimation.scans import Own, unclaimed
 from team.estimation.se2 import compose, tangent, wrapped
 
@@ -120,17 +114,17 @@ def joint_innovation(
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     to_own = dense.product(tangent(pose[2]).T, F)
     m = 2 * len(slots)
-    error, A, H = np.empty(m), np.zeros((m, len(columns))), np.empty((m, 3))
-    R = np.empty(m)
+    error, A, R = np.empty(m), np.zeros((m, len(columns))), np.empty(m)
     measurements = np.column_stack((ranges, bearings))[known]
+    expected, by_pose, by_landmark = core.predict(pose, places[slots])
     for k, slot in enumerate(slots):
         rows = slice(2 * k, 2 * k + 2)
-        distance, bearing = predicted(pose, places[slot])
+        distance, bearing = expected[k].tolist()
         error[rows] = measurements[k, 0] - distance, wrapped(measurements[k, 1] - bearing)
         R[rows] = noise(sensor, distance)
-        H[rows] = pose_jacobian(distance, bearing)
-        A[rows, :3] = dense.product(H[rows], to_own)
-        A[rows, 3 + 2 * slot : 5 + 2 * slot] = landmark_jacobian(distance, pose[2] + bearing)
+        A[rows, :3] = dense.product(by_pose[k], to_own)
+        A[rows, 3 + 2 * slot : 5 + 2 * slot] = by_landmark[k]
+    H = by_pose.reshape(m, 3)
     S = (
         dense.product(dense.product(A, covariance[np.ix_(columns, columns)]), A.T)
         + dense.product(dense.product(H, increment.covariance), H.T)

@@ -1,5 +1,6 @@
 """Keyframes from a stream of odometry intervals and scans."""
 
+import math
 from bisect import insort
 
 import msgspec
@@ -7,17 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 from msgspec.structs import force_setattr, replace
 
+from team import core
 from team.config import MotionModel, Sensor
-from team.estimation import dense, se2
-from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
-from team.estimation.hybrid_slam.reduction import KeyframeScan, all_between, reduced
-from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
-from team.estimation.models import Increment, scanned
-from team.estimation.mount import of_sensor
+from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
+from team.estimation.models import Increment, model_of, scanned
 from team.estimation.odometry import STANDING, OdometryInterval
 from team.estimation.scans import Own, calibrated, unclaimed
-from team.estimation.se2 import Pose, adjoint, inverse
 from team.rejection import Rejection
 
 NOTHING = np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
@@ -35,7 +32,7 @@ class Keyframe(msgspec.Struct, frozen=True, gc=False):
     looks: the scans without identities since the last keyframe, as they came. rest: the motion
     since the last of them; None: there is none.
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
-    forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
+    forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
     """
 
     stamp_ns: int
@@ -82,25 +79,19 @@ class Segmenter:
         keyframe_s: float,
         grid: PoseGrid | None = None,
     ) -> None:
-        self._motion = motion
         self._sensor = sensor
         self._keyframe_ns = round(keyframe_s * 1e9)
         self._grid = grid
         self._here_ns = 0
-        self._increment = Increment.identity()
-        self._forward = np.zeros(3)
+        self._odometry = core.Odometry(
+            model_of(motion), sensor.mount if sensor.is_mounted else None
+        )
         self._waiting: list[KeyframeScan] = []
         self._keyframe: list[KeyframeScan] = []
-        self._scan_poses: list[Pose] = []
         self._keyframe_start_ns = 0
-        self._scan_motion = np.zeros(3)
-        self._since_look: Increment | None = None
         self.rest_forward = np.zeros(3)
-        self._is_mounted, self._mount = sensor.is_mounted, np.array(sensor.mount)
-        self._unmount = adjoint(inverse(self._mount))
         self._last = STANDING
-        self._unmeasured: Float[np.ndarray, "3 3"] | None = None
-        self._run = OdometryRun(motion)
+        self._unmeasured: tuple[float, float, float] | None = None
         self.now_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
@@ -110,6 +101,7 @@ class Segmenter:
         self._last = STANDING  # a submap depends on its window's measurements alone
         if self._grid is not None:
             self._grid.begin(stamp_ns)
+            self._odometry.forget_sightings()
 
     def observe(
         self,
@@ -164,7 +156,6 @@ class Segmenter:
             elif self._keyframe_ns:
                 self._keep(scan)
             else:
-                self._settle()
                 seen = scan.ids, scan.ranges, scan.bearings
                 keyframes.append(self._keyframe_at(at_ns, *seen, scan.own))
         if self._grid is not None:
@@ -172,7 +163,6 @@ class Segmenter:
         self._go_on_to(stamp_ns, over)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
-            self._settle()
             keyframes.append(self._close_keyframe(stamp_ns))
         return keyframes
 
@@ -180,22 +170,17 @@ class Segmenter:
         """Keep a scan without identities with the motion since the one before; returns its
         keyframe, if it is one.
         """
-        self._settle()
-        motion = self._increment if self._since_look is None else self._since_look
+        motion = Increment(*self._odometry.pass_unnamed_scan())
         scan = replace(scan, at_ns=at_ns, motion=motion)
-        self._since_look = Increment.identity()
         if self._keyframe_ns:
             self._keep(scan)
             return []
         return [replace(self._keyframe_at(at_ns, *NOTHING), looks=(scan,))]
 
     def _keep(self, scan: KeyframeScan) -> None:
-        """Keep a scan of the keyframe, here; its pose is known once the motion up to it is."""
+        """Keep a scan of the keyframe, here."""
         self._keyframe.append(scan)
-        if self._run.is_pending:
-            self._run.mark()
-        else:
-            self._scan_poses.append(self._scan_motion)
+        self._odometry.mark_scan()
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
         """Close the window here: returns its last keyframe, if one is open, and the motion after
@@ -203,13 +188,11 @@ class Segmenter:
 
         The shift of that motion by an error of the scale of speed is `rest_forward`.
         """
-        self._settle()
         keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
-        rest, self.rest_forward = self._increment, self._forward
-        self._increment, self._forward = Increment.identity(), np.zeros(3)
+        rest, self.rest_forward, _ = self._odometry.end_keyframe()
+        self._odometry.end_scans()
         self._keyframe_start_ns = stamp_ns
-        self._scan_motion, self._since_look = np.zeros(3), None
-        return keyframes, rest
+        return keyframes, Increment(*rest)
 
     def leave(self) -> int:
         """End the window: drop the scans that are stamped behind it; returns their number.
@@ -232,8 +215,7 @@ class Segmenter:
         keyframes = []
         while (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
             self._go_on_to(next_ns, over)
-            self._settle()
-            if grid.reach():
+            if grid.reach(self._odometry):
                 keyframes.append(replace(self._keyframe_at(next_ns, *NOTHING), is_node=True))
         return keyframes
 
@@ -246,47 +228,12 @@ class Segmenter:
         return stamp_ns
 
     def _integrate(self, duration_ns: int, rest_ns: int, over: OdometryInterval) -> None:
-        if over.moved is None and self._unmeasured is None and not self._is_mounted:
-            self._run.add(over, duration_ns)
+        part_s, added = duration_ns * 1e-9, self._unmeasured
+        if over.moved is None:
+            self._odometry.drive(part_s, over.forward, over.yaw_rate, added)
             return
-        self._settle()
-        step = over.part(self._motion, duration_ns, rest_ns)
-        if self._unmeasured is not None:
-            added = step.covariance + duration_ns * 1e-9 * self._unmeasured
-            step = Increment(step.mean, added)
-        if self._grid is not None:
-            self._grid.moved(step)
-        if self._is_mounted:
-            step = of_sensor(step, self._mount)
-        self._increment = self._increment.then(step)
-        if self._motion.calibrated_speed is not None:
-            column = over.forward_column(self._motion, duration_ns)
-            if self._is_mounted:
-                column = dense.product(self._unmount, column)
-            self._forward = carried_on(self._forward, step.mean) + column
-        if self._keyframe_ns:
-            self._scan_motion = se2.compose(self._scan_motion, step.mean)
-        if self._since_look is not None:
-            self._since_look = self._since_look.then(step)
-
-    def _settle(self) -> None:
-        """Bring the motions up to date with the intervals driven since the last call."""
-        if not self._run.is_pending:
-            return
-        if self._since_look is not None:
-            self._since_look = self._run.append_to(self._since_look)
-        if self._grid is not None:
-            self._grid.carry(self._run.append_to)
-        node = Increment.identity() if self._grid is None else self._grid.since_node
-        after, poses = self._run.compose(self._increment, node, self._forward, self._scan_motion)
-        self._scan_poses += list(poses)
-        self._increment = Increment(after.motion, after.covariance)
-        if self._motion.calibrated_speed is not None:
-            self._forward = after.shift
-        if self._keyframe_ns:
-            self._scan_motion = after.of_scan
-        if self._grid is not None:
-            self._grid.since_node = Increment(after.node_motion, after.node_covariance)
+        share, rest = duration_ns / over.duration_ns, rest_ns / over.duration_ns
+        self._odometry.move(*over.moved, over.duration_ns * 1e-9, part_s, share, rest, added)
 
     def _keyframe_at(
         self,
@@ -296,29 +243,24 @@ class Segmenter:
         bearings: Float[np.ndarray, " n"],
         own: Own,
     ) -> Keyframe:
-        motion = self._increment
-        keyframe = Keyframe(
+        motion, forward, rest = self._odometry.end_keyframe()
+        return Keyframe(
             stamp_ns=stamp_ns,
-            increment=motion,
+            increment=Increment(*motion),
             ids=ids,
             ranges=ranges,
             bearings=bearings,
             own=own,
-            rest=self._since_look,
-            forward=self._forward,
+            rest=None if rest is None else Increment(*rest),
+            forward=forward,
         )
-        self._increment, self._since_look = Increment.identity(), None
-        self._forward = np.zeros(3)
-        return keyframe
 
     def _close_keyframe(self, stamp_ns: int) -> Keyframe:
-        backs = all_between(self._scan_motion, np.array(self._scan_poses))
-        placed = list(zip(self._keyframe, backs, strict=True))
+        placed = list(zip(self._keyframe, self._odometry.end_scans(), strict=True))
         seen = reduced([each for each in placed if not each[0].is_unnamed])
         looks = tuple(replace(scan, back=back) for scan, back in placed if scan.is_unnamed)
-        self._keyframe, self._scan_poses = [], []
+        self._keyframe = []
         self._keyframe_start_ns = stamp_ns
-        self._scan_motion = np.zeros(3)
         return replace(self._keyframe_at(stamp_ns, *seen), looks=looks)
 
 
@@ -334,8 +276,8 @@ def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most:
     return keyframe.only(taken)
 
 
-def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> Float[np.ndarray, "3 3"]:
-    """Variance per second of an unmeasured motion, such that errors of the speeds sum up."""
+def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> tuple[float, float, float]:
+    """Variances per second of an unmeasured motion, such that errors of the speeds sum up."""
     way = max(abs(forward), UNMEASURED[0]) * duration_s
-    turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, np.pi)
-    return np.diag([way * way, 0.01 * way * way, turn * turn]) / duration_s
+    turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, math.pi)
+    return way * way / duration_s, 0.01 * way * way / duration_s, turn * turn / duration_s

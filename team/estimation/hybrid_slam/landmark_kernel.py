@@ -27,43 +27,6 @@ def seen(pose: Triple, mean: Float[np.ndarray, "2"]) -> Triple:
     return distance, dx / distance, dy / distance
 
 
-@inlined
-def innovation_of(
-    measurement: Float[np.ndarray, "2"],
-    own: Float[np.ndarray, " own"],
-    sensor: Triple,
-    distance: float,
-    of_bearing: float,
-) -> tuple[float, float, float, float, float]:
-    """Innovation and noise (ν_range, ν_bearing, rr, rb, bb) of a measurement.
-
-    distance: the predicted range d; of_bearing: the bearing's innovation δ. Of a measured point,
-    whose noise is Gaussian in the plane, they are the point's: with its error (r cos δ − d, r sin
-    δ) along and across the predicted direction and S, its covariance turned there, (e₀, e₁/d) and
-    diag(1, 1/d) S diag(1, 1/d). That is a linear map of both, so whatever follows is what it were
-    for the point itself.
-    """
-    if len(own) == 0 or own[3] < 0.0:
-        total = sensor[0] + sensor[1] * distance * distance
-        return measurement[0] - distance, of_bearing, total, 0.0, sensor[2]
-    rr, rb, bb = own[0], own[1], own[2]
-    if own[3] == 0.0:
-        return measurement[0] - distance, of_bearing, rr, rb, bb
-    reach = max(measurement[0], NEAREST_M)
-    s, c = elementary.sin_and_cos(of_bearing)
-    rb, bb = rb * reach, bb * reach * reach
-    along = c * c * rr - 2.0 * c * s * rb + s * s * bb
-    both = c * s * (rr - bb) + (c * c - s * s) * rb
-    across = s * s * rr + 2.0 * c * s * rb + c * c * bb
-    return (
-        reach * c - distance,
-        reach * s / distance,
-        along,
-        both / distance,
-        across / (distance * distance),
-    )
-
-
 @compiled
 def place(
     mean: Float[np.ndarray, "2"],

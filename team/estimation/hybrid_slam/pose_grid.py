@@ -7,12 +7,12 @@ the open window and within sighting_s. The observer's odometry carries it to tha
 measurements of one teammate at one node are reduced to one.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.config import FrontEnd, Sensor
 from team.estimation.inter_robot import (
     CarriedPoint,
@@ -45,22 +45,17 @@ class NodeSighting:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """A teammate observed in message `counter`; `motion`: the observer's since, up to the node."""
+    """A teammate observed in message `counter`."""
 
     stamp_ns: int
     counter: int
     teammate: str
     seen: CarriedPoint
     node_ns: int
-    motion: Increment
 
 
 class PoseGrid:
-    """The grid times of the open window and its inter-robot measurements; the segmenter reports
-    motion.
-
-    since_node: the motion since the last pose node.
-    """
+    """The grid times of the open window and its inter-robot measurements."""
 
     def __init__(self, sensor: Sensor, front_end: FrontEnd) -> None:
         self._sensor = sensor
@@ -72,7 +67,6 @@ class PoseGrid:
         self._uncovered: list[_Look] = []
         self._ahead: list[_Look] = []
         self._at_node: dict[tuple[int, str], list[tuple[int, CarriedPoint]]] = {}
-        self.since_node = Increment.identity()
 
     def begin(self, stamp_ns: int) -> None:
         """Begin a window; its nodes are the grid times within window_s from here."""
@@ -103,7 +97,7 @@ class PoseGrid:
             seen = point_seen(self._sensor, float(distances[k]), float(directions[k]), drift)
             if self._sensor.is_mounted:
                 seen = of_base(seen, np.array(self._sensor.mount))
-            look = _Look(stamp_ns, counter, teammates[k], seen, node_ns, Increment.identity())
+            look = _Look(stamp_ns, counter, teammates[k], seen, node_ns)
             self._uncovered.append(look)
         return None if mask.any() else Rejection.SENSOR_LIMITS
 
@@ -115,35 +109,25 @@ class PoseGrid:
             times.append(self._node_ns)
         return min(times, default=None)
 
-    def reach(self) -> bool:
-        """Note that the observer is at `next_ns`; True if that is a pose node (which comes
-        before measurements).
+    def reach(self, odometry: core.Odometry) -> bool:
+        """Note that the observer is at `next_ns`, where its odometry has brought it; True if that
+        is a pose node (which comes before measurements).
         """
         is_node = self.next_ns == self._node_ns <= self._last_ns
         if not is_node:
             look = self._uncovered.pop(0)
             if look.stamp_ns < look.node_ns:
                 self._ahead.append(look)
+                odometry.mark_sighting()
             else:
-                self._keep(look, carried_back(look.seen, self.since_node))
+                since_node = Increment(*odometry.since_node())
+                self._keep(look, carried_back(look.seen, since_node))
             return False
-        for look in self._ahead:
-            self._keep(look, carried_on(look.seen, look.motion))
+        for look, since in zip(self._ahead, odometry.reach_node(), strict=True):
+            self._keep(look, carried_on(look.seen, Increment(*since)))
         self._ahead = []
-        self.since_node = Increment.identity()
         self._node_ns += self._grid_ns
         return True
-
-    def moved(self, step: Increment) -> None:
-        """Take the observer's motion."""
-        self.since_node = self.since_node.then(step)
-        self.carry(lambda motion: motion.then(step))
-
-    def carry(self, behind: Callable[[Increment], Increment]) -> None:
-        """Carry the inter-robot measurements that wait for their node on; behind: a motion followed
-        by the observer's since.
-        """
-        self._ahead = [replace(each, motion=behind(each.motion)) for each in self._ahead]
 
     def sightings(self) -> tuple[NodeSighting, ...]:
         """The window's inter-robot measurements, by node and teammate, without those that

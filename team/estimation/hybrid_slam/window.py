@@ -14,22 +14,14 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team import core
-from team.config import Bias, FrontEnd, Sensor
+from team.config import BIASES, Bias, FrontEnd, Sensor
 from team.estimation import dense
 from team.estimation.gaussian import FAULTS, NotACovarianceError
 from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation_of
-from team.estimation.hybrid_slam.sensitivity import (
-    NO_MOTIONS,
-    WindowMotions,
-    WindowSights,
-    columns,
-    rows,
-)
 from team.estimation.models import Increment
-from team.estimation.mount import base_points, base_poses, base_shifts
 from team.estimation.scans import Own, unclaimed
-from team.estimation.se2 import inverse, tangent
+from team.estimation.se2 import tangent
 from team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)
@@ -42,7 +34,6 @@ class Window(msgspec.Struct, frozen=True, gc=False):
     Poses are the sensor's, in the frame of the window's start of the sensor.
     node_stamps: team time [ns] of the pose nodes.
     innovation: of all measurements so far that were predicted.
-    motions: up to each keyframe, and after the last one; kept where biases are asked for.
     """
 
     front_end: FrontEnd
@@ -50,7 +41,6 @@ class Window(msgspec.Struct, frozen=True, gc=False):
     core: core.Window
     node_stamps: Int64[np.ndarray, " nodes"] = NO_NODES
     innovation: Innovation = NOTHING
-    motions: WindowMotions = NO_MOTIONS
 
     @property
     def particles(self) -> Particles:
@@ -120,36 +110,22 @@ def advanced(
     none).
 
     The measurements are accepted and corrected already (`models.scanned`).
-    forward: the motion's shift by an error of the scale of speed (`odometry.forward_column`).
+    forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
     own: the noises that the measurements claim (`team.estimation.scans`).
     """
     noises = unclaimed(len(ids)) if own is None else own
-    front, seen = window.front_end, (ids, ranges, bearings, noises)
-    count = front.particles
-    is_thin = window.effective < front.resample_below * count
+    seen, count = (ids, ranges, bearings, noises), window.front_end.particles
+    is_thin = window.effective < window.front_end.resample_below * count
     uniform = generator.random() if is_thin else None
     normals, after = generator.standard_normal((count, 3)), window.core.copy()
     with refused_by_name():
-        step = after.advance(increment.mean, increment.covariance, *seen, uniform, normals)
+        step = after.advance(increment.mean, increment.covariance, *seen, uniform, normals, forward)
     expected = Innovation(step.squared, step.dof)
     if not math.isfinite(step.squared):
         expected = NOTHING
         with suppress(NotACovarianceError):  # then it is not known how well they were predicted
             expected = innovation_of(window.core, increment, seen)
-    return msgspec.structs.replace(
-        window,
-        core=after,
-        innovation=window.innovation.plus(expected),
-        motions=_with_motion(window, increment, forward),
-    )
-
-
-def _with_motion(
-    window: Window, increment: Increment, forward: Float[np.ndarray, "3"]
-) -> WindowMotions:
-    if not window.front_end.biases:
-        return NO_MOTIONS
-    return window.motions.then(increment.covariance, forward)
+    return msgspec.structs.replace(window, core=after, innovation=window.innovation.plus(expected))
 
 
 def marked(window: Window, stamp_ns: int) -> Window:
@@ -174,10 +150,8 @@ def moved(
     after = window.core.copy()
     normals = generator.standard_normal((window.front_end.particles, 3))
     with refused_by_name():
-        after.move(increment.mean, increment.covariance, normals)
-    return msgspec.structs.replace(
-        window, core=after, motions=_with_motion(window, increment, forward)
-    )
+        after.move(increment.mean, increment.covariance, normals, forward)
+    return msgspec.structs.replace(window, core=after)
 
 
 def gaussian(window: Window, *, running: bool = False) -> LocalMap:
@@ -187,7 +161,7 @@ def gaussian(window: Window, *, running: bool = False) -> LocalMap:
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
     Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on
     SE(2), plus POSE_JITTER. Poses and landmarks are those of the base, in the frame of its start.
-    The derivatives by the biases come from `sensitivity.columns`.
+    Its derivatives by the biases are those of the window's smoother.
     running: for a pose within the window, which is not fused: without pose nodes, and, where all of
     the sensor's errors are white, with the landmarks that the particles hold.
     Raises NotACovarianceError if P is not finite or not positive definite.
@@ -199,7 +173,7 @@ def gaussian(window: Window, *, running: bool = False) -> LocalMap:
     stamps = window.node_stamps[: len(nodes)]
     if not window.front_end.biases:
         return LocalMap(ids, mean, covariance, stamps)
-    biases, sensitivity = _sensitivity(window, (ids, mean), nodes)
+    biases, sensitivity = _sensitivity(window, mean, running)
     return LocalMap(ids, mean, covariance, stamps, biases, sensitivity)
 
 
@@ -218,32 +192,15 @@ def motion_alone(motion: Increment) -> LocalMap:
 
 
 def _sensitivity(
-    window: Window,
-    submap: tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, " n"]],
-    nodes: Int64[np.ndarray, " nodes"],
+    window: Window, mean: Float[np.ndarray, " n"], running: bool
 ) -> tuple[tuple[Bias, ...], Float[np.ndarray, "b n"]]:
-    """The biases, and the derivatives of a submap's mean by them; submap: its ids and its mean.
+    """The biases, and the derivatives of the window's mean by them.
 
     That by `forward_scale` is left out where all of the window's motion is calibrated.
     """
-    uncalibrated = bool(window.motions.shifts.any())
+    uncalibrated = window.core.has_shifts
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
-    mount, is_mounted = np.array(window.sensor.mount), window.sensor.is_mounted
-    ids, mean = submap
-    keyframes, seen, _, own = window.core.measurements()
-    end, points = mean[:3], mean[3 + 3 * len(nodes) :].reshape(-1, 2)
-    if is_mounted:
-        away = inverse(mount)
-        end, points = base_poses(end[None], away)[0], base_points(points, away)
-    path, poses, landmarks = columns(
-        window.core.mean_path(),
-        end,
-        window.motions,
-        (ids, points),
-        WindowSights(keyframes, seen, own),
-        noise_of(window.sensor),
-    )
-    if is_mounted:
-        poses = base_shifts(poses, path, mount)
-        landmarks = base_points(landmarks, np.array([0.0, 0.0, mount[2]]))
-    return biases, rows(biases, poses, landmarks, nodes)
+    rows, fault = window.core.sensitivity(mean, not running)
+    if fault:
+        raise NotACovarianceError("the smoother of a window", FAULTS[fault])
+    return biases, rows[[BIASES.index(bias) for bias in biases]]

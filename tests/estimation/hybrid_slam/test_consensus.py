@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 from sim.scenarios.scenario import load
 from sim.scenarios.source import streams_of
 from sim.world.streams import WorldStreams
+from team import core
 from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation import dense
-from team.estimation.hybrid_slam import consensus
-from team.estimation.hybrid_slam import consensus_kernel as kernel
-from team.estimation.hybrid_slam.consensus import agreeing, confirmed
+from team.estimation.hybrid_slam.fastslam import noise_of
 from team.estimation.models import Increment, increment_of, predicted
 from team.estimation.scans import point_scan, polar_scan, unclaimed
 from team.estimation.se2 import compose
@@ -36,9 +34,19 @@ class Drive:
     ids: np.ndarray
     measurements: np.ndarray
 
-    def judged(self, by=confirmed, outlier_share: float = 0.3, own=None) -> np.ndarray:
-        seen = self.ids, self.measurements, unclaimed(len(self.ids)) if own is None else own
-        return by(self.motions, self.keyframes, *seen, SENSOR, outlier_share)
+    def judged(self, by="confirmed", outlier_share: float = 0.3, own=None, sensor=SENSOR):
+        """What a `Consensus` of all keyframes marks, in the order of the measurements."""
+        own = unclaimed(len(self.ids)) if own is None else own
+        consensus = core.Consensus(
+            noise_of(sensor), sensor.max_range, sensor.field_of_view, outlier_share
+        )
+        for k, motion in enumerate(self.motions):
+            at = self.keyframes == k
+            ranges, bearings = self.measurements[at].T
+            consensus.add(motion.mean, motion.covariance, self.ids[at], ranges, bearings, own[at])
+        taken = np.zeros(len(self.ids), dtype=np.bool_)
+        taken[np.argsort(self.keyframes, kind="stable")] = getattr(consensus, by)()
+        return taken
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
@@ -113,7 +121,7 @@ def test_measurements_are_judged_by_the_covariances_that_they_claim(points: bool
 def test_a_landmark_under_another_ones_name_is_not_taken():
     window = drive(2)
     window.ids[[4, 12]] = 50  # landmark 1 in the second and in the fourth step
-    assert window.judged(agreeing)[[4, 12]].all(), "they agree with each other"
+    assert window.judged("agreeing")[[4, 12]].all(), "they agree with each other"
     taken = window.judged()
     assert not taken[[4, 12]].any()
     assert np.delete(taken, [4, 12]).all()
@@ -148,7 +156,7 @@ def test_a_window_without_measurements_or_with_one_has_nothing_to_take():
             window.ids[:count],
             window.measurements[:count],
         )
-        for by in (agreeing, confirmed):
+        for by in ("agreeing", "confirmed"):
             assert not few.judged(by).any()
 
 
@@ -161,60 +169,13 @@ def test_keyframes_without_measurements_change_nothing():
     np.testing.assert_array_equal(sparse.judged(), window.judged())
 
 
-def smoothed(window: Drive, used: np.ndarray):
-    """Path, landmarks and covariance at rest."""
-    of = consensus._Measurements(
-        window.motions,
-        window.keyframes,
-        window.ids,
-        window.measurements,
-        unclaimed(len(window.ids)),
-        SENSOR,
-        0.3,
-    )
-    path = np.zeros((len(of.means), 3))
-    for k in range(1, len(path)):
-        path[k] = compose(path[k - 1], of.means[k])
-    landmarks = PLACES - increment_of(MOTION, 1.0, 1.0, 0.15).mean[:2]
-    metrics = np.linalg.inv(of.covariances + np.diag(consensus.MOTION_JITTER))
-    for _ in range(4):
-        path, landmarks, P = consensus._smoothed(of, path, landmarks, metrics, used)
-    return of, path, landmarks, P
-
-
-def test_a_measurement_is_judged_by_what_the_others_predict_of_it():
-    window = drive(7)
-    used = np.ones(40, dtype=bool)
-    of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, of.own, used, of.sensor)
-    own = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, of.own, ~used, of.sensor)
-    for n in (0, 9, 22, 39):
-        without = used.copy()
-        without[n] = False
-        _, *other = smoothed(window, without)
-        of_all = of.keyframes, of.slots, of.measurements, of.own
-        left = kernel.left_out(*other, *of_all, without, of.sensor)
-        assert logs[n] == pytest.approx(left[n], abs=0.05)
-    assert np.abs(own - logs).max() > 0.1, "a measurement that judges itself is another matter"
-
-
-def test_of_a_landmarks_only_measurement_the_others_say_nothing():
-    window = drive(8)
-    used = window.ids != 1
-    used[0] = True
-    of, *found = smoothed(window, used)
-    logs = kernel.left_out(*found, of.keyframes, of.slots, of.measurements, of.own, used, of.sensor)
-    assert logs[0] < -3.0
-    assert logs[0] < logs[1:].min() - 1.0 or logs[0] == -np.inf
-
-
 def world_of(name: str, kind: str, outlier_share: float) -> WorldStreams:
     scenario = load(name)
     world = msgspec.structs.replace(scenario.world, outlier_share=outlier_share, outlier_kind=kind)
     return streams_of(msgspec.structs.replace(scenario, world=world))
 
 
-def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
+def rates(name: str, kind: str, by="confirmed") -> tuple[float, float]:
     """The shares of good measurements that are kept and of outliers that pass, in windows of 12
     s.
     """
@@ -234,8 +195,8 @@ def rates(name: str, kind: str, by=confirmed) -> tuple[float, float]:
                 strict=True,
             )
             motions = [increment_of(robot.motion, 1.0, *each) for each in odometry]
-            of_window = seen.ids[rows], measurements[rows], unclaimed(len(keyframes))
-            taken = by(motions, keyframes, *of_window, robot.sensor, 0.3)
+            window = Drive(motions, keyframes, seen.ids[rows], measurements[rows])
+            taken = window.judged(by, sensor=robot.sensor)
             kept.append(taken[~bad[rows]])
             passed.append(taken[bad[rows]])
     return float(np.concatenate(kept).mean()), float(np.concatenate(passed).mean())
@@ -258,39 +219,55 @@ def test_of_three_tenths_outliers_few_pass_and_good_measurements_are_kept(
     assert passed < most_passed
 
 
-def test_names_alone_are_not_enough_against_wrong_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    none = lambda window, *rest: np.zeros(len(window.slots), dtype=bool)  # noqa: E731
-    monkeypatch.setattr(consensus, "_misread", none)
-    assert rates("thesis-b", "identity")[1] > 0.06
-
-
 def test_the_smoother_finds_what_the_odometry_alone_lets_pass() -> None:
-    assert rates("thesis-b", "measurement", agreeing)[1] > 2.0 * rates("thesis-b", "measurement")[1]
+    assert (
+        rates("thesis-b", "measurement", "agreeing")[1] > 2.0 * rates("thesis-b", "measurement")[1]
+    )
 
 
 @pytest.mark.parametrize("exactly", [False, True])
-def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly, monkeypatch):
+def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly):
     """Ranges so good that their weight is no finite number: no Cholesky factor, whatever rounds."""
-    window, failures = drive(0), []
+    window = drive(0)
     if exactly:
         pose = np.zeros(3)
         for k, motion in enumerate(window.motions):
             pose = compose(pose, motion.mean)
             for i in np.flatnonzero(window.keyframes == k):
                 window.measurements[i] = predicted(pose, PLACES[window.ids[i] - 1])
-
-    def factor(H):
-        failures.append(True)
-        found = cholesky(H)
-        failures[-1] = False
-        return found
-
-    cholesky = dense.cholesky
-    monkeypatch.setattr(dense, "cholesky", factor)
     sensor = Sensor(range_sigma=1e-160, bearing_sigma=0.01 if exactly else 1e-3)
-    seen = window.ids, window.measurements, unclaimed(len(window.ids))
-    measurements = (window.motions, window.keyframes, *seen, sensor, 0.3)
-    taken = confirmed(*measurements)
-    assert failures[-1], "the equations have a solution here: nothing is tried"
-    assert sum(failures) == 1, "what has failed is not gone on with"
-    np.testing.assert_array_equal(taken, agreeing(*measurements))
+    agreeing = window.judged("agreeing", sensor=sensor)
+    assert agreeing.any()
+    np.testing.assert_array_equal(window.judged(sensor=sensor), agreeing)
+
+
+WRONG = {
+    "a share of none": lambda noise: core.Consensus(noise, 10.0, 6.0, 0.0),
+    "a share of all": lambda noise: core.Consensus(noise, 10.0, 6.0, 1.0),
+    "a sensor without reach": lambda noise: core.Consensus(noise, 0.0, 6.0, 0.3),
+    "a sensor without noise": lambda noise: core.Consensus((0.0, *noise[1:]), 10.0, 6.0, 0.3),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_sensor_or_a_share_out_of_its_range_is_refused(name):
+    with pytest.raises(ValueError, match="must be"):
+        WRONG[name](noise_of(SENSOR))
+
+
+def test_measurements_that_do_not_fit_or_are_not_finite_are_refused_and_change_nothing():
+    consensus = core.Consensus(noise_of(SENSOR), 10.0, 6.0, 0.3)
+    motion = np.zeros(3), np.zeros((3, 3))
+    ids, one, none = np.array([3], np.uint32), np.array([2.0]), unclaimed(1)
+    for wrong in (
+        (ids, one, np.empty(0), none),
+        (ids, one, one, unclaimed(2)),
+        (ids, one * np.nan, one, none),
+        (ids, one, one * np.inf, none),
+        (ids, one, one, np.full((1, 4), np.nan)),
+    ):
+        with pytest.raises(ValueError, match="must"):
+            consensus.add(*motion, *wrong)
+    assert not len(consensus.agreeing())
+    with pytest.raises(TypeError):
+        consensus.add(*motion, ids.astype(np.int64), one, one, none)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from team import core
 from team.core import landmarks_along_paths
 from team.estimation.hybrid_slam.fastslam import Noise
-from team.estimation.models import landmark_jacobian, predicted
+from team.estimation.models import predicted
 from team.estimation.scans import unclaimed
 
 PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])
@@ -30,9 +31,7 @@ def dense(noise: Noise, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     point = LANDMARK.copy()
     for _ in range(20):
         expected = [predicted(pose, point) for pose in PATH]
-        H = np.vstack(
-            [landmark_jacobian(d, pose[2] + a) for pose, (d, a) in zip(PATH, expected, strict=True)]
-        )
+        H = np.vstack([core.predict(pose, point[None])[2][0] for pose in PATH])
         information = H.T @ W @ H
         point = point + np.linalg.solve(information, H.T @ W @ (seen - expected).ravel())
     return point, np.linalg.inv(information)

@@ -12,9 +12,8 @@ from team import core
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation import se2
 from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
-from team.estimation.models import Increment, increment_of, located
-from team.estimation.odometry import OdometryInterval, forward_column
+from team.estimation.models import Increment, increment_of, located, model_of
+from team.estimation.odometry import OdometryInterval
 
 SECOND = 1_000_000_000
 WHITE = MotionModel(
@@ -254,7 +253,8 @@ def test_a_run_of_intervals_is_one_after_the_other_to_the_bit(kind):
         speeds = 0.7 * np.sin(0.3 * k), np.cos(0.7 * k) * (k % 5 > 0)
         segmenter.drive(OdometryInterval(k * SECOND, SECOND, *map(float, speeds)))
         step = increment_of(motion, 1.0, *map(float, speeds))
-        shift = carried_on(shift, step.mean) + forward_column(motion, 1.0, *map(float, speeds))
+        column = model_of(motion).forward_column(1.0, *map(float, speeds))
+        shift = core.shift_after(shift, step.mean) + column
         expected = expected.then(step)
     found = segmenter.cut(29 * SECOND)[1]
     np.testing.assert_array_equal(found.mean, expected.mean)

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from team.estimation.hybrid_slam.consensus_kernel import _prediction
-from team.estimation.models import landmark_jacobian, predicted
-from team.estimation.se2 import compose, exponential, tangent, wrapped
+from team import core
+from team.estimation.models import predicted
+from team.estimation.se2 import compose, exponential, inverse, tangent, wrapped
 from tests.estimation.hybrid_slam import one_landmark
 
 SENSOR = (0.04, 0.001, 0.003)
@@ -52,7 +52,7 @@ def test_the_range_and_then_the_bearing_are_the_joint_update(kind: str) -> None:
     """Range first, then the bearing less its regression on the range: the same Gaussian."""
     h = np.array(predicted(np.array(POSE), MEAN))
     z = h + np.array([0.2, -0.05])
-    H = landmark_jacobian(h[0], POSE[2] + h[1])
+    H = core.predict(np.array(POSE), MEAN[None])[2][0]
     expected = kalman(z - h, H, noise(OWN[kind], h[0]))
     for got, textbook in zip(updated(z, OWN[kind]), expected, strict=True):
         np.testing.assert_allclose(got, textbook, rtol=1e-10)
@@ -73,26 +73,59 @@ def test_a_measured_point_is_a_linear_measurement_in_the_plane() -> None:
     assert got[2] == pytest.approx(likelihood + math.log(h[0]), rel=1e-10)
 
 
+EVIDENCE, REACH, FIELD = math.log(100.0), 3.0, 6.0
+
+
+def least_prior(
+    motion: np.ndarray, covariance: np.ndarray, z: np.ndarray, own: np.ndarray
+) -> float:
+    """The log odds of good measurements from which on two scans' measurements agree."""
+    none, some = -20.0, EVIDENCE
+    while some - none > 1e-12:
+        prior = 0.5 * (none + some)
+        noise = SENSOR[0], SENSOR[1], 1.0, SENSOR[2], 1.0
+        consensus = core.Consensus(noise, 1e6, FIELD, 1.0 / (1.0 + math.exp(prior)))
+        for step, each in ((np.zeros((4, 3)), z[0]), (np.vstack((motion, covariance)), z[1])):
+            seen = np.array([7], np.uint32), each[:1], each[1:], own.reshape(1, -1)
+            consensus.add(step[0], step[1:], *seen)
+        taken = consensus.agreeing()
+        assert taken.all() or not taken.any()
+        none, some = (none, prior) if taken.all() else (prior, some)
+    return some
+
+
 @pytest.mark.parametrize("kind", ["none", "range and bearing"])
 def test_one_measurement_predicts_another_with_all_of_their_noise(kind: str) -> None:
-    """S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ, its Jacobians by differences."""
+    """S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ, its Jacobians by differences.
+
+    Both agree where log p + prior + log(reach · field of view), the support of the one that is
+    supported best, exceeds EVIDENCE − prior.
+    """
     own = OWN[kind]
-    seen, z, pose = np.array([3.0, 0.4]), np.array([2.4, 0.9]), np.array([0.8, -0.3, 0.2])
+    seen, z, pose = np.array([REACH, 0.4]), np.array([2.4, 0.9]), np.array([0.8, -0.3, 0.2])
     A = np.array([[0.2, 0.0, 0.0], [0.05, 0.1, 0.0], [-0.02, 0.03, 0.07]])
     spread = A @ A.T
 
-    def h(xi: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        point = seen[0] * np.array([math.cos(seen[1]), math.sin(seen[1])])
-        return np.array(predicted(compose(pose, exponential(xi)), point))
+    def log_likelihood(of, given, there):
+        def h(xi, given):
+            point = given[0] * np.array([math.cos(given[1]), math.sin(given[1])])
+            return np.array(predicted(there(xi), point))
 
-    def slopes(f, at: np.ndarray) -> np.ndarray:
-        step = 1e-6 * np.eye(len(at))
-        return np.array([(f(at + d) - f(at - d)) / 2e-6 for d in step]).T
+        def slopes(f, at):
+            step = 1e-6 * np.eye(len(at))
+            return np.array([(f(at + d) - f(at - d)) / 2e-6 for d in step]).T
 
-    Hx = slopes(lambda xi: h(xi, seen), np.zeros(3))
-    Hl = slopes(lambda s: h(np.zeros(3), s), seen)
-    expected = h(np.zeros(3), seen)
-    S = noise(own, expected[0]) + Hx @ spread @ Hx.T + Hl @ noise(own, seen[0]) @ Hl.T
-    e = np.array([z[0] - expected[0], wrapped(z[1] - expected[1])])
-    log = _prediction(pose, spread, seen, z, SENSOR, own, own)
-    assert log == pytest.approx(log_density(e, S), rel=1e-6)
+        Hx = slopes(lambda xi: h(xi, given), np.zeros(3))
+        Hl = slopes(lambda g: h(np.zeros(3), g), given)
+        expected = h(np.zeros(3), given)
+        S = noise(own, expected[0]) + Hx @ spread @ Hx.T + Hl @ noise(own, given[0]) @ Hl.T
+        return log_density(np.array([of[0] - expected[0], wrapped(of[1] - expected[1])]), S)
+
+    moved = lambda xi: compose(pose, exponential(xi))  # noqa: E731
+    logs = (
+        log_likelihood(z, seen, moved),
+        log_likelihood(seen, z, lambda xi: inverse(moved(xi))),
+    )
+    expected = 0.5 * (EVIDENCE - math.log(REACH * FIELD) - max(logs))
+    assert expected < EVIDENCE
+    assert least_prior(pose, spread, np.array([seen, z]), own) == pytest.approx(expected, rel=1e-6)

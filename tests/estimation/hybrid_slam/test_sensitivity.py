@@ -10,20 +10,17 @@ from hypothesis import strategies as st
 
 from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
-from team import translate
-from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation import dense, se2
+from team import core, translate
+from team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
+from team.estimation import se2
 from team.estimation.consistency import nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.gaussian import FAULTS
 from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.arrow_kernel import solve_arrow
-from team.estimation.hybrid_slam.sensitivity_kernel import BIASES, carried_on
+from team.estimation.hybrid_slam.fastslam import noise_of
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
 from team.estimation.map_joining.submap_factor import biased_normal
-from team.estimation.models import increment_of
-from team.estimation.odometry import forward_column
+from team.estimation.models import increment_of, model_of
 from team.estimation.randomness import generator
 from team.robot.node import RobotNode
 from team.wire import channels as ch
@@ -62,7 +59,7 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
             ranges[seen] * (1.0 + range_scale) + range_offset,
             bearings + bearing,
             random,
-            forward_column(MOTION, 1.0, 1.0, 0.1),
+            model_of(MOTION).forward_column(1.0, 1.0, 0.1),
         )
     return windows.gaussian(window)
 
@@ -85,7 +82,10 @@ def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
     window, random = windows.opened(front, Sensor()), generator(1, "r1", 0, 0)
     motion = msgspec.structs.replace(MOTION, calibrated_speed=(0.5, 2.0))
     seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
-    step, column = increment_of(motion, 1.0, 1.0, 0.1), forward_column(motion, 1.0, 1.0, 0.1)
+    step, column = (
+        increment_of(motion, 1.0, 1.0, 0.1),
+        model_of(motion).forward_column(1.0, 1.0, 0.1),
+    )
     local = windows.gaussian(windows.advanced(window, step, *seen, random, column))
     assert local.biases == ("bearing", "range_offset", "range_scale")
     assert local.sensitivity.shape == (3, 5)
@@ -104,25 +104,118 @@ def test_columns_change_nothing_else():
     assert made[0].biases == ()
 
 
-def test_an_arrow_is_solved_to_the_bits_of_a_dense_matrix():
-    random, poses, rows = np.random.default_rng(1), 13, []
-    for k in range(poses):
-        seen = 3 * poses + 2 * random.integers(4)
-        for own in (
-            range(max(3 * k - 3, 0), 3 * k + 3),
-            [*range(3 * k, 3 * k + 3), seen, seen + 1],
-        ):
-            row = np.zeros(3 * poses + 8)
-            row[list(own)] = random.normal(size=len(own))
-            rows.append(np.outer(row, row))
-    A = sum(rows) + np.eye(3 * poses + 8)
-    A *= 1.0 + 1e-15 * random.integers(-2, 3, A.shape)  # as sums leave it: symmetric but for that
-    right = random.normal(size=(len(A), 4))
-    expected = dense.solve_factored(dense.cholesky(A), right)
-    assert solve_arrow(A, right, 3 * poses) == 0
-    assert right.tobytes() == expected.tobytes()
-    A[2, 2] = -1.0
-    assert FAULTS[solve_arrow(A, right, 3 * poses)] == "not positive definite"
+def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
+    """A core's window of six random keyframes, and its motions' covariances and shifts."""
+    rng = np.random.default_rng(seed)
+    window = core.Window(5, noise_of(sensor), mount=mount)
+    motions = []
+    for k in range(6):
+        step = increment_of(MOTION, 1.0, rng.uniform(0.5, 2.0), rng.normal(0.0, 0.3))
+        ids = rng.choice(np.array([3, 9, 4], np.uint32), 0 if k == 2 else 2, replace=False)
+        ranges, bearings = rng.uniform(2.0, 9.0, len(ids)), rng.uniform(-3.0, 3.0, len(ids))
+        own = np.empty((len(ids), 0))
+        if k == 3:
+            own = np.array([[0.05, 0.006, 0.002, 0.0], [0.0, 0.0, 0.0, -1.0]])
+        shift = rng.normal(size=3)
+        normals = rng.standard_normal((5, 3))
+        window.advance(step.mean, step.covariance, ids, ranges, bearings, own, None, normals, shift)
+        motions.append((step.covariance, shift))
+        if k in mark:
+            window.mark()
+    return window, motions
+
+
+def stated(window, motions, points):
+    """The answers of the smoother to each bias: dense, its Jacobians by differences.
+
+    Residuals are Log(motion⁻¹ ∘ x_{k−1}⁻¹ ∘ x_k) − shift b and h(x, landmark) + g b.
+    """
+    path, (keyframes, seen, _, own) = window.mean_path(), window.measurements()
+    ids = np.sort(window.ids())
+    steps = [se2.between(a, b) for a, b in zip([np.zeros(3), *path], path, strict=False)]
+    white = noise_of(SMOOTHED)
+    K, W, biased = len(path), [], []
+    for covariance, shift in motions:
+        W.append(np.linalg.inv(covariance + np.diag([1e-7, 1e-7, 1e-9])))
+        biased.append([[0.0, -each, 0.0, 0.0] for each in shift])
+    for k, landmark, claim in zip(keyframes, seen, own, strict=True):
+        distance = np.hypot(*(points[np.searchsorted(ids, landmark)] - path[k][:2]))
+        variance = white.range_variance + white.range_per_m2 * distance**2
+        R = np.diag([variance, white.bearing_variance])
+        if claim[3] >= 0.0:
+            R = np.array([[claim[0], claim[1]], [claim[1], claim[2]]])
+        W.append(np.linalg.inv(R))
+        biased.append([[0.0, 0.0, 1.0, distance], [1.0, 0.0, 0.0, 0.0]])
+
+    def residuals(x):
+        poses = [se2.compose(p, se2.exponential(x[3 * k : 3 * k + 3])) for k, p in enumerate(path)]
+        found = [
+            se2.logarithm(se2.between(step, se2.between(a, b)))
+            for step, a, b in zip(steps, [np.zeros(3), *poses], poses, strict=False)
+        ]
+        for k, landmark in zip(keyframes, seen, strict=True):
+            slot = np.searchsorted(ids, landmark)
+            d = points[slot] + x[3 * K + 2 * slot :][:2] - poses[k][:2]
+            at = points[slot] - path[k][:2]  # the bearing from there on, which has no jump
+            turn = np.angle(complex(*d) / complex(*at))
+            found.append(np.array([np.hypot(*d), turn - x[3 * k + 2]]))
+        return np.concatenate(found)
+
+    n = 3 * K + 2 * len(ids)
+    J = np.array([(residuals(d) - residuals(-d)) / 2e-6 for d in 1e-6 * np.eye(n)]).T
+    weights = np.zeros((len(J), len(J)))
+    at = 0
+    for block in W:
+        weights[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return -np.linalg.solve(J.T @ weights @ J, J.T @ weights @ np.vstack(biased))
+
+
+SMOOTHED = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.02)
+
+
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.8)])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(seed, mount):
+    nodes, away = (1, 4), se2.inverse(np.array(mount))
+    window, motions = some_window(seed, SMOOTHED, nodes, mount)
+    mean = window.close()[1]
+    rows, fault = window.sensitivity(mean, True)
+    assert fault == 0
+    points = np.array([se2.transformed(away, p) for p in mean[9:].reshape(-1, 2)])
+    answer = stated(window, motions, points).T
+    path, turn = window.mean_path(), se2.tangent(mount[2])[:2, :2]
+
+    def of_base(pose):
+        return se2.compose(se2.compose(np.array(mount), pose), away)
+
+    for at, k in enumerate((len(path) - 1, *nodes)):
+        for row, xi in zip(rows[:, 3 * at : 3 * at + 3], answer[:, 3 * k : 3 * k + 3], strict=True):
+            up, down = (
+                of_base(se2.compose(path[k], se2.exponential(h * xi))) for h in (1e-6, -1e-6)
+            )
+            np.testing.assert_allclose(row, wrap_pose(up - down) / 2e-6, rtol=1e-5, atol=1e-5)
+    expected = answer[:, 18:].reshape(4, -1, 2) @ turn.T
+    np.testing.assert_allclose(rows[:, 9:], expected.reshape(4, -1), rtol=1e-5, atol=1e-5)
+
+
+def wrap_pose(difference):
+    return np.array([*difference[:2], wrap(difference[2])])
+
+
+def test_a_window_without_keyframes_has_no_answer_and_a_mean_of_another_one_is_refused():
+    window = core.Window(5, noise_of(SMOOTHED))
+    rows, fault = window.sensitivity(np.zeros(3), True)
+    assert rows.shape == (4, 3)
+    assert not rows.any()
+    assert fault == 0
+    assert not window.has_shifts
+    full, _ = some_window(0, SMOOTHED)
+    assert full.has_shifts
+    mean = full.close()[1]
+    for wrong in (mean[:-1], np.append(mean, 0.0), np.where(mean == mean[0], np.nan, mean)):
+        with pytest.raises(ValueError, match="mean must be"):
+            full.sensitivity(wrong, False)
 
 
 @settings(deadline=None)
@@ -141,9 +234,9 @@ def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, 
 
     h = 1e-6
     step = se2.between(driven_with(1.0 - h), driven_with(1.0 + h))
-    first = forward_column(motion, 0.5, speed, rate)
+    first = model_of(motion).forward_column(0.5, speed, rate)
     second = increment_of(motion, 0.5, speed, more).mean
-    column = carried_on(first, second) + forward_column(motion, 0.5, speed, more)
+    column = core.shift_after(first, second) + model_of(motion).forward_column(0.5, speed, more)
     np.testing.assert_allclose(column, se2.logarithm(step) / (2 * h), atol=2e-2 * speed)
 
 

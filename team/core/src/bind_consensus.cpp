@@ -1,0 +1,55 @@
+// Bindings of the consensus over a window's scans.
+#include "binding_scan.hpp"
+#include "consensus.hpp"
+
+namespace teamslam::binding {
+
+using window::Consensus;
+
+namespace {
+
+using MadeFlags = Made<bool, nb::ndim<1>>;
+
+MadeFlags made_flags(const std::vector<bool>& flags) {
+  auto* kept = new bool[flags.size()];
+  std::copy(flags.begin(), flags.end(), kept);
+  nb::capsule owner(kept, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
+  return MadeFlags(kept, {flags.size()}, owner);
+}
+
+}  // namespace
+
+void bind_consensus(nb::module_& m) {
+  nb::class_<Consensus>(m, "Consensus",
+                        "The measurements of a window, and which of them agree: those that no others confirm are outliers.\n\n"
+                        "A measurement is accepted where it is likelier given the other accepted ones and the odometry than\n"
+                        "as an outlier, uniform over the sensor's range and field of view.")
+      .def(
+          "__init__",
+          [](Consensus* self, const std::array<double, 5>& noise, double max_range, double field_of_view, double outlier_share) {
+            check(max_range > 0.0 && field_of_view > 0.0, "max_range and field_of_view must be positive");
+            check(outlier_share > 0.0 && outlier_share < 1.0, "outlier_share must be in (0, 1)");
+            new (self) Consensus(noise_of(noise), max_range, field_of_view, outlier_share);
+          },
+          "noise"_a, "max_range"_a, "field_of_view"_a, "outlier_share"_a,
+          "Begin a window. noise: as of `Window`; outlier_share: the share of measurements that are outliers.")
+      .def(
+          "add",
+          [](Consensus& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
+             const Numbers& bearings, const Table& own) {
+            motion::Increment increment{{motion(0), motion(1), motion(2)}, {}};
+            std::copy(covariance.data(), covariance.data() + 9, increment.covariance[0]);
+            self.add(increment, scan_of(ids, ranges, bearings, own));
+          },
+          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
+          "Take a keyframe: the motion since the last one, then its measurements (there may be none).")
+      .def("agreeing", [](const Consensus& self) { return made_flags(self.agreeing()); },
+           "Mark the measurements that agree with others of their landmark under the odometry alone.\n\n"
+           "The measurement of a landmark that the others support best places it; it is accepted together with\n"
+           "those that support it.")
+      .def("confirmed", [](const Consensus& self) { return made_flags(self.confirmed()); },
+           "Mark those of `agreeing`, then by a smoother over the whole window until the classification is stable.\n\n"
+           "Where the normal equations have no solution in floating point, nothing more is rejected.");
+}
+
+}  // namespace teamslam::binding

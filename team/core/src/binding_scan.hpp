@@ -1,0 +1,36 @@
+// Poses, scans and the noise of a sensor from Python, for the bindings.
+#pragma once
+
+#include "binding.hpp"
+#include "window.hpp"
+
+namespace teamslam::binding {
+
+template <class Array>
+se2::Pose<double> pose_of(const Array& pose) {
+  return {pose.data()[0], pose.data()[1], pose.data()[2]};
+}
+
+inline models::Noise noise_of(const std::array<double, 5>& noise) {
+  check_finite(noise.data(), 5, "the noise of the sensor");
+  check(noise[0] > 0.0 && noise[1] >= 0.0 && noise[3] > 0.0, "the variances of the sensor must be positive");
+  check(noise[2] > 0.0 && noise[2] <= 1.0 && noise[4] > 0.0 && noise[4] <= 1.0,
+        "the white shares of the sensor must be in (0, 1]");
+  return {noise[0], noise[1], noise[2], noise[3], noise[4]};
+}
+
+inline std::span<const models::Claim> claims_of(const Table& own, std::size_t n) {
+  check(own.shape(0) == n && (own.shape(1) == 0 || own.shape(1) == 4), "own must be (n, 0) or (n, 4)");
+  finite(own, "own");
+  static_assert(sizeof(models::Claim) == 4 * sizeof(double));
+  if (own.shape(1) == 0) return {};
+  return {reinterpret_cast<const models::Claim*>(own.data()), n};
+}
+
+inline window::Scan scan_of(const Ids& ids, const Numbers& ranges, const Numbers& bearings, const Table& own) {
+  const std::size_t n = ids.size();
+  check(ranges.size() == n && bearings.size() == n, "ids, ranges and bearings must have one length");
+  return {{ids.data(), n}, finite(ranges, "ranges"), finite(bearings, "bearings"), claims_of(own, n)};
+}
+
+}  // namespace teamslam::binding

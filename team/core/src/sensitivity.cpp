@@ -1,0 +1,202 @@
+#include "sensitivity.hpp"
+
+#include <algorithm>
+
+#include "arrow.hpp"
+
+namespace teamslam::window {
+
+namespace {
+
+using se2::Point;
+
+// Added to each motion's variances [m², m², rad²].
+constexpr double JITTER[3] = {1e-7, 1e-7, 1e-9};
+
+// Range or bearing of a measurement: ∂h by the pose's error and by the landmark, and its variance.
+struct Line {
+  double H[5], variance;
+};
+
+// A measurement, linearised. The bearing's line is less its regression on the range's, so that both are
+// independent.
+struct Sight {
+  std::size_t keyframe, landmark;
+  double distance, slope;  // slope: of the regression
+  Line range, bearing;
+};
+
+using Shifts = std::array<double, BIASES>;  // a number's answer to each bias
+
+Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& pose, const Point<double>& at,
+               const Noise& noise) {
+  const auto [dx, dy, d, direction] = models::line_to(pose, at.x, at.y);
+  const auto of_pose = models::pose_jacobian(d, direction - pose.heading);
+  const auto of_landmark = models::landmark_jacobian(d, direction);
+  Sight sight{z.keyframe, landmark, d, 0.0, {{}, noise.range_variance + noise.range_per_m2 * d * d}, {{}, noise.bearing_variance}};
+  const auto set = [](Line& line, const std::array<double, 3>& by_pose, const std::array<double, 2>& by_landmark) {
+    std::copy(by_pose.begin(), by_pose.end(), line.H);
+    std::copy(by_landmark.begin(), by_landmark.end(), line.H + 3);
+  };
+  set(sight.range, of_pose[0], of_landmark[0]);
+  set(sight.bearing, of_pose[1], of_landmark[1]);
+  if (z.claim.is_made()) {
+    sight.slope = z.claim.rb / z.claim.rr;
+    sight.range.variance = z.claim.rr;
+    sight.bearing.variance = z.claim.bb - sight.slope * z.claim.rb;
+    for (std::size_t i = 0; i < 5; i++) sight.bearing.H[i] -= sight.slope * sight.range.H[i];
+  }
+  return sight;
+}
+
+// Adds the residual h(pose, landmark) + g b of a measurement to A X = B; chain: the poses' unknowns.
+void add_sight(dense::View A, dense::View B, const Sight& z, std::size_t chain) {
+  const std::size_t pose = 3 * z.keyframe, landmark = chain + 2 * z.landmark;
+  const std::size_t at[5] = {pose, pose + 1, pose + 2, landmark, landmark + 1};
+  const auto add = [&](const Line& line, std::size_t i) {
+    const double weighted = line.H[i] / line.variance;
+    for (std::size_t j = 0; j < 5; j++) A[at[i]][at[j]] += weighted * line.H[j];
+    return weighted;
+  };
+  for (std::size_t i = 0; i < 5; i++) {
+    const double weighted = add(z.range, i);
+    B[at[i]][RANGE_OFFSET] -= weighted;
+    B[at[i]][RANGE_SCALE] -= weighted * z.distance;
+  }
+  for (std::size_t i = 0; i < 5; i++) {
+    const double weighted = add(z.bearing, i);
+    B[at[i]][BEARING] -= weighted;
+    B[at[i]][RANGE_OFFSET] += weighted * z.slope;
+    B[at[i]][RANGE_SCALE] += weighted * z.slope * z.distance;
+  }
+}
+
+// Sums over the measurements of one landmark, given the answers of their residuals.
+struct GivenPath {
+  double A[2][2] = {}, B[2][BIASES] = {};
+
+  // Adds ranges or bearings, of whose variance the share that is not white is one constant error,
+  // eliminated by Schur's complement.
+  void add(std::span<const Line* const> lines, std::span<const Shifts> shifts, double white) {
+    double column[2] = {}, error[BIASES] = {}, total = 0.0;
+    for (std::size_t n = 0; n < lines.size(); n++) {
+      const double weight = 1.0 / (white * lines[n]->variance), *H = lines[n]->H + 3;
+      total += weight;
+      for (std::size_t b = 0; b < BIASES; b++) error[b] += weight * shifts[n][b];
+      for (std::size_t i = 0; i < 2; i++) {
+        column[i] += weight * H[i];
+        for (std::size_t b = 0; b < BIASES; b++) B[i][b] -= weight * H[i] * shifts[n][b];
+        for (std::size_t j = 0; j < 2; j++) A[i][j] += weight * H[i] * H[j];
+      }
+    }
+    if (white == 1.0 || lines.empty()) return;
+    const double share = 1.0 / (total + 1.0 / ((1.0 - white) * lines.back()->variance));
+    for (std::size_t i = 0; i < 2; i++) {
+      for (std::size_t b = 0; b < BIASES; b++) B[i][b] += share * column[i] * error[b];
+      for (std::size_t j = 0; j < 2; j++) A[i][j] -= share * column[i] * column[j];
+    }
+  }
+
+  Point<double> solved(std::size_t b) const {
+    const double determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0], x = B[0][b], y = B[1][b];
+    return {(A[1][1] * x - A[0][1] * y) / determinant, (A[0][0] * y - A[1][0] * x) / determinant};
+  }
+};
+
+// How a line answers to its pose's errors ξ, of which there is one for each bias.
+void add_answer(Shifts& shifts, const Line& line, dense::Const xi, std::size_t keyframe) {
+  const double* H = line.H;
+  for (std::size_t b = 0; b < BIASES; b++)
+    shifts[b] += H[0] * xi[3 * keyframe][b] + H[1] * xi[3 * keyframe + 1][b] + H[2] * xi[3 * keyframe + 2][b];
+}
+
+// How a landmark answers, given the path's answer ξ, as it is solved again at the end.
+GivenPath landmark_given(dense::Const xi, std::span<const Sight> sights, std::size_t landmark, const Noise& noise) {
+  std::vector<const Line*> ranges, bearings;
+  std::vector<Shifts> of_ranges, of_bearings;
+  for (const Sight& z : sights) {
+    if (z.landmark != landmark) continue;
+    Shifts range{}, bearing{};
+    range[RANGE_OFFSET] = 1.0;
+    range[RANGE_SCALE] = z.distance;
+    bearing[BEARING] = 1.0;
+    bearing[RANGE_OFFSET] = -z.slope;
+    bearing[RANGE_SCALE] = -z.slope * z.distance;
+    add_answer(range, z.range, xi, z.keyframe);
+    add_answer(bearing, z.bearing, xi, z.keyframe);
+    ranges.push_back(&z.range);
+    bearings.push_back(&z.bearing);
+    of_ranges.push_back(range);
+    of_bearings.push_back(bearing);
+  }
+  GivenPath sums;
+  sums.add(ranges, of_ranges, noise.range_white);
+  sums.add(bearings, of_bearings, noise.bearing_white);
+  return sums;
+}
+
+// The poses at the keyframes, and at the window's end where the robot moved after the last of them.
+std::vector<Pose<double>> path_to(const Pose<double>& end, const Window& window) {
+  std::vector<Pose<double>> path = window.mean_path();
+  if (window.motions().size() > path.size()) path.push_back(end);
+  return path;
+}
+
+}  // namespace
+
+Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, bool with_nodes) {
+  window.check_of_sensor();
+  const Noise& noise = window.settings().noise;
+  const se2::Mount& mount = window.settings().mount;
+  const se2::Mount away = mount.inverse();
+  const std::span<const std::size_t> nodes = with_nodes ? window.nodes() : std::span<const std::size_t>();
+  std::vector<std::uint32_t> ids = window.particles().ids;
+  std::sort(ids.begin(), ids.end());
+  const std::size_t first = 3 + 3 * nodes.size(), L = ids.size();
+  const Pose<double> end{mean[0], mean[1], mean[2]};
+  const std::vector<Pose<double>> path = path_to(mount.is_mounted() ? away.base_pose(end) : end, window);
+
+  const std::size_t chain = 3 * path.size();
+  dense::Matrix A(chain + 2 * L, chain + 2 * L), B(chain + 2 * L, BIASES);
+  std::vector<Sight> sights;
+  for (const WindowMeasurement& z : window.measurements()) {
+    const std::size_t landmark = std::size_t(std::lower_bound(ids.begin(), ids.end(), z.id) - ids.begin());
+    const Point<double> at{mean[first + 2 * landmark], mean[first + 2 * landmark + 1]};
+    sights.push_back(sight_of(z, landmark, path[z.keyframe], mount.is_mounted() ? away.base_point(at) : at, noise));
+  }
+  for (std::size_t k = 0; k < path.size(); k++) {
+    const WindowMotion& motion = window.motions()[k];
+    const std::optional<Matrix3> metric = metric_of(motion.covariance, JITTER);
+    if (!metric) return {{}, Fault::NOT_POSITIVE};
+    add_motion(A.view(), B.view(), FORWARD_SCALE, k, k ? path[k - 1] : Pose<double>{}, path[k], *metric, motion.shift);
+  }
+  for (const Sight& z : sights) add_sight(A.view(), B.view(), z, chain);
+  if (const Fault fault = solve_arrow(A, B.view(), path.size()); fault != Fault::NONE) return {{}, fault};
+
+  Sensitivity found{dense::Matrix(BIASES, first + 2 * L)};
+  const auto set_pose = [&](std::size_t at, std::size_t k) {
+    const auto [s, c] = elementary::sin_cos(path[k].heading);
+    for (std::size_t b = 0; b < BIASES; b++) {
+      const double x = B[3 * k][b], y = B[3 * k + 1][b];
+      const Pose<double> shift{c * x - s * y, s * x + c * y, B[3 * k + 2][b]};
+      const auto [dx, dy, turn] = mount.is_mounted() ? mount.base_shift(shift, path[k]) : shift;
+      double* row = found.rows[b] + at;
+      row[0] = dx;
+      row[1] = dy;
+      row[2] = turn;
+    }
+  };
+  if (!path.empty()) set_pose(0, path.size() - 1);
+  for (std::size_t k = 0; k < nodes.size(); k++) set_pose(3 + 3 * k, nodes[k]);
+  for (std::size_t landmark = 0; landmark < L; landmark++) {
+    const GivenPath sums = landmark_given(B, sights, landmark, noise);
+    for (std::size_t b = 0; b < BIASES; b++) {
+      const auto [x, y] = mount.is_mounted() ? mount.base_vector(sums.solved(b)) : sums.solved(b);
+      found.rows[b][first + 2 * landmark] = x + 0.0;  // a zero is positive
+      found.rows[b][first + 2 * landmark + 1] = y + 0.0;
+    }
+  }
+  return found;
+}
+
+}  // namespace teamslam::window

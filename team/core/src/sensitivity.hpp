@@ -1,0 +1,28 @@
+// The derivative of a window's Gaussian by errors that many windows share.
+//
+// A small calibration error b shifts every submap of a robot alike. With S = ∂mean/∂b a submap is
+// r = h(x) − (mean + S b) ~ N(0, P), and the centre estimates b together with the map. The mean of the
+// particles has no derivative in closed form; S is that of the window's smoother, linearised about the
+// particles' mean path: with J, W over the motions and the measurements and g the derivative of their
+// residuals, S = −(JᵀWJ)⁻¹ Jᵀ W g. As in the window itself the path takes the measurements as
+// independent, and the landmarks are solved for given the path.
+#pragma once
+
+#include "window.hpp"
+
+namespace teamslam::window {
+
+// The errors: a bearing reads b too much, the way driven is (1 + b) times the odometry's, a range reads
+// b too much, or (1 + b) times itself.
+enum Bias : std::size_t { BEARING, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE, BIASES };
+
+// A row for each Bias over (end pose, pose nodes, landmarks by ascending id), in the base's frame.
+struct Sensitivity {
+  dense::Matrix rows;
+  gaussian::Fault fault = gaussian::Fault::NONE;  // of the smoother; there are no rows then
+};
+
+// mean: the window's, of `close`, or of `run` without `with_nodes`.
+Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, bool with_nodes);
+
+}  // namespace teamslam::window
