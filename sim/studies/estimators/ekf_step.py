@@ -57,7 +57,7 @@ def _move(
     """
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = Q.tolist()
     forward, left, turn = motion.tolist()
-    theta = float(wrap(mean[2] + turn))
+    theta = wrap(float(mean[2]) + turn)
     sines, cosines = elementwise.sin_and_cos(np.array([mean[2], theta]))
     s, c = float(sines[0]), float(cosines[0])
     of_x, of_y = -s * forward - c * left, c * forward - s * left
@@ -154,7 +154,7 @@ def _condition(
         return False
     for k in range(m):
         mean += innovation[k] * gains[k]
-    mean[2] = wrap(mean[2])
+    mean[2] = wrap(float(mean[2]))
     _joseph(P, HP, gains, H, R)
     return True
 

@@ -1,9 +1,12 @@
 """Distance and direction of landmarks, elementwise on arrays of any shape that broadcast."""
 
+from typing import Any, cast
+
 import numpy as np
 from jaxtyping import Float
 
 from team.estimation import elementwise
+from team.estimation.elementwise import Numbers
 from team.estimation.models import NEAREST_M
 
 Array = Float[np.ndarray, "..."]
@@ -22,6 +25,7 @@ def see(poses: Array, landmarks: Array) -> tuple[Array, Array, Array]:
     return np.where(near, NEAREST_M, distance), ex, ey
 
 
-def wrap(angles: Array) -> Array:
+def wrap(angles: Numbers) -> Numbers:
     """Wrap each angle to (−π, π]."""
-    return angles + 2.0 * np.pi * np.floor((np.pi - angles) / (2.0 * np.pi))
+    wrapped: Any = angles + 2.0 * np.pi * np.floor((np.pi - angles) / (2.0 * np.pi))
+    return cast(Numbers, wrapped)
