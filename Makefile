@@ -23,8 +23,8 @@ LISTED := install --require-hashes --no-deps --requirement
 # The core is built without build isolation, by these.
 BUILDING := cmake nanobind ninja scikit-build-core
 CORE := $(wildcard team/core/src/* team/core/building/* team/core/CMakeLists.txt)
-COMPILER := $(if $(filter environment,$(origin CXX)),$(CXX),$(shell command -v c++ || command -v g++ || command -v clang++))
-NEEDS_ZIG = $(if $(COMPILER),,@echo "No C++ compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt)
+NEEDS_ZIG = @$(BIN)/python team/core/building/backend.py --find > /dev/null || { \
+  echo "No C++20 compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt; }
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 # One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
