@@ -1,5 +1,5 @@
-# Needs make, a Python of 3.11 or newer and a C++20 compiler (without one that of the ziglang wheel is
-# fetched); everything else goes into .venv, at pinned versions.
+# Needs make, a Python of 3.11 or newer with its headers and a C++20 compiler (without one that of the
+# ziglang wheel is fetched); everything else goes into .venv, at pinned versions.
 #
 #   make run        a team maps a random place; what `make test` needs is not installed for it
 #   make test       all tests
