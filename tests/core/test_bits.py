@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from team import core
 from tests.support import ROOT
 
 FOLDER = ROOT / "team" / "core"
+LIBRARIES = Path(core.__file__).parent
+"""Elsewhere than the sources where a wheel is tested."""
 PROGRAMS = {
     "bits": (
         ("8c51871c169fc457", "3659448349629494"),
@@ -32,13 +35,15 @@ EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-ma
 FUSED = re.compile(r"\s(?:vfn?m(?:add|sub)\w*|fn?m(?:add|sub)|fml[as])\s.*")
 
 
-def hashes_of(name: str, tmp_path: Path, *command: str) -> tuple[str, ...]:
+def hashes_of(
+    name: str, tmp_path: Path, *command: str, runs_by: Sequence[str] = ()
+) -> tuple[str, ...]:
     program = tmp_path / name
     sources = [FOLDER / "src" / f"{each}.cpp" for each in PROGRAMS[name][1]]
     words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / f"tests/core/{name}.cpp"]
     subprocess.run([*words, "-o", program], check=True, capture_output=True, timeout=900)
-    ended = subprocess.run([program], check=True, capture_output=True, text=True)
-    return tuple(ended.stdout.split())
+    ran = subprocess.run([*runs_by, program], check=True, capture_output=True, text=True)
+    return tuple(ran.stdout.split())
 
 
 @pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
@@ -63,10 +68,20 @@ def test_clang_gives_the_bits_of_gcc(name: str, tmp_path: Path) -> None:
     assert found == PROGRAMS[name][0]
 
 
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_an_arm_processor_gives_the_bits_of_an_intel(name: str, tmp_path: Path) -> None:
+    """Debian: apt install g++-aarch64-linux-gnu qemu-user. Its base has fused multiply-add."""
+    compiler, emulator = map(shutil.which, ("aarch64-linux-gnu-g++", "qemu-aarch64"))
+    if compiler is None or emulator is None:
+        pytest.skip("a compiler for aarch64 and qemu-user are not on the path")
+    found = hashes_of(name, tmp_path, compiler, "-O3", "-static", runs_by=[emulator])
+    assert found == PROGRAMS[name][0]
+
+
 def test_no_library_holds_a_fused_multiply_add() -> None:
     if shutil.which("objdump") is None:
         pytest.skip("objdump is not on the path")
-    built = sorted(FOLDER.glob("_core_*.so"))
+    built = sorted(LIBRARIES.glob("_core_*.so"))
     assert built
     for library in built:
         code = subprocess.run(
