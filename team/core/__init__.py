@@ -41,8 +41,11 @@ _import_library()
 
 from team.core._core import (  # noqa: E402 - the level is chosen before
     POSE_JITTER,
+    Cholesky,
     MotionError,
     NotFiniteError,
+    NotPositiveDefiniteError,
+    Pattern,
     Step,
     Window,
     atan2,
@@ -56,6 +59,7 @@ from team.core._core import (  # noqa: E402 - the level is chosen before
     log,
     log1p,
     mean_direction,
+    minimum_degree,
     moments,
     normal_below,
     normalise,
@@ -70,8 +74,11 @@ from team.core._core import (  # noqa: E402 - the level is chosen before
 
 __all__ = [
     "POSE_JITTER",
+    "Cholesky",
     "MotionError",
     "NotFiniteError",
+    "NotPositiveDefiniteError",
+    "Pattern",
     "Step",
     "Window",
     "atan2",
@@ -85,6 +92,7 @@ __all__ = [
     "log",
     "log1p",
     "mean_direction",
+    "minimum_degree",
     "moments",
     "normal_below",
     "normalise",

@@ -41,8 +41,8 @@ struct Supernodes {
 
 // The stored blocks of the lower triangle of a symmetric matrix, and their places in the factor.
 //
-// Entry e with column_start[j] ≤ e < column_start[j + 1] is block (rows[e], j), rows[e] ≥ j ascending,
-// the diagonal block first. The numbers of a matrix are one flat array: block e row by row from
+// Entry e with column_start[j] ≤ e < column_start[j + 1] is block (rows[e], j), rows[e] ≥ j, the
+// diagonal block first. The numbers of a matrix are one flat array: block e row by row from
 // value_start[e] on, diagonal blocks as full squares.
 class Pattern {
  public:
@@ -76,7 +76,8 @@ class Pattern {
   Supernodes supernodes_;
 };
 
-// The Cholesky factor L of a matrix on a pattern, L Lᵀ = A (permuted).
+// The Cholesky factor L of a matrix on a pattern, L Lᵀ = A (permuted). Its numbers are finite: one that
+// is not leaves no positive pivot in its row.
 class Cholesky {
  public:
   // Throws NotPositiveDefinite, which names the pivot's variable. A pivot that is rounding noise of its
@@ -84,7 +85,6 @@ class Cholesky {
   Cholesky(std::shared_ptr<const Pattern> pattern, Values values);
 
   const Pattern& pattern() const { return *pattern_; }
-  bool is_finite() const;
 
   // A⁻¹ right.
   dense::Matrix solve(dense::Const right) const;

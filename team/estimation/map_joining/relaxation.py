@@ -17,15 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team.core import Cholesky, NotPositiveDefiniteError, Pattern
 from team.estimation import elementary, elementwise
 from team.estimation.map_joining.submap_graph import Graph
-from team.estimation.sparse_cholesky.sparse import (
-    NotPositiveDefiniteError,
-    Pattern,
-    analysed,
-    factorised,
-    solved,
-)
 
 Values = Float[np.ndarray, " _"]
 Indices = Int64[np.ndarray, " _"]
@@ -90,11 +84,11 @@ def _least_squares(
         return None
     try:
         pattern = Pattern(sizes, normal.indptr.astype(np.int64), indices)
-        factor = factorised(analysed(pattern), normal.data)
+        factor = Cholesky(pattern, normal.data)
     except NotPositiveDefiniteError:
         return None
     found = numbers.copy()
-    found[free] = solved(factor, (B.T @ right)[:, None])[:, 0]
+    found[free] = factor.solve(B.T @ right)
     return found if np.isfinite(found).all() else None
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team.config import UNNAMED, Bias
+from team.core import Pattern
 from team.estimation import elementary
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.geometry import compose, transformed
@@ -25,7 +26,6 @@ from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
 from team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from team.estimation.map_joining.priors_kernel import PriorFactors
-from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
@@ -216,7 +216,7 @@ class Graph:
 
     @property
     def pattern(self) -> Pattern:
-        """Blocks of the normal equations: a block variable per node."""
+        """Blocks of the normal equations (a variable per node) and their places in the factor."""
         return self._pattern_and_entry[0]
 
     @property
@@ -234,11 +234,6 @@ class Graph:
     def condensed_entry(self) -> Indices:
         """The part of `entry` for the condensed factor's nodes."""
         return self.entry[self.sighting_factors.first_pair + 4 * len(self.sightings) :]
-
-    @cached_property
-    def analysis(self) -> Analysis:
-        """Order of elimination and places in the Cholesky factor."""
-        return analysed(self.pattern)
 
     @cached_property
     def dimensions(self) -> Indices:
