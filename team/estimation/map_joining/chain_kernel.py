@@ -12,8 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
 from team.estimation.compiled import compiled
-from team.estimation.dense_kernel import inverse_from_factor, solve_lower, solve_upper
-from team.estimation.gaussian import factor_or_fault
+from team.estimation.dense_kernel import (
+    factor_or_fault,
+    inverse_from_factor,
+    solve_lower,
+    solve_upper,
+)
 from team.estimation.geometry import compose, transformed, wrapped
 from team.estimation.map_joining.joining_kernel import (
     SubmapFactors,

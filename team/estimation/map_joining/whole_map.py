@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
-from team.estimation.geometry import wrapped
 from team.estimation.map_joining.join_kernel import joined_by_id
 from team.estimation.map_joining.tie_kernel import INDEFINITE, SINGULAR, end_pose_of
+from team.estimation.se2 import wrapped
 from team.estimation.submap import LocalMap
 
 Maps = tuple[
