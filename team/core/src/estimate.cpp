@@ -111,7 +111,9 @@ Numbers Estimate::dimensions() const {
 Numbers Estimate::costs(const Submaps& submaps, const Numbers& state) const {
   Numbers found;
   for (std::size_t f = 0; f < submaps.size(); f++)
-    found.push_back(submaps[f]->chi2(state, graph_->submaps[f].at) / loss_.covariance_factor);
+    found.push_back(chi2_ && &state == &state_ && submaps[f] == discounted()[f]
+                        ? (*chi2_)[f]
+                        : submaps[f]->chi2(state, graph_->submaps[f].at) / loss_.covariance_factor);
   return found;
 }
 
@@ -325,7 +327,7 @@ Step Estimate::take_step(double damping) const {
     }
     double largest = 0.0;
     for (const double x : step)
-      if (!(std::fabs(x) <= largest)) largest = std::fabs(x);
+      if (largest == largest && !(std::fabs(x) <= largest)) largest = std::fabs(x);  // NaN stays
     for (const double share : SHARES) {
       if (damping != 0.0 && share < 1.0) break;
       const Estimate after(graph_, moved(step, share), scale_, sighting_scale_, loss_);

@@ -16,5 +16,6 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   binding::bind_dense(m);
   binding::bind_se2(m);
   binding::bind_sparse(m);
+  binding::bind_graph(m);
   binding::bind_window(m);
 }
