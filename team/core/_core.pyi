@@ -296,10 +296,7 @@ class Cholesky:
         """
 
     def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-        """Solve A x = right."""
-
-    def solve_columns(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-        """Solve A X = right, (n, k)."""
+        """Solve A X = right, (n,) or (n, k)."""
 
     def inverse_columns(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
         """

@@ -65,7 +65,7 @@ def assert_right(pattern, dense, rng):
 
     many = int(rng.choice([0, 1, 2, 3, 5, 20, 70]))
     right = dense @ rng.normal(size=(n, many))
-    solution = cholesky.solve_columns(right)
+    solution = cholesky.solve(right)
     margin = 1e-11 * (abs(dense) @ (1.0 / np.sqrt(np.diag(dense))))[:, None]
     scale = np.abs(right / np.sqrt(np.diag(dense))[:, None]).max(initial=0.0)
     assert (abs(dense @ solution - right) <= margin * (1.0 + scale)).all()
@@ -305,7 +305,7 @@ def test_arguments_of_another_size_are_refused():
     for call in (
         lambda: Cholesky(pattern, np.ones(3)),
         lambda: cholesky.solve(np.ones(4)),
-        lambda: cholesky.solve_columns(np.ones((4, 2))),
+        lambda: cholesky.solve(np.ones((4, 2))),
         lambda: cholesky.inverse_columns(np.array([5])),
         lambda: cholesky.inverse_block(np.array([-1])),
         lambda: pattern.block(np.ones(19), 0, 2),

@@ -104,17 +104,13 @@ void bind_sparse(nb::module_& m) {
            "Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is\n"
            "rounding noise of its diagonal entry counts as zero.")
       .def("solve",
-           [](const Cholesky& f, const Numbers& right) {
-             check(std::int64_t(right.size()) == f.pattern().unknowns(), "right must have a number for each unknown");
-             return made_numbers(f.solve(sparse::Values{right.data(), right.size()}));
-           },
-           "right"_a, "Solve A x = right.")
-      .def("solve_columns",
-           [](const Cholesky& f, const Table& right) {
+           [](const Cholesky& f, const Array& right) {
+             check(right.ndim() == 1 || right.ndim() == 2, "right must be a vector or a matrix");
              check(std::int64_t(right.shape(0)) == f.pattern().unknowns(), "right must have a row for each unknown");
-             return made_matrix(f.solve(matrix_of(right)));
+             const std::size_t columns = right.ndim() == 2 ? right.shape(1) : 1;
+             return made_array(f.solve(dense::Const{right.data(), right.shape(0), columns, columns}).numbers(), axes_of(right));
            },
-           "right"_a, "Solve A X = right, (n, k).")
+           "right"_a, "Solve A X = right, (n,) or (n, k).")
       .def("inverse_columns",
            [](const Cholesky& f, const IndexArray& unknowns) {
              return made_matrix(f.inverse_columns(unknowns_of(f, unknowns)));

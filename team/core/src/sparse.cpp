@@ -7,7 +7,7 @@
 
 namespace teamslam::sparse {
 
-using dense::Const, dense::Matrix, dense::View;
+using dense::Const, dense::Matrix, dense::transposed, dense::View;
 
 namespace {
 
@@ -114,13 +114,6 @@ void product(View c, Left a, Const b, unsigned shape = FULL) {
 
 Left by_rows(Const a) { return {a.data, a.stride, 1}; }
 Left by_columns(Const a) { return {a.data, 1, a.stride}; }  // of Aᵀ
-
-Matrix transposed(Const a) {
-  Matrix made(a.columns, a.rows);
-  for (std::size_t i = 0; i < a.rows; i++)
-    for (std::size_t j = 0; j < a.columns; j++) made[j][i] = a[i][j];
-  return made;
-}
 
 void negate(View a) {
   for (std::size_t i = 0; i < a.rows; i++)
@@ -442,7 +435,7 @@ Matrix Cholesky::solve(Const right) const {
 }
 
 std::vector<double> Cholesky::solve(Values right) const {
-  return solve(Const{right.data(), right.size(), 1, 1}).numbers();
+  return solve(dense::column(right)).numbers();
 }
 
 // The rows `requested` of columns of A⁻¹, both by their places in the order of elimination and none

@@ -552,7 +552,7 @@ def solved_with_fixed(
         gradient = island.normal_equations[1]
         right = np.column_stack([-gradient, np.zeros(len(island.state))])
         right[unknown, 1] = 1.0
-        p, q = island.posterior.solve_columns(right).T
+        p, q = island.posterior.solve(right).T
         force = (missing - p[unknown]) / q[unknown]
         step = p + force * q
         squared = float(force * step[unknown] - dense.product(gradient, step))

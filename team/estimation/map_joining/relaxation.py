@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from team import core
-from team.core import Cholesky, NotPositiveDefiniteError, Pattern
 from team.estimation.map_joining.submap_graph import Graph
 
 Values = Float[np.ndarray, " _"]
@@ -83,9 +82,9 @@ def _least_squares(
     if (normal.diagonal() == 0.0).any():
         return None
     try:
-        pattern = Pattern(sizes, normal.indptr.astype(np.int64), indices)
-        factor = Cholesky(pattern, normal.data)
-    except NotPositiveDefiniteError:
+        pattern = core.Pattern(sizes, normal.indptr.astype(np.int64), indices)
+        factor = core.Cholesky(pattern, normal.data)
+    except core.NotPositiveDefiniteError:
         return None
     found = numbers.copy()
     found[free] = factor.solve(B.T @ right)

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int64
 
 from team import core
 from team.config import UNNAMED, Bias
-from team.core import Pattern
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
@@ -202,7 +201,7 @@ class Graph:
         )
 
     @cached_property
-    def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
+    def _pattern_and_entry(self) -> tuple[core.Pattern, Indices]:
         factors, pairs = self.factors, self.sighting_factors.nodes
         members = factors.member_start[-1] + 2 * np.arange(1, len(pairs) + 1)
         old = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
@@ -212,10 +211,10 @@ class Graph:
             np.concatenate([factors.member, pairs.ravel(), old]),
             np.concatenate([ends, ends[-1:] + len(old)]) if len(old) else ends,
         )
-        return Pattern(np.diff(self.offset), column_start, rows), entry
+        return core.Pattern(np.diff(self.offset), column_start, rows), entry
 
     @property
-    def pattern(self) -> Pattern:
+    def pattern(self) -> core.Pattern:
         """Blocks of the normal equations (a variable per node) and their places in the factor."""
         return self._pattern_and_entry[0]
 
