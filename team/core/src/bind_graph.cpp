@@ -13,6 +13,7 @@ namespace {
 
 using IndexArray = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Marks = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Changed = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using SubmapFactor = std::tuple<std::shared_ptr<Submap>, IndexArray>;
 using Sighting = std::tuple<std::int64_t, std::int64_t, Numbers, Table>;
 using Prior = std::tuple<std::int64_t, Numbers, Table, bool>;
@@ -176,6 +177,32 @@ void bind_graph(nb::module_& m) {
                                   listed(slope), cost};
            },
            nb::arg("nodes").noconvert(), "at"_a, nb::arg("headings").noconvert(), "information"_a, "slope"_a, "cost"_a);
+
+  m.def("add_product",
+        [](const Table& a, const Table& b, const Changed& c, bool upper, bool lower) {
+          check(a.shape(1) == b.shape(0), "a must have as many columns as b has rows");
+          check(c.shape(0) >= a.shape(0) && c.shape(1) >= b.shape(1), "the sum must have room for the product");
+          dense::add_product(matrix_of(a), matrix_of(b), {c.data(), c.shape(0), c.shape(1), c.shape(1)}, {upper, lower});
+        },
+        "a"_a, "b"_a, nb::arg("c").noconvert(), "upper"_a = false, "lower"_a = false,
+        "Add A B to the first rows and columns of C, in place; each entry adds its terms in order.\n\n"
+        "upper: only the upper triangle of the square A B is required, the rest of C may change or not. lower: B is\n"
+        "lower triangular, entries above its diagonal count as zero.");
+  m.def("own_blocks",
+        [](const Table& upper, const Table& spread) {
+          const std::size_t count = spread.shape(0) / 2, n = spread.shape(1);
+          check(spread.shape(0) % 2 == 0 && upper.shape(0) == 2 * count && upper.shape(1) == 2 * count,
+                "both matrices must have two rows for each landmark");
+          std::vector<double> blocks;
+          for (std::size_t k = 0; k < 2 * count; k += 2) {
+            const std::span<const double> x{spread.data() + k * n, n}, y{spread.data() + (k + 1) * n, n};
+            const double cross = upper(k, k + 1) + dense::inner(x, y);
+            blocks.insert(blocks.end(), {upper(k, k) + dense::inner(x, x), cross, cross,
+                                         upper(k + 1, k + 1) + dense::inner(y, y)});
+          }
+          return made<double, nb::ndim<3>>(std::move(blocks), {count, 2, 2});
+        },
+        "upper"_a, "spread"_a, "Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.");
 
   nb::class_<Graph>(m, "SubmapGraph",
                     "The factor graph of one frame, independent of the state.\n\n"

@@ -59,8 +59,8 @@ const Estimate::Submaps& Estimate::submaps() const {
 const std::pair<Numbers, Numbers>& Estimate::landmark_chi2_and_gate() const {
   return once(landmark_chi2_, [&] {
     const std::size_t count = graph_->landmarks();
-    if (!loss_.robust_c) return std::pair(Numbers(count), Numbers(count, 1.0));
-    std::pair found(Numbers(count), Numbers());
+    if (!loss_.robust_c) return std::pair{Numbers(count), Numbers(count, 1.0)};
+    std::pair<Numbers, Numbers> found{Numbers(count), {}};
     for (std::size_t f = 0; f < submaps().size(); f++) {
       const Submap& each = *submaps()[f];
       each.landmark_chi2(state_, graph_->submaps[f].at, loss_.covariance_factor,
@@ -233,7 +233,7 @@ double Estimate::cost_of_factors(const Marked& marked) const {
 const std::pair<Numbers, Numbers>& Estimate::normal_equations() const {
   return once(normal_, [&] {
     const Graph& graph = *graph_;
-    std::pair made(Numbers(std::size_t(graph.pattern()->numbers())), Numbers(state_.size()));
+    std::pair made{Numbers(std::size_t(graph.pattern()->numbers())), Numbers(state_.size())};
     auto& [values, gradient] = made;
     for (std::size_t node = 0; node < graph.nodes(); node++)
       if (graph.fixed[node])
