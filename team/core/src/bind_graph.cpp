@@ -141,16 +141,16 @@ void bind_graph(nb::module_& m) {
            },
            "weights"_a,
            "Make the same submap with each landmark's own covariance enlarged by its weight: P + blkdiag(0, (1/w - 1) P_ll).")
-      .def_prop_ro("information", [](const Submap& self) { return made_matrix(dense::Matrix(self.information)); }, "P⁻¹.")
+      .def_prop_ro("information", [](const Submap& self) { return made_matrix(dense::Matrix(self.information)); }, nb::rv_policy::move, "P⁻¹.")
       .def_prop_ro("sensitivity", [](const Submap& self) { return made_matrix(dense::Matrix(self.sensitivity)); },
-                   "∂mean/∂b, a row per bias.")
+                   nb::rv_policy::move, "∂mean/∂b, a row per bias.")
       .def_prop_ro("landmarks",
                    [](const Submap& self) {
                      std::vector<double> numbers;
                      for (const auto& each : self.landmarks) numbers.insert(numbers.end(), {each.xx, each.xy, each.yy});
                      return made<double, nb::ndim<2>>(std::move(numbers), {self.landmarks.size(), 3});
                    },
-                   "Each landmark's own covariance (xx, xy, yy).");
+                   nb::rv_policy::move, "Each landmark's own covariance (xx, xy, yy).");
   m.attr("LARGEST_RATIO") = graph::LARGEST_RATIO;
 
   m.def("linearise_sighting",
@@ -240,19 +240,19 @@ void bind_graph(nb::module_& m) {
            },
            "graph"_a, "state"_a, "scale"_a, "sighting_scale"_a, "robust_c"_a.none(), "landmark_gate"_a,
            "covariance_factor"_a, "joined_ranges"_a)
-      .def_prop_ro("landmark_weights", copied(&Estimate::landmark_weights),
+      .def_prop_ro("landmark_weights", copied(&Estimate::landmark_weights), nb::rv_policy::move,
                    "Weight of each landmark of each submap: 1 up to its gate or without a robust loss.")
-      .def_prop_ro("dimensions", made_by(&Estimate::dimensions),
+      .def_prop_ro("dimensions", made_by(&Estimate::dimensions), nb::rv_policy::move,
                    "Dimension of each submap, a discounted landmark counting by its weight.")
-      .def_prop_ro("chi2", copied(&Estimate::chi2), "rᵀ(f P)⁻¹r of each submap, with discounted landmarks.")
-      .def_prop_ro("whole_chi2", made_by(&Estimate::whole_chi2), "rᵀ(f P)⁻¹r of each submap, without discounting.")
-      .def_prop_ro("counted_chi2", made_by(&Estimate::counted_chi2),
+      .def_prop_ro("chi2", copied(&Estimate::chi2), nb::rv_policy::move, "rᵀ(f P)⁻¹r of each submap, with discounted landmarks.")
+      .def_prop_ro("whole_chi2", made_by(&Estimate::whole_chi2), nb::rv_policy::move, "rᵀ(f P)⁻¹r of each submap, without discounting.")
+      .def_prop_ro("counted_chi2", made_by(&Estimate::counted_chi2), nb::rv_policy::move,
                    "χ² of each submap in which each landmark's share w χ² counts w times.")
-      .def_prop_ro("weights", made_by(&Estimate::weights), "Robust weight of each submap.")
-      .def_prop_ro("sighting_chi2", copied(&Estimate::sighting_chi2), "rᵀR⁻¹r of each inter-robot measurement.")
-      .def_prop_ro("sighting_weights", made_by(&Estimate::sighting_weights), "Robust weight of each inter-robot measurement.")
-      .def_prop_ro("prior_chi2", made_by(&Estimate::prior_chi2), "χ² of each prior.")
-      .def_prop_ro("prior_weights", made_by(&Estimate::prior_weights),
+      .def_prop_ro("weights", made_by(&Estimate::weights), nb::rv_policy::move, "Robust weight of each submap.")
+      .def_prop_ro("sighting_chi2", copied(&Estimate::sighting_chi2), nb::rv_policy::move, "rᵀR⁻¹r of each inter-robot measurement.")
+      .def_prop_ro("sighting_weights", made_by(&Estimate::sighting_weights), nb::rv_policy::move, "Robust weight of each inter-robot measurement.")
+      .def_prop_ro("prior_chi2", made_by(&Estimate::prior_chi2), nb::rv_policy::move, "χ² of each prior.")
+      .def_prop_ro("prior_weights", made_by(&Estimate::prior_weights), nb::rv_policy::move,
                    "Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.")
       .def_prop_ro("cost", &Estimate::cost, "The minimised cost, at these robust scales.")
       .def("cost_of",
@@ -266,21 +266,21 @@ void bind_graph(nb::module_& m) {
                      const auto& [values, gradient] = self.normal_equations();
                      return std::tuple(made_copy(values), made_copy(gradient));
                    },
-                   "A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r.")
+                   nb::rv_policy::move, "A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r.")
       .def_prop_ro("gradient", [](const Estimate& self) { return made_copy(self.normal_equations().second); },
-                   "Half the gradient, Σ w JᵀP⁻¹r.")
+                   nb::rv_policy::move, "Half the gradient, Σ w JᵀP⁻¹r.")
       .def_prop_ro("posterior",
                    [](const Estimate& self) { return std::const_pointer_cast<sparse::Cholesky>(self.posterior()); },
                    "The Cholesky factor of A. Raises NotPositiveDefiniteError.")
-      .def_prop_ro("step", copied(&Estimate::step), "The full step, -A⁻¹g.")
+      .def_prop_ro("step", copied(&Estimate::step), nb::rv_policy::move, "The full step, -A⁻¹g.")
       .def_prop_ro("squared_length",
                    [](const Estimate& self) { return -dense::inner(self.normal_equations().second, self.step()); },
                    "The full step's squared length in standard deviations, gᵀA⁻¹g.")
-      .def_prop_ro("selected_covariance", copied(&Estimate::selected_covariance),
+      .def_prop_ro("selected_covariance", copied(&Estimate::selected_covariance), nb::rv_policy::move,
                    "Entries of A⁻¹ in the layout of the graph's pattern; fixed nodes: identity.")
       .def_prop_ro("boundary_covariance",
                    [](const Estimate& self) { return made_matrix(self.graph().among_boundary(self.selected_covariance())); },
-                   "The joint covariance of the condensed factor's nodes.")
+                   nb::rv_policy::move, "The joint covariance of the condensed factor's nodes.")
       .def("take_step",
            [](const Estimate& self, double damping) {
              graph::Step step = self.take_step(damping);
@@ -292,11 +292,11 @@ void bind_graph(nb::module_& m) {
            "Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a more\n"
            "damped one. Returns the next state, the next damping and the full step's largest change; where no damping\n"
            "helps the state is None, the damping infinite and the change that of the first step.")
-      .def_prop_ro("explained", made_by(&Estimate::explained),
+      .def_prop_ro("explained", made_by(&Estimate::explained), nb::rv_policy::move,
                    "tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.")
-      .def_prop_ro("explained_by_sightings", made_by(&Estimate::explained_by_sightings),
+      .def_prop_ro("explained_by_sightings", made_by(&Estimate::explained_by_sightings), nb::rv_policy::move,
                    "tr(JᵀR⁻¹J Σ) of each inter-robot measurement.")
-      .def_prop_ro("explained_by_priors", made_by(&Estimate::explained_by_priors), "tr(P⁻¹ Σ) of each prior.")
+      .def_prop_ro("explained_by_priors", made_by(&Estimate::explained_by_priors), nb::rv_policy::move, "tr(P⁻¹ Σ) of each prior.")
       .def("quadratic",
            [](const Estimate& self, const IndexArray& nodes, const Marks& submaps, const Marks& sightings, const Marks& priors) {
              for (std::size_t k = 0; k < nodes.size(); k++)
