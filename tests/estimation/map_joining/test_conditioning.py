@@ -81,7 +81,7 @@ def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
         sigma = np.sqrt(np.diag(covariance))
         away = max(away, np.abs((found.mean - mean) / sigma).max())
         away = max(away, np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max())
-        assert found.cost == pytest.approx(island.chi2.sum(), rel=1e-9)
+        assert found.cost == pytest.approx(island.estimate.chi2.sum(), rel=1e-9)
         assert found.dof == int(graph.dimensions.sum()) - graph.unknowns
         beyond = np.concatenate(conditioning._beyond_gate(island))
         np.testing.assert_array_equal(found.beyond, beyond)
