@@ -41,11 +41,15 @@ _import_library()
 
 from team.core._core import (  # noqa: E402 - the level is chosen before
     POSE_JITTER,
+    Chain,
+    ChainSolution,
     MotionError,
     NotFiniteError,
     Step,
+    WholeMap,
     Window,
     atan2,
+    corrected,
     digest,
     effective_sample_size,
     exp,
@@ -70,11 +74,15 @@ from team.core._core import (  # noqa: E402 - the level is chosen before
 
 __all__ = [
     "POSE_JITTER",
+    "Chain",
+    "ChainSolution",
     "MotionError",
     "NotFiniteError",
     "Step",
+    "WholeMap",
     "Window",
     "atan2",
+    "corrected",
     "digest",
     "effective_sample_size",
     "exp",

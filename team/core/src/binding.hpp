@@ -99,6 +99,7 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 
 // One function for each file of bindings.
 void bind_elementary(nb::module_& m);
+void bind_maps(nb::module_& m);
 void bind_window(nb::module_& m);
 
 }  // namespace teamslam::binding

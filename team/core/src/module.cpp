@@ -13,5 +13,6 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   nb::exception<binding::NotFiniteError>(m, "NotFiniteError", PyExc_ValueError);
   nb::exception<window::MotionError>(m, "MotionError", PyExc_ValueError);
   binding::bind_elementary(m);
+  binding::bind_maps(m);
   binding::bind_window(m);
 }
