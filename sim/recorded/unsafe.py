@@ -7,8 +7,8 @@ import numpy as np
 
 from team import translate
 from team.config import Exchange, RobotConfig
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.core import WholeMap
+from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.map_joining.conditioning import RobotPrior
 from team.estimation.map_joining.whole_map import initial_map, joined
 from team.estimation.submap import LocalMap

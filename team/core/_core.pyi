@@ -48,6 +48,100 @@ def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy
 def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """The length of each (x, y)."""
 
+class WholeMap:
+    """
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.
+    """
+
+    def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
+
+    @property
+    def ids(self) -> NDArray[numpy.uint32]:
+        """The landmarks' ids (L,), ascending; read-only."""
+
+    @property
+    def mean(self) -> NDArray[numpy.float64]:
+        """(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only."""
+
+    @property
+    def covariance(self) -> NDArray[numpy.float64]:
+        """(n, n); read-only."""
+
+    def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """Copy mean (3,) and covariance (3, 3) of the pose."""
+
+    def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
+        """
+        Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
+
+        Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map
+        is as it was.
+        """
+
+    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
+        """
+        Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
+
+        Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as
+        of `joined`, 2 where a single landmark's innovation is singular.
+        """
+
+def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
+    """
+
+class Chain:
+    """
+    A prior and the submaps after it, each beginning at the end of the one before.
+    """
+
+    def __init__(self, prior: WholeMap) -> None: ...
+
+    def append(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None:
+        """Append the next submap, without pose nodes."""
+
+    def solve(self, iterations: int, tolerance: float) -> ChainSolution:
+        """
+        Minimise the squares over all poses and landmarks by damped Gauss-Newton.
+
+        tolerance: the largest change of a number, of an undamped step, at which the iterations stop.
+        """
+
+class ChainSolution:
+    """The least-squares solution of a prior and the submaps after it."""
+
+    @property
+    def map(self) -> WholeMap:
+        """The last end pose and all landmarks."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-squared of all maps, in `dof` degrees of freedom."""
+
+    @property
+    def dof(self) -> int: ...
+
+    @property
+    def known(self) -> NDArray[numpy.int64]:
+        """
+        For each submap, the number of its landmarks that another map has, too.
+        """
+
+    @property
+    def landmark_chi2(self) -> NDArray[numpy.float64]:
+        """Chi-squared of each landmark of the submaps by its own covariance."""
+
+    @property
+    def fault(self) -> int:
+        """
+        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
+        """
+
+    @property
+    def at(self) -> int:
+        """The map without covariance; 0 is the prior."""
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 

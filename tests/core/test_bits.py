@@ -17,7 +17,7 @@ from tests.support import ROOT
 FOLDER = ROOT / "team" / "core"
 HASH = "8c51871c169fc457"
 """Of all results of tests/core/bits.cpp; equal to the bits of the Numba kernels before them."""
-SOURCES = ("window", "particles", "innovation", "along_path", "moments")
+SOURCES = ("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian")
 EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 FUSED = re.compile(r"\s(?:vfn?m(?:add|sub)\w*|fn?m(?:add|sub)|fml[as])\s.*")
 

@@ -113,7 +113,8 @@ void bind_maps(nb::module_& m) {
       .def_ro("dof", &ChainSolution::dof)
       .def_prop_ro("known", [](const ChainSolution& self) { return Places{self.known}; },
                    "For each submap, the number of its landmarks that another map has, too.")
-      .def_prop_ro("landmark_chi2", [](const ChainSolution& self) { return made_numbers(std::vector(self.landmark_chi2)); },
+      .def_prop_ro("landmark_chi2",
+                   [](ChainSolution& self) { return View1(self.landmark_chi2.data(), {self.landmark_chi2.size()}, nb::find(self)); },
                    "Chi-squared of each landmark of the submaps by its own covariance.")
       .def_prop_ro("fault", [](const ChainSolution& self) { return int(self.fault); },
                    "0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.")

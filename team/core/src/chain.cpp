@@ -138,8 +138,9 @@ struct Chain::Problem {
       if (factor.fault != gaussian::Fault::NONE) return {damping, elementary::NOT_A_NUMBER};
       Numbers step = gradient;
       for (double& each : step) each = -each;
-      dense::solve_lower(factor.L, dense::column(step));
-      dense::solve_upper(factor.L, dense::column(step));
+      const dense::View column = dense::column(std::span<double>(step));
+      dense::solve_lower(factor.L, column);
+      dense::solve_upper(factor.L, column);
       const double change = largest(step);
       for (const double share : SHARES) {
         if (damping > 0.0 && share < 1.0) break;

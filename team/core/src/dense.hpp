@@ -1,8 +1,13 @@
-// Matrices of any size, row by row.
+// Matrices of any size, row by row, and their algebra: every sum in the order of its index.
+//
+// A BLAS sums in another order on another processor. Here a register holds different entries, never
+// parts of one sum, so its width changes no bit.
 #pragma once
 
 #include <cassert>
 #include <cstddef>
+#include <optional>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -68,5 +73,51 @@ class Matrix {
   std::size_t rows_ = 0, columns_ = 0;
   std::vector<double> numbers_;
 };
+
+inline constexpr std::size_t BLOCK = 32;  // columns factored or solved by loops, before a product takes them from the others
+
+// A column, as a matrix.
+inline Const column(std::span<const double> x) { return {x.data(), x.size(), 1, 1}; }
+inline View column(std::span<double> x) { return {x.data(), x.size(), 1, 1}; }
+
+Matrix identity(std::size_t n);
+Matrix transposed(Const a);
+Matrix negative(Const a);
+bool is_finite(Const a);
+
+// Σ aᵢ bᵢ in eight lanes, which are summed in pairs.
+double inner(std::span<const double> a, std::span<const double> b);
+
+// A x.
+std::vector<double> product(Const a, std::span<const double> x);
+
+// A B.
+Matrix product(Const a, Const b);
+
+// Which entries of a product are needed or read.
+struct Shape {
+  bool is_upper = false;  // only the upper triangle of the square A B is needed; tiles below may stay as they are
+  bool is_lower = false;  // B is lower triangular: entries above its diagonal are not read, except within its tiles
+};
+
+// C += A B, each entry its terms in order; C overlaps neither A nor B.
+void add_product(Const a, Const b, View c, Shape shape = {});
+
+// B := A⁻¹ B by elimination with partial pivoting, A := what is left of it; false for a zero pivot.
+[[nodiscard]] bool solve(View A, View B);
+
+// The upper triangle of U := the factor R with Rᵀ R = U, of which the upper triangle is read; false
+// where a pivot is not positive.
+[[nodiscard]] bool factor_upper(View U);
+
+// Lower L with L Lᵀ = A, from the lower triangle of A; none where A is not positive definite.
+std::optional<Matrix> cholesky(Const A);
+
+// right := L⁻¹ right, and L⁻ᵀ right.
+void solve_lower(Const L, View right);
+void solve_upper(Const L, View right);
+
+// (L Lᵀ)⁻¹ = RᵀR, R = L⁻¹, exactly symmetric.
+Matrix inverse_from_factor(Const L);
 
 }  // namespace teamslam::dense

@@ -5,6 +5,7 @@
 #include <span>
 #include <vector>
 
+#include "dense.hpp"
 #include "elementary.hpp"
 
 namespace teamslam::linalg {
@@ -18,6 +19,15 @@ struct Lower3 {
       if (!std::isfinite(x)) return false;
     return true;
   }
+};
+
+// A 3 × 3 matrix.
+struct Matrix3 {
+  double entries[3][3];
+
+  double* operator[](std::size_t i) { return entries[i]; }
+  const double* operator[](std::size_t i) const { return entries[i]; }
+  operator dense::Const() const { return {entries[0], 3, 3, 3}; }
 };
 
 inline constexpr double SMALLEST_VARIANCE = 1e-200;  // a variance of motion below it is zero [m², rad²]
@@ -68,33 +78,6 @@ inline double normalised_square(std::span<const double> error, std::span<const d
     squares += white[j] * white[j];
   }
   return squares;
-}
-
-// Why a symmetric matrix is no covariance; the index in team.estimation.gaussian.FAULTS.
-enum class Fault : int { NONE = 0, NOT_FINITE = 1, NOT_POSITIVE = 2 };
-
-// Rank is judged by the diagonal's scale: a pivot that is no more than n ε of its diagonal entry is
-// rounding of a singular matrix.
-inline Fault fault_of_covariance(std::span<const double> P, std::size_t n) {
-  for (const double x : P)
-    if (!std::isfinite(x)) return Fault::NOT_FINITE;
-  std::vector<double> U(P.begin(), P.end()), sigmas(n);
-  for (std::size_t i = 0; i < n; i++) {
-    if (!(P[i * n + i] > 0.0)) return Fault::NOT_POSITIVE;
-    sigmas[i] = pack::sqrt(P[i * n + i]);
-  }
-  for (std::size_t k = 0; k < n; k++) {  // U with Uᵀ U = P, row by row
-    if (!(U[k * n + k] > 0.0 && U[k * n + k] < elementary::INF)) return Fault::NOT_POSITIVE;
-    const double root = pack::sqrt(U[k * n + k]);
-    for (std::size_t i = k; i < n; i++) U[k * n + i] /= root;
-    const double pivot = U[k * n + k] / sigmas[k];
-    if (pivot * pivot <= double(n) * elementary::EPSILON) return Fault::NOT_POSITIVE;
-    for (std::size_t later = k + 1; later < n; later++) {
-      const double factor = U[k * n + later];
-      for (std::size_t j = later; j < n; j++) U[later * n + j] -= factor * U[k * n + j];
-    }
-  }
-  return Fault::NONE;
 }
 
 // Σ values in NumPy's order: by halves down to 128 numbers, whose sums are in eight lanes.

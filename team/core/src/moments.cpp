@@ -210,7 +210,7 @@ Gaussian submap_moments(const Rows& poses, std::span<const double> log_weights, 
   Gaussian found = moments(poses, weights, sorted, sample_factor(weights), true);
   for (const std::size_t slot : order) found.ids.push_back(ids[slot]);
   for (std::size_t j = 0; j < poses.rows(); j++) found.covariance[j * n + j] += POSE_JITTER[j % 3];
-  found.fault = linalg::fault_of_covariance(found.covariance, n);
+  found.fault = gaussian::factor_or_fault({found.covariance.data(), n, n, n}).fault;
   return found;
 }
 

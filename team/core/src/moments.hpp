@@ -8,6 +8,7 @@
 
 #include <array>
 
+#include "gaussian.hpp"
 #include "rows.hpp"
 #include "se2.hpp"
 
@@ -20,7 +21,7 @@ inline constexpr double POSE_JITTER[3] = {1e-6, 1e-6, 1e-8};
 struct Gaussian {
   std::vector<std::uint32_t> ids;
   std::vector<double> mean, covariance;
-  linalg::Fault fault = linalg::Fault::NONE;
+  gaussian::Fault fault = gaussian::Fault::NONE;
 };
 
 // A mean pose and each pose's deviation from it in (x, y, heading): rows x, y, heading.

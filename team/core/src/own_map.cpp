@@ -327,7 +327,7 @@ TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate) {
   put(joint.view().part(0, 0, 3, 3), found.covariance.view().part(0, 0, 3, 3));
   put(joint.view().part(3, 3, 3, 3), submap.covariance.part(0, 0, 3, 3));
   for (std::size_t a = 0; a < 6; a++) {
-    const Numbers row = dense::product(found.tie.inverse, {gain[a], m});
+    const Numbers row = dense::product(found.tie.inverse, std::span<const double>(gain[a], m));
     for (std::size_t b = 0; b < 6; b++)
       for (std::size_t k = 0; k < m; k++) joint[a][b] -= row[k] * gain[b][k];
   }

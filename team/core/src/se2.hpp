@@ -1,5 +1,5 @@
 // SE(2): poses are (x [m], y [m], heading [rad]); a perturbation is on the right, pose ∘ Exp(ξ) with
-// ξ = (forward [m], left [m], turn [rad]). team/estimation/geometry.py has the same conventions.
+// ξ = (forward [m], left [m], turn [rad]). `a_from_b` maps coordinates in b into a.
 #pragma once
 
 #include "linalg.hpp"
@@ -7,7 +7,7 @@
 namespace teamslam::se2 {
 
 using elementary::SineCosine;
-using linalg::Lower3;
+using linalg::Lower3, linalg::Matrix3;
 using pack::all, pack::max, pack::min, pack::select;
 
 template <class T>
@@ -49,6 +49,74 @@ inline T half_cotangent(T turn) {
   const T half = 0.5 * turn;
   const auto [s, c] = elementary::sin_cos_near(half);
   return select(pack::abs(turn) < 1e-4, 1.0 - half * half / 3.0, half / (s / c));
+}
+
+// a_from_c = a_from_b ∘ b_from_c.
+inline Pose<double> compose(const Pose<double>& a_from_b, const Pose<double>& b_from_c) {
+  const auto [s, c] = elementary::sin_cos(a_from_b.heading);
+  return {a_from_b.x + c * b_from_c.x - s * b_from_c.y, a_from_b.y + s * b_from_c.x + c * b_from_c.y,
+          wrapped(a_from_b.heading + b_from_c.heading)};
+}
+
+// b_from_a.
+inline Pose<double> inverse(const Pose<double>& a_from_b) {
+  const auto [s, c] = elementary::sin_cos(a_from_b.heading);
+  return {-c * a_from_b.x - s * a_from_b.y, s * a_from_b.x - c * a_from_b.y, wrapped(-a_from_b.heading)};
+}
+
+// b_from_c = a_from_b⁻¹ ∘ a_from_c: the motion from b to c, seen in b.
+inline Pose<double> between(const Pose<double>& a_from_b, const Pose<double>& a_from_c) {
+  const auto [s, c] = elementary::sin_cos(a_from_b.heading);
+  const double dx = a_from_c.x - a_from_b.x, dy = a_from_c.y - a_from_b.y;
+  return {c * dx + s * dy, -s * dx + c * dy, wrapped(a_from_c.heading - a_from_b.heading)};
+}
+
+// The point's coordinates in frame a.
+inline Point<double> transformed(const Pose<double>& a_from_b, const Point<double>& in_b) {
+  const auto [s, c] = elementary::sin_cos(a_from_b.heading);
+  return {a_from_b.x + c * in_b.x - s * in_b.y, a_from_b.y + s * in_b.x + c * in_b.y};
+}
+
+// V(turn) (forward, left): the end of a constant twist in unit time.
+//
+// V(θ) = [[sin θ/θ, −(1 − cos θ)/θ], [(1 − cos θ)/θ, sin θ/θ]]; near θ = 0 the quotients are taken
+// from their series.
+inline Point<double> swept(const Motion& twist) {
+  double along, across;
+  if (pack::abs(twist.turn) < 1e-4) {
+    const double square = twist.turn * twist.turn;
+    along = 1.0 - square / 6.0;
+    across = twist.turn * (0.5 - square / 24.0);
+  } else {
+    const auto [s, c] = elementary::sin_cos(twist.turn);
+    along = s / twist.turn;
+    across = (1.0 - c) / twist.turn;
+  }
+  return {along * twist.forward - across * twist.left, across * twist.forward + along * twist.left};
+}
+
+// Exp: R³ → SE(2), (V(θ) (forward, left), θ).
+inline Pose<double> exponential(const Motion& twist) {
+  const auto [x, y] = swept(twist);
+  return {x, y, wrapped(twist.turn)};
+}
+
+// Log: SE(2) → R³, the inverse of `exponential` for |θ| < π.
+inline Motion logarithm(const Pose<double>& pose) {
+  const double turn = wrapped(pose.heading), half = 0.5 * turn, a = half_cotangent(turn);
+  return {a * pose.x + half * pose.y, -half * pose.x + a * pose.y, turn};
+}
+
+// Ad with T ∘ Exp(ξ) = Exp(Ad_T ξ) ∘ T: carries a perturbation from the right to the left.
+inline Matrix3 adjoint(const Pose<double>& a_from_b) {
+  const auto [s, c] = elementary::sin_cos(a_from_b.heading);
+  return {{{c, -s, a_from_b.y}, {s, c, -a_from_b.x}, {0.0, 0.0, 1.0}}};
+}
+
+// ∂(x, y, θ)/∂ξ of pose ∘ Exp(ξ) for a pose of this heading.
+inline Matrix3 tangent(double heading) {
+  const auto [s, c] = elementary::sin_cos(heading);
+  return {{{c, -s, 0.0}, {s, c, 0.0}, {0.0, 0.0, 1.0}}};
 }
 
 // pose ∘ motion; of_turn: of the motion's turn.

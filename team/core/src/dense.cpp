@@ -1,0 +1,284 @@
+#include "dense.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "pack.hpp"
+
+namespace teamslam::dense {
+
+using pack::Pack, pack::load, pack::store;
+
+namespace {
+
+// Big products go by tiles of columns and blocks of terms, which stay in the first cache; four rows
+// and four terms at once keep most of the work in registers.
+constexpr std::size_t TILE = 64, DEPTH = 32;
+
+// row −= factor · other.
+void take(double* __restrict row, double factor, const double* __restrict other, std::size_t count) {
+  for (std::size_t j = 0; j < count; j++) row[j] -= factor * other[j];
+}
+
+void divide(double* row, double by, std::size_t count) {
+  for (std::size_t j = 0; j < count; j++) row[j] /= by;
+}
+
+// Adds to four rows of a tile the products of `deep` entries of A's rows with the packed rows of B.
+void add_terms(const double* const (&a)[4], const double* packed, double* sums, std::size_t deep, std::size_t width) {
+  const std::size_t whole = deep - deep % 4;
+  for (std::size_t p = 0; p < whole; p += 4) {
+    const double* row = packed + p * TILE;
+    for (std::size_t j = 0; j < width; j += pack::WIDTH) {
+      const Pack b0 = load(row + j), b1 = load(row + TILE + j), b2 = load(row + 2 * TILE + j), b3 = load(row + 3 * TILE + j);
+#pragma GCC unroll 4
+      for (std::size_t r = 0; r < 4; r++) {
+        double* sum = sums + r * TILE + j;
+        store(sum, (((load(sum) + a[r][p] * b0) + a[r][p + 1] * b1) + a[r][p + 2] * b2) + a[r][p + 3] * b3);
+      }
+    }
+  }
+  for (std::size_t p = whole; p < deep; p++)
+    for (std::size_t r = 0; r < 4; r++)
+      for (std::size_t j = 0; j < width; j++) sums[r * TILE + j] += a[r][p] * packed[p * TILE + j];
+}
+
+}  // namespace
+
+Matrix identity(std::size_t n) {
+  Matrix made(n, n);
+  for (std::size_t i = 0; i < n; i++) made[i][i] = 1.0;
+  return made;
+}
+
+Matrix transposed(Const a) {
+  Matrix made(a.columns, a.rows);
+  for (std::size_t i = 0; i < a.rows; i++)
+    for (std::size_t j = 0; j < a.columns; j++) made[j][i] = a[i][j];
+  return made;
+}
+
+Matrix negative(Const a) {
+  Matrix made(a.rows, a.columns);
+  for (std::size_t i = 0; i < a.rows; i++)
+    for (std::size_t j = 0; j < a.columns; j++) made[i][j] = -a[i][j];
+  return made;
+}
+
+bool is_finite(Const a) {
+  for (std::size_t i = 0; i < a.rows; i++)
+    for (std::size_t j = 0; j < a.columns; j++)
+      if (!std::isfinite(a[i][j])) return false;
+  return true;
+}
+
+double inner(std::span<const double> a, std::span<const double> b) {
+  assert(a.size() == b.size());
+  double l[8] = {}, rest = 0.0;
+  const std::size_t n = a.size(), whole = n - n % 8;
+  for (std::size_t i = 0; i < whole; i += 8)
+    for (std::size_t j = 0; j < 8; j++) l[j] += a[i + j] * b[i + j];
+  for (std::size_t i = whole; i < n; i++) rest += a[i] * b[i];
+  return (((l[0] + l[4]) + (l[2] + l[6])) + ((l[1] + l[5]) + (l[3] + l[7]))) + rest;
+}
+
+std::vector<double> product(Const a, std::span<const double> x) {
+  assert(a.columns == x.size());
+  std::vector<double> sums(a.rows);
+  const std::size_t whole = a.rows - a.rows % 8;
+  for (std::size_t i = 0; i < whole; i += 8) {
+    double s[8] = {};
+    for (std::size_t p = 0; p < a.columns; p++)
+      for (std::size_t r = 0; r < 8; r++) s[r] += a.data[(i + r) * a.stride + p] * x[p];
+    std::copy(s, s + 8, &sums[i]);
+  }
+  for (std::size_t i = whole; i < a.rows; i++)
+    for (std::size_t p = 0; p < a.columns; p++) sums[i] += a[i][p] * x[p];
+  return sums;
+}
+
+Matrix product(Const a, Const b) {
+  assert(a.columns == b.rows);
+  Matrix c(a.rows, b.columns);
+  if (a.rows >= 4 && b.columns > TILE / 2 && a.columns >= 4) {
+    add_product(a, b, c.view());
+    return c;
+  }
+  const std::size_t whole = a.columns - a.columns % 4;
+  for (std::size_t i = 0; i < a.rows; i++) {
+    double* __restrict sums = c[i];
+    for (std::size_t p = 0; p < whole; p += 4) {
+      const double f0 = a[i][p], f1 = a[i][p + 1], f2 = a[i][p + 2], f3 = a[i][p + 3];
+      const double *b0 = b[p], *b1 = b[p + 1], *b2 = b[p + 2], *b3 = b[p + 3];
+      for (std::size_t j = 0; j < b.columns; j++)
+        sums[j] = (((sums[j] + f0 * b0[j]) + f1 * b1[j]) + f2 * b2[j]) + f3 * b3[j];
+    }
+    for (std::size_t p = whole; p < a.columns; p++) {
+      const double factor = a[i][p];
+      const double* row = b[p];
+      for (std::size_t j = 0; j < b.columns; j++) sums[j] += factor * row[j];
+    }
+  }
+  return c;
+}
+
+void add_product(Const a, Const b, View c, Shape shape) {
+  assert(a.columns == b.rows && c.rows == a.rows && c.columns == b.columns);
+  double packed[DEPTH * TILE] = {}, sums[4 * TILE] = {};
+  for (std::size_t begin = 0; begin < b.columns; begin += TILE) {
+    const std::size_t width = std::min(TILE, b.columns - begin), filled = pack::padded(width);
+    const std::size_t rows = shape.is_upper ? std::min(a.rows, begin + width) : a.rows;
+    for (std::size_t first = shape.is_lower ? begin : 0; first < b.rows; first += DEPTH) {
+      const std::size_t deep = std::min(DEPTH, b.rows - first);
+      for (std::size_t p = 0; p < deep; p++) std::copy_n(b[first + p] + begin, width, packed + p * TILE);
+      for (std::size_t i = 0; i < rows; i += 4) {
+        const std::size_t high = std::min<std::size_t>(4, rows - i);
+        const double* of_rows[4];
+        for (std::size_t r = 0; r < 4; r++) of_rows[r] = a[i + std::min(r, high - 1)] + first;
+        for (std::size_t r = 0; r < high; r++) std::copy_n(c[i + r] + begin, width, sums + r * TILE);
+        add_terms(of_rows, packed, sums, deep, filled);
+        for (std::size_t r = 0; r < high; r++) std::copy_n(sums + r * TILE, width, c[i + r] + begin);
+      }
+    }
+  }
+}
+
+bool solve(View A, View B) {
+  assert(A.rows == A.columns && B.rows == A.rows);
+  const std::size_t n = A.rows, many = B.columns;
+  for (std::size_t k = 0; k < n; k++) {
+    std::size_t best = k;
+    for (std::size_t i = k + 1; i < n; i++)
+      if (std::fabs(A[i][k]) > std::fabs(A[best][k])) best = i;
+    if (A[best][k] == 0.0) return false;
+    if (best != k) {
+      std::swap_ranges(A[k], A[k] + n, A[best]);
+      std::swap_ranges(B[k], B[k] + many, B[best]);
+    }
+    for (std::size_t i = k + 1; i < n; i++) {
+      const double factor = A[i][k] / A[k][k];
+      if (factor == 0.0) continue;
+      take(A[i] + k + 1, factor, A[k] + k + 1, n - k - 1);
+      take(B[i], factor, B[k], many);
+    }
+  }
+  for (std::size_t k = n; k-- > 0;) {
+    divide(B[k], A[k][k], many);
+    for (std::size_t i = 0; i < k; i++) take(B[i], A[i][k], B[k], many);
+  }
+  return true;
+}
+
+bool factor_upper(View U) {
+  assert(U.rows == U.columns);
+  const std::size_t n = U.rows;
+  for (std::size_t begin = 0; begin < n; begin += BLOCK) {
+    const std::size_t end = std::min(begin + BLOCK, n);
+    for (std::size_t k = begin; k < end; k++) {
+      const double pivot = U[k][k];
+      if (!(pivot > 0.0 && pivot < std::numeric_limits<double>::infinity())) return false;
+      divide(U[k] + k, std::sqrt(pivot), n - k);
+      for (std::size_t later = k + 1; later < end; later++) take(U[later] + later, U[k][later], U[k] + later, n - later);
+    }
+    if (end < n) {
+      const Const right = U.part(begin, end, end - begin, n - end);
+      add_product(negative(transposed(right)), right, U.part(end, end, n - end, n - end), {.is_upper = true});
+    }
+  }
+  return true;
+}
+
+std::optional<Matrix> cholesky(Const A) {
+  Matrix U = transposed(A);
+  if (!factor_upper(U.view())) return {};
+  Matrix L(A.rows, A.rows);
+  for (std::size_t k = 0; k < A.rows; k++)
+    for (std::size_t i = k; i < A.rows; i++) L[i][k] = U[k][i];
+  return L;
+}
+
+void solve_lower(Const L, View right) {
+  assert(L.rows == L.columns && right.rows == L.rows);
+  const std::size_t n = right.rows, many = right.columns;
+  if (many == 1) {
+    for (std::size_t k = 0; k < n; k += 4) {  // four rows at once
+      const std::size_t high = std::min<std::size_t>(4, n - k);
+      const double* rows[4];
+      double s[4];
+      for (std::size_t r = 0; r < 4; r++) {
+        rows[r] = L[k + std::min(r, high - 1)];
+        s[r] = right[k + std::min(r, high - 1)][0];
+      }
+      for (std::size_t p = 0; p < k; p++)
+        for (std::size_t r = 0; r < 4; r++) s[r] -= rows[r][p] * right[p][0];
+      for (std::size_t r = 0; r < high; r++) {
+        for (std::size_t p = 0; p < r; p++) s[r] -= rows[r][k + p] * s[p];
+        right[k + r][0] = s[r] /= rows[r][k + r];
+      }
+    }
+    return;
+  }
+  for (std::size_t begin = 0; begin < n; begin += BLOCK) {
+    const std::size_t end = std::min(begin + BLOCK, n);
+    if (begin > 0)
+      add_product(negative(L.part(begin, 0, end - begin, begin)), right.part(0, 0, begin, many),
+                  right.part(begin, 0, end - begin, many));
+    for (std::size_t k = begin; k < end; k++) {
+      for (std::size_t p = begin; p < k; p++) take(right[k], L[k][p], right[p], many);
+      divide(right[k], L[k][k], many);
+    }
+  }
+}
+
+void solve_upper(Const L, View right) {
+  assert(L.rows == L.columns && right.rows == L.rows);
+  const std::size_t n = right.rows, many = right.columns;
+  if (many == 1) {
+    for (std::size_t k = n; k-- > 0;) {
+      const double pivot = right[k][0] /= L[k][k];
+      for (std::size_t p = 0; p < k; p++) right[p][0] -= L[k][p] * pivot;
+    }
+    return;
+  }
+  for (std::size_t begin = (n + BLOCK - 1) / BLOCK * BLOCK; begin > 0;) {
+    begin -= BLOCK;
+    const std::size_t end = std::min(begin + BLOCK, n);
+    for (std::size_t k = end; k-- > begin;) {
+      divide(right[k], L[k][k], many);
+      for (std::size_t p = begin; p < k; p++) take(right[p], L[k][p], right[k], many);
+    }
+    if (begin > 0)
+      add_product(negative(transposed(L.part(begin, 0, end - begin, begin))), right.part(begin, 0, end - begin, many),
+                  right.part(0, 0, begin, many));
+  }
+}
+
+Matrix inverse_from_factor(Const L) {
+  assert(L.rows == L.columns);
+  const std::size_t n = L.rows;
+  Matrix R = identity(n);
+  for (std::size_t begin = 0; begin < n; begin += BLOCK) {
+    const std::size_t end = std::min(begin + BLOCK, n);
+    if (begin > 0)
+      add_product(negative(L.part(begin, 0, end - begin, begin)), R.view().part(0, 0, begin, begin),
+                  R.view().part(begin, 0, end - begin, begin), {.is_lower = true});
+    for (std::size_t k = begin; k < end; k++) {
+      for (std::size_t p = begin; p < k; p++) take(R[k], L[k][p], R[p], p + 1);
+      divide(R[k], L[k][k], k + 1);
+    }
+  }
+  Matrix inverse(n, n);
+  if (n < BLOCK) {
+    for (std::size_t k = 0; k < n; k++)
+      for (std::size_t i = 0; i <= k; i++)
+        for (std::size_t j = i; j <= k; j++) inverse[i][j] += R[k][i] * R[k][j];
+  } else {
+    add_product(transposed(R), R, inverse.view(), {.is_upper = true, .is_lower = true});
+  }
+  for (std::size_t i = 0; i < n; i++)
+    for (std::size_t j = 0; j < i; j++) inverse[i][j] = inverse[j][i];
+  return inverse;
+}
+
+}  // namespace teamslam::dense

@@ -1,0 +1,23 @@
+// Covariance matrices: which matrix is one, and its factor.
+#pragma once
+
+#include "dense.hpp"
+
+namespace teamslam::gaussian {
+
+// Why a matrix is no covariance; the index in team.estimation.gaussian.FAULTS.
+enum class Fault : int { NONE = 0, NOT_FINITE = 1, NOT_POSITIVE = 2, NOT_SYMMETRIC = 3 };
+
+// What is seen of a matrix without factoring it; sigmas: the roots of its diagonal, where it is positive.
+Fault fault_of(dense::Const P, std::span<double> sigmas);
+
+struct Factor {
+  dense::Matrix L;  // lower, L Lᵀ = P; empty where there is none
+  Fault fault;
+};
+
+// Rank is judged by the diagonal's scale: a pivot that is no more than n ε of its diagonal entry is
+// rounding of a singular matrix.
+Factor factor_or_fault(dense::Const P);
+
+}  // namespace teamslam::gaussian
