@@ -24,15 +24,18 @@ struct Constraints {
 };
 
 Numbers part(std::span<const double> x, const Places& places) {
-  Numbers found;
-  for (const std::size_t i : places) found.push_back(x[i]);
+  Numbers found(places.size());
+  for (std::size_t i = 0; i < places.size(); i++) found[i] = x[places[i]];
   return found;
 }
 
 Matrix part(Const A, const Places& rows, const Places& columns) {
   Matrix found(rows.size(), columns.size());
-  for (std::size_t i = 0; i < rows.size(); i++)
-    for (std::size_t j = 0; j < columns.size(); j++) found[i][j] = A[rows[i]][columns[j]];
+  for (std::size_t i = 0; i < rows.size(); i++) {
+    const double* from = A[rows[i]];
+    double* to = found[i];
+    for (std::size_t j = 0; j < columns.size(); j++) to[j] = from[columns[j]];
+  }
   return found;
 }
 
@@ -43,20 +46,28 @@ void put(View to, Const from) {
 // Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ.
 Matrix of_map(Const P, const Numbers& lever) {
   Matrix U(P.rows, lever.size());
-  for (std::size_t row = 0; row < P.rows; row++)
-    for (std::size_t i = 0; i < lever.size(); i++) U[row][i] = P[row][i % 2] + lever[i] * P[row][2] - P[row][3 + i];
+  for (std::size_t row = 0; row < P.rows; row++) {
+    const double* from = P[row];
+    double* to = U[row];
+    for (std::size_t i = 0; i < lever.size(); i += 2) {
+      to[i] = from[0] + lever[i] * from[2] - from[3 + i];
+      to[i + 1] = from[1] + lever[i + 1] * from[2] - from[4 + i];
+    }
+  }
   return U;
 }
 
 // Rows of the submap's covariance (columns: the landmarks) times Hᵀ.
 Matrix of_submap(Const P, double s, double c) {
   Matrix V(P.rows, P.columns);
-  for (std::size_t row = 0; row < P.rows; row++)
+  for (std::size_t row = 0; row < P.rows; row++) {
+    const double* from = P[row];
+    double* to = V[row];
     for (std::size_t i = 0; i < P.columns; i += 2) {
-      const double x = P[row][i], y = P[row][i + 1];
-      V[row][i] = c * x - s * y;
-      V[row][i + 1] = s * x + c * y;
+      to[i] = c * from[i] - s * from[i + 1];
+      to[i + 1] = s * from[i] + c * from[i + 1];
     }
+  }
   return V;
 }
 
@@ -67,35 +78,24 @@ Numbers moved(std::span<const double> mean, Const gain, const Numbers& z) {
   return after;
 }
 
-// S ← S⁻¹ by Cholesky, exactly symmetric; returns whether S is positive definite.
-bool invert(Matrix& S) {
+// S⁻¹ of a symmetric S, exactly symmetric; none where S is not positive definite. The pivots of its
+// factor are roots, where `dense::cholesky` divides by the root: they round otherwise.
+std::optional<Matrix> inverse(const Matrix& S) {
   const std::size_t m = S.rows();
+  Matrix U = dense::transposed(S), L(m, m);
   for (std::size_t k = 0; k < m; k++) {
-    for (std::size_t j = 0; j < k; j++) {
-      const double factor = S[k][j];
-      for (std::size_t i = k; i < m; i++) S[i][k] -= S[i][j] * factor;
-    }
-    if (!(S[k][k] > 0.0)) return false;
-    S[k][k] = pack::sqrt(S[k][k]);
-    for (std::size_t i = k + 1; i < m; i++) S[i][k] /= S[k][k];
-  }
-  for (std::size_t k = 0; k < m; k++) {  // L ← L⁻¹, column by column
-    S[k][k] = 1.0 / S[k][k];
-    for (std::size_t i = k + 1; i < m; i++) {
-      double sum = 0.0;
-      for (std::size_t j = k; j < i; j++) sum -= S[i][j] * S[j][k];
-      S[i][k] = sum / S[i][i];
+    double* row = U[k];
+    if (!(row[k] > 0.0)) return std::nullopt;
+    row[k] = pack::sqrt(row[k]);
+    for (std::size_t i = k + 1; i < m; i++) row[i] /= row[k];
+    for (std::size_t i = k; i < m; i++) L[i][k] = row[i];
+    for (std::size_t later = k + 1; later < m; later++) {
+      const double factor = row[later];
+      double* __restrict to = U[later];
+      for (std::size_t i = later; i < m; i++) to[i] -= row[i] * factor;
     }
   }
-  for (std::size_t i = 0; i < m; i++)  // L⁻ᵀ L⁻¹ above the diagonal; the diagonal last, when its row needs it no more
-    for (std::size_t j = 0; j <= i; j++) {
-      double sum = 0.0;
-      for (std::size_t k = i; k < m; k++) sum += S[k][i] * S[k][j];
-      S[j][i] = sum;
-    }
-  for (std::size_t i = 0; i < m; i++)
-    for (std::size_t j = 0; j < i; j++) S[i][j] = S[j][i];
-  return true;
+  return dense::inverse_from_factor(L);
 }
 
 // Iterates the EKF update by the constraints; returns whether S is positive definite.
@@ -125,13 +125,14 @@ bool tie(const Numbers& mean, const Matrix& covariance, const Numbers& seen, con
         S[i][k] = (U[0][k] + found.lever[i] * U[2][k] - U[3 + i][k]) + (c * V[i][k] - s * V[j][k]);
         S[j][k] = (U[1][k] + found.lever[j] * U[2][k] - U[3 + j][k]) + (s * V[i][k] + c * V[j][k]);
       }
+    std::optional<Matrix> information = inverse(S);
+    if (!information) return false;
     found.sine = s;
     found.cosine = c;
-    if (!invert(S)) return false;
-    found.multiplier = dense::product(S, y);
+    found.inverse = std::move(*information);
+    found.multiplier = dense::product(found.inverse, y);
     state = moved(mean, U, found.multiplier);
     local = moved(seen, V, found.multiplier);
-    found.inverse = std::move(S);
   }
   return true;
 }
