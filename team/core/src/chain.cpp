@@ -35,8 +35,11 @@ struct Chain::Problem {
 
   const std::vector<Link>& links;
   std::vector<std::uint32_t> ids;
-  std::vector<std::vector<graph::Index>> at;  // of each map's members
+  std::vector<std::vector<graph::Index>> at;       // of each map's members
+  std::vector<std::vector<std::size_t>> unknowns;  // of each map
   Numbers state;
+  double chi2;      // of the state
+  Matrix of_prior;  // its part of the normal equations, which is constant: the prior begins at the origin
 
   explicit Problem(const std::vector<Link>& all) : links(all) {
     for (const Link& link : links) ids.insert(ids.end(), link.ids.begin(), link.ids.end());
@@ -45,8 +48,18 @@ struct Chain::Problem {
     for (std::size_t k = 0; k < links.size(); k++) {
       at.push_back({graph::Index(3 * k), graph::Index(3 * k + 3)});
       for (const std::uint32_t id : links[k].ids) at[k].push_back(graph::Index(poses() + 2 * slot(id)));
+      unknowns.emplace_back();
+      for (std::size_t a = 0; a < at[k].size(); a++)
+        for (std::size_t p = 0; p < (a < 2 ? 3u : 2u); p++) unknowns[k].push_back(std::size_t(at[k][a]) + p);
     }
     guess();
+    chi2 = cost(state);
+    of_prior = Matrix(state.size(), state.size());
+    for (std::size_t i = 0; i < 3; i++) of_prior[i][i] = 1.0;
+    const Matrix& information = links[0].factor.information;
+    for (std::size_t i = 0; i < information.rows(); i++)
+      for (std::size_t j = 0; j < information.rows(); j++)
+        of_prior[unknowns[0][3 + i]][unknowns[0][3 + j]] = information[i][j];
   }
 
   std::size_t poses() const { return 3 * (links.size() + 1); }
@@ -83,38 +96,21 @@ struct Chain::Problem {
 
   // Σ JᵀP⁻¹J and Σ JᵀP⁻¹r; the origin has an identity block and a zero gradient.
   Matrix normal_equations(Numbers& gradient) const {
-    const std::size_t size = state.size();
-    Matrix H(size, size);
-    gradient.assign(size, 0.0);
-    std::vector<std::size_t> unknowns;
-    for (std::size_t k = 0; k < links.size(); k++) {
-      const graph::Submap& factor = links[k].factor;
-      unknowns.clear();
-      for (std::size_t a = 0; a < at[k].size(); a++)
-        for (std::size_t p = 0; p < (a < 2 ? 3u : 2u); p++) unknowns.push_back(std::size_t(at[k][a]) + p);
-      if (k == 0) {  // it begins at the origin, so it is linear
-        const Numbers residual = factor.residual(state, at[0]).numbers;
-        for (std::size_t i = 0; i < factor.size(); i++) {
-          const double* row = factor.information[i];
-          for (std::size_t j = 0; j < factor.size(); j++) {
-            H[unknowns[3 + i]][unknowns[3 + j]] = row[j];
-            gradient[unknowns[3 + i]] += row[j] * residual[j];
-          }
-        }
-        continue;
-      }
-      const graph::Normal normal = factor.normal(state, at[k]);
-      for (std::size_t i = 0; i < unknowns.size(); i++) {
-        gradient[unknowns[i]] += normal.gradient[i];
-        double* row = H[unknowns[i]];
-        for (std::size_t j = 0; j < unknowns.size(); j++) row[unknowns[j]] += normal.hessian[i][j];
+    Matrix H = of_prior;
+    gradient.assign(state.size(), 0.0);
+    const graph::Submap& prior = links[0].factor;
+    const Numbers slope = dense::product(prior.information, prior.residual(state, at[0]).numbers);
+    for (std::size_t i = 0; i < slope.size(); i++) gradient[unknowns[0][3 + i]] = slope[i];
+    for (std::size_t k = 1; k < links.size(); k++) {
+      const graph::Normal normal = links[k].factor.normal(state, at[k]);
+      const std::vector<std::size_t>& own = unknowns[k];
+      for (std::size_t i = 0; i < own.size(); i++) {
+        gradient[own[i]] += normal.gradient[i];
+        double* row = H[own[i]];
+        const double* from = normal.hessian[i];
+        for (std::size_t j = 0; j < own.size(); j++) row[own[j]] += from[j];
       }
     }
-    for (std::size_t i = 0; i < 3; i++) {
-      for (std::size_t j = 0; j < size; j++) H[i][j] = H[j][i] = 0.0;
-      gradient[i] = 0.0;
-    }
-    for (std::size_t i = 0; i < 3; i++) H[i][i] = 1.0;
     return H;
   }
 
@@ -128,13 +124,13 @@ struct Chain::Problem {
   // Takes one step.
   Step take(double damping) {
     Numbers gradient;
-    const Matrix H = normal_equations(gradient);
-    const double before = cost(state);
+    Matrix H = normal_equations(gradient);
+    Numbers diagonal(H.rows());
+    for (std::size_t i = 0; i < H.rows(); i++) diagonal[i] = H[i][i];
     double refused = elementary::INF;
     while (damping < MOST_DAMPING) {
-      Matrix damped = H;
-      for (std::size_t i = 0; i < H.rows(); i++) damped[i][i] *= 1.0 + damping;
-      const gaussian::Factor factor = gaussian::factor_or_fault(damped);
+      for (std::size_t i = 0; i < H.rows(); i++) H[i][i] = diagonal[i] * (1.0 + damping);
+      const gaussian::Factor factor = gaussian::factor_or_fault(H);
       if (factor.fault != gaussian::Fault::NONE) return {damping, elementary::NOT_A_NUMBER};
       Numbers step = gradient;
       for (double& each : step) each = -each;
@@ -145,8 +141,10 @@ struct Chain::Problem {
       for (const double share : SHARES) {
         if (damping > 0.0 && share < 1.0) break;
         Numbers after = moved(step, share);
-        if (cost(after) <= before * (1.0 + ROUNDING) + ROUNDING) {
+        const double now = cost(after);
+        if (now <= chi2 * (1.0 + ROUNDING) + ROUNDING) {
           state = std::move(after);
+          chi2 = now;
           return {damping > LEAST_DAMPING ? damping / 10.0 : 0.0, change};
         }
       }
@@ -198,7 +196,7 @@ ChainSolution Chain::solve(int iterations, double tolerance) const {
   found.map = {problem.ids,
                {problem.state.begin() + std::ptrdiff_t(last), problem.state.end()},
                dense::inverse_from_factor(factor.L.view().part(last, last, rest, rest))};
-  found.cost = problem.cost(problem.state);
+  found.cost = problem.chi2;
   found.dof = 3 - std::ptrdiff_t(problem.state.size());
   std::vector<std::size_t> counts(problem.ids.size());
   for (std::size_t k = 0; k < links_.size(); k++) {
